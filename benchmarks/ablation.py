@@ -208,7 +208,7 @@ def _gains_of(true: ElasticModes) -> tuple[GainData, Float64[Tensor, "others 3"]
         names=tuple(f"{row:03d}" for row in range(12)), directions=ways[:12].float(),
     )  # fmt: skip
     bank = ModalBank(true.frequency, torch.full_like(true.frequency, 20.0))
-    found = Extraction(bank, gains, Residual(torch.zeros(1025)), torch.zeros_like(gains))
+    found = Extraction(bank, gains + 0j, Residual(torch.zeros(1025)))
     phase = torch.zeros(len(true), dtype=torch.float64)
     features = FeatureField.from_points(true.nodes.float())
     return GainData(impacts, features, found, phase, gains, FitConfig()), others, ways[12:]

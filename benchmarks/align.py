@@ -94,7 +94,7 @@ def by_threshold(folder: Path) -> Impacts:
 
 def coherence_of(modes: Extraction) -> float:
     """Return the coherence of an extraction's amplitudes."""
-    return coherence(torch.complex(modes.quadrature.double(), -modes.gains.double()), modes.bank.damping)
+    return coherence(-1j * modes.gains.to(torch.complex128), modes.bank.damping)
 
 
 def _captures(options: Options) -> Report:

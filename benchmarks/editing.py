@@ -199,7 +199,7 @@ def generation(model: StableAudio, seconds: float = GENERATED, finder: ModeFinde
         recording = Recording(f"generated from {prompt!r}", made[None].numpy(), rate, "FLOAT")
         sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))[None]
         modes = extract_sounds(sound, sample_rate=rate, method=finder or HighResolution())
-        return Edited(audible_modes(modes.bank, torch.hypot(modes.gains, modes.quadrature)), sound.float(), rate)
+        return Edited(audible_modes(modes.bank, modes.gains.abs()), sound.float(), rate)
 
     return EditMethod("generation", edit)
 

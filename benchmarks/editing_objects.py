@@ -70,7 +70,7 @@ class KnownObject:
     @property
     def bank(self) -> ModalBank:
         """Its audible modes."""
-        return audible_modes(self.modes.bank, torch.hypot(self.modes.gains, self.modes.quadrature))
+        return audible_modes(self.modes.bank, self.modes.gains.abs())
 
     @cached_property
     def sound_field(self) -> SoundField:

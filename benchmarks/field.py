@@ -296,8 +296,8 @@ def _judge(
 
 def measured_parts(test: Impacts, field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
     """Return the recordings' own gains with a field's modes: along each mode's phase, and a quarter period ahead."""
-    gains, quadrature = fit_gains(test.sounds.double(), field.bank, sample_rate=test.sample_rate)
-    turned = torch.complex(gains, quadrature) * torch.polar(torch.ones_like(field.phase), -field.phase)
+    gains = fit_gains(test.sounds.double(), field.bank, sample_rate=test.sample_rate)
+    turned = gains * torch.polar(torch.ones_like(field.phase), -field.phase)
     return torch.view_as_real(turned)
 
 

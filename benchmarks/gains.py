@@ -244,8 +244,8 @@ def _large_case(elastic: ElasticModes, contacts: int, modes: int) -> GainData:
         names=tuple(f"{row:03d}" for row in range(contacts)), directions=directions.float(),
     )  # fmt: skip
     bank = ModalBank(frequency, torch.full_like(frequency, 20.0))
-    quadrature = 0.02 * gains * torch.randn(gains.shape, generator=generator, dtype=torch.float64)
-    found = Extraction(bank, gains, Residual(torch.zeros(1025)), quadrature)
+    ahead = 0.02 * gains * torch.randn(gains.shape, generator=generator, dtype=torch.float64)
+    found = Extraction(bank, torch.complex(gains, ahead), Residual(torch.zeros(1025)))
     phase = torch.zeros(modes, dtype=torch.float64)
     return GainData(impacts, FeatureField.from_points(elastic.nodes.float()), found, phase, gains, FitConfig())
 
@@ -254,12 +254,11 @@ def _modal_error(field: SoundField, test: Impacts, truth: Truth) -> float:
     """Return the error of the field's modes against the true ones, both without noise."""
     true = truth_from_first_sample(truth_at(truth, test.names), test)
     clean = synthesize(
-        true.gains.float(),
+        true.gains.to(torch.complex64),
         true.frequency,
         true.damping,
         samples=test.sounds.shape[1],
         sample_rate=test.sample_rate,
-        quadrature=true.quadrature.float(),
     )
     silent = replace(field, residual=Residual(torch.zeros_like(field.residual.magnitude)))
     made = silent.render(test.contacts, directions=test.directions, samples=test.sounds.shape[1])

@@ -105,7 +105,7 @@ class SolvedShape:
         bank = ModalBank(vibration.frequency, vibration.damping)
         # Regression over shapes needs some doubt: as much as noise 60 dB below the sounds would give.
         level = torch.full((17,), 1e-3 * float(sounds.square().mean().sqrt()))
-        modes = Extraction(bank, -amplitudes.imag.float(), Residual(level), amplitudes.real.float())
+        modes = Extraction(bank, (1j * amplitudes).to(torch.complex64), Residual(level))
         recipe = MixtureEstimator(bodies=CandidateBodies([CandidateBody(None, elastic)]))
         features = partial(FeatureField.from_points, elastic.nodes[self._spread])
         return KnownObject(f"{self.kind}-{material.name}", material.name, impacts, modes, recipe, features)

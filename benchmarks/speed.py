@@ -185,7 +185,7 @@ def _paper_seconds(task: Task, spatial: bool, config: FitConfig, repeats: int) -
     held = round(config.validation * len(task.train))
     learnt = list(range(len(task.train) - held))
     modes = task.modes
-    fewer = replace(modes, gains=modes.gains[learnt], quadrature=modes.quadrature[learnt])
+    fewer = modes.take(learnt)
     trial = Task(task.train.take(learnt), task.features, fewer)
     total = 0.0
     for part, varied in ((trial, False), (trial, True), (task, spatial)):

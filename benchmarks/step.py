@@ -93,7 +93,7 @@ def full_setting(
     sounds += shape_noise(residual.magnitude, contacts=count, samples=samples, generator=generator)
     names = tuple(f"{row:02d}" for row in range(count))
     impacts = Impacts(contacts, sounds, sample_rate, names)
-    return impacts, IMPULSE.features(), Extraction(bank, gains, residual, torch.zeros_like(gains))
+    return impacts, IMPULSE.features(), Extraction(bank, gains + 0j, residual)
 
 
 def start(

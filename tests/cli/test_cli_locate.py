@@ -45,12 +45,11 @@ class Place:
         """Return a blow in faint noise, with some quiet before it."""
         gains = self.gains[row][None].to(torch.complex128)
         sound = synthesize(
-            gains.real,
+            gains,
             bank.frequency,
             bank.damping,
             samples=SAMPLES * rate // RATE,
             sample_rate=float(rate),
-            quadrature=gains.imag,
         )[0]
         whole = torch.cat([torch.zeros(round(before * rate), dtype=torch.float64), sound])
         noise = torch.randn(len(whole), generator=torch.Generator().manual_seed(row), dtype=torch.float64)

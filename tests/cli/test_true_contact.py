@@ -39,9 +39,7 @@ def hit(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str, torch.Tenso
     save(field, folder / "plate.safetensors")
     locator = Locator.of(field)
     gains = locator.gains[STRUCK][None].to(torch.complex128)
-    sound = synthesize(
-        gains.real, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=float(RATE), quadrature=gains.imag
-    )[0]
+    sound = synthesize(gains, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=float(RATE))[0]
     noise = torch.randn(len(sound) + 800, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     whole = torch.nn.functional.pad(sound, (800, 0)) / sound.abs().max() + 1e-4 * noise
     soundfile.write(folder / "hit.wav", (0.5 * whole).numpy(), RATE, subtype="FLOAT")

@@ -1,7 +1,7 @@
 """Recordings and materials as what a field shall sound like."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,6 @@ from avmsf.editing.modal_edit import FieldAtContacts
 from avmsf.editing.reference import Reference, band_spectrum, gain_slope
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
-from avmsf.field.gains.model import Gains
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
 
@@ -196,19 +195,9 @@ def test_an_object_that_makes_no_sound_is_refused():
         Reference.of_material(ringing_field(pitch=100.0), CERAMIC, WOOD)
 
 
-@dataclass(frozen=True, eq=False)
-class Ahead(SameGains):
-    """Gains of which a part is a quarter of a period ahead."""
-
-    quadrature: torch.Tensor
-
-    def predict(self, points, directions=None) -> Gains:
-        return Gains(self.gains.expand(len(points), -1), self.quadrature.expand(len(points), -1))
-
-
 def test_a_modes_size_does_not_depend_on_its_phase():
     field, turn = ringing_field(), torch.linspace(0.0, 1.5, 6)
     gains = field.gain_field.gains
-    turned = replace(field, gain_field=Ahead(gains * torch.cos(turn), gains * torch.sin(turn)))
+    turned = replace(field, gain_field=SameGains(gains * torch.exp(1j * turn)))
     own, other = (Reference.of_material(each, CERAMIC, WOOD, seed=0) for each in (field, turned))
     torch.testing.assert_close(other.clips, own.clips, rtol=1e-4, atol=1e-4)

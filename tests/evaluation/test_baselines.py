@@ -40,7 +40,7 @@ def true_extraction(impacts: Impacts) -> Extraction:
     modes: PlateModes = plate_modes(PLATE, impacts.contacts)
     gains = modes.gains.float()
     residual = Residual(torch.zeros(4))
-    return Extraction(ModalBank(modes.frequency, modes.damping), gains, residual, torch.zeros_like(gains))
+    return Extraction(ModalBank(modes.frequency, modes.damping), gains + 0j, residual)
 
 
 def test_white_noise_is_white_and_as_loud_as_the_training_sounds():
@@ -83,12 +83,12 @@ def test_without_noise_mean_gains_are_mean_waveforms():
 def test_mean_gains_have_both_phases():
     train, _ = split(plate_impacts(), 0.2)
     extraction = true_extraction(train)
-    turned = replace(extraction, gains=torch.zeros_like(extraction.gains), quadrature=extraction.gains)
+    turned = replace(extraction, gains=1j * extraction.gains)
     sounds = MeanGains(train, turned, count=1).render(train.contacts)
     times = torch.arange(sounds.shape[1], dtype=torch.float64) / 22050.0
     bank = extraction.bank
     cosines = torch.exp(-bank.damping[:, None] * times) * torch.cos(2 * math.pi * bank.frequency[:, None] * times)
-    expected = extraction.gains.double() @ cosines
+    expected = extraction.gains.real.double() @ cosines
     assert torch.allclose(sounds.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
@@ -114,7 +114,7 @@ def test_only_the_floor_with_cosines_follows_a_turned_phase():
     assert both < 0.02
     assert sines > 5 * both
     # The best sines are not what is left of the best sines and cosines without the cosines.
-    gains, _ = fit_gains(late.sounds, bank, sample_rate=late.sample_rate)
+    gains = fit_gains(late.sounds, bank, sample_rate=late.sample_rate).real
     without = synthesize(gains, bank.frequency, bank.damping, samples=4410, sample_rate=22050.0)
     best = float((floor(late, bank, sines=True) - late.sounds).square().sum())
     assert best < 0.999 * float((without - late.sounds).square().sum())

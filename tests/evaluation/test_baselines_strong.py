@@ -41,7 +41,7 @@ def spline(places: torch.Tensor, values: torch.Tensor) -> SplineGains:
     modes = values.shape[1]
     bank = ModalBank(100.0 + torch.arange(modes, dtype=torch.float64), torch.full((modes,), 5.0, dtype=torch.float64))
     impacts = Impacts(places, torch.zeros(len(places), 400), 8000.0, tuple(map(str, range(len(places)))))
-    return SplineGains(impacts, Extraction(bank, values, Residual(torch.zeros(4)), torch.zeros_like(values)))
+    return SplineGains(impacts, Extraction(bank, values + 0j, Residual(torch.zeros(4))))
 
 
 def gains(found: SplineGains, places: torch.Tensor) -> torch.Tensor:
@@ -115,11 +115,10 @@ def two_sided(count: int = 14) -> tuple[Impacts, Extraction, Extraction]:
     bank = ModalBank(modes.frequency, modes.damping)
     sounds = torch.zeros(count, 400)
     impacts = Impacts(contacts, sounds, 8000.0, tuple(map(str, range(count))), directions)
-    still = torch.zeros_like(above)
     return (
         impacts,
-        Extraction(bank, above * sides, Residual(torch.zeros(4)), still),
-        Extraction(bank, above, Residual(torch.zeros(4)), still),
+        Extraction(bank, above * sides + 0j, Residual(torch.zeros(4))),
+        Extraction(bank, above + 0j, Residual(torch.zeros(4))),
     )
 
 

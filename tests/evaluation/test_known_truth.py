@@ -19,10 +19,10 @@ DAMPING = torch.tensor([60.0, 90.0, 70.0, 200.0, 400.0], dtype=torch.float64)
 
 
 def known(modes: int = 5) -> Truth:
-    gains, quadrature = torch.randn(2, COUNT, modes, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    gains = torch.complex(*torch.randn(2, COUNT, modes, generator=torch.Generator().manual_seed(0)).double())
     names = tuple(f"{row}.wav" for row in range(COUNT))
     starts = torch.zeros(COUNT, dtype=torch.float64)
-    return Truth(FREQUENCY[:modes], DAMPING[:modes], gains, quadrature, names, starts=starts)
+    return Truth(FREQUENCY[:modes], DAMPING[:modes], gains, names, starts=starts)
 
 
 def heard(truth: Truth, starts: torch.Tensor, *, noise: float = 0.0) -> Impacts:
@@ -56,8 +56,7 @@ class Fitted:
     bank: ModalBank
 
     def complex_gains(self, contacts: torch.Tensor, *, directions: torch.Tensor | None = None) -> torch.Tensor:
-        gains, quadrature = fit_gains(self.impacts.sounds, self.bank, sample_rate=RATE)
-        return 1.1 * torch.complex(quadrature, -gains)
+        return -1.1j * fit_gains(self.impacts.sounds, self.bank, sample_rate=RATE)
 
 
 def figures(truth: Truth, samples: float) -> dict[str, float | None]:

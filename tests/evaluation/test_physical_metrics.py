@@ -22,9 +22,9 @@ def numbers(*values: float) -> torch.Tensor:
 
 def truth() -> Truth:
     generator = torch.Generator().manual_seed(0)
-    gains, quadrature = torch.randn(2, 12, 4, generator=generator, dtype=torch.float64)
+    gains = torch.complex(*torch.randn(2, 12, 4, generator=generator, dtype=torch.float64))
     frequency = numbers(400, 900, 1700, 4000)
-    return Truth(frequency, numbers(4, 8, 20, 40), gains, quadrature, tuple(f"{row}.wav" for row in range(12)))
+    return Truth(frequency, numbers(4, 8, 20, 40), gains, tuple(f"{row}.wav" for row in range(12)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +60,12 @@ def test_weights_are_the_energies_of_the_sounds():
     one = truth()
     rate, energies = 48000.0, []
     for mode in range(4):
-        table = [values[:, mode : mode + 1] for values in (one.gains, one.quadrature)]
         sounds = synthesize(
-            table[0],
+            one.gains[:, mode : mode + 1],
             one.frequency[mode : mode + 1],
             one.damping[mode : mode + 1],
             samples=96000,
             sample_rate=rate,
-            quadrature=table[1],
         )
         energies.append(float(sounds.double().square().sum() / rate))
     share = numbers(*energies) / sum(energies)
@@ -89,7 +87,7 @@ def test_what_a_listener_hears_is_not_free():
     wrong = amplitudes()
     wrong[:6, 0] *= -1
     one = truth()
-    single = Truth(one.frequency[:1], one.damping[:1], one.gains[:, :1], one.quadrature[:, :1], one.names)
+    single = Truth(one.frequency[:1], one.damping[:1], one.gains[:, :1], one.names)
     assert compare_modes(rendered(wrong), CONTACTS, truth()).figures()["mac"] < 0.9
     # Of a single mode it is nothing but polarity.
     alone = Modes(ModalBank(single.frequency, single.damping), wrong[:, :1])
@@ -109,7 +107,7 @@ def test_gains_are_compared_along_the_impacts_directions():
     along = torch.linspace(0.1, 1.0, 12, dtype=torch.float64)
     directions = torch.stack([(1 - along.square()).sqrt(), torch.zeros_like(along), along], dim=1)
     renderer = Directed(rendered(amplitudes()).bank, amplitudes())
-    one = replace(truth(), gains=truth().gains * along[:, None], quadrature=truth().quadrature * along[:, None])
+    one = replace(truth(), gains=truth().gains * along[:, None])
     figures = compare_modes(renderer, CONTACTS, one, directions=directions).figures()
     assert figures["gain_error"] == pytest.approx(0.0, abs=1e-7)
 
@@ -123,14 +121,14 @@ def test_a_level_is_a_gain_error_and_leaves_the_mac(factor):
 
 def test_error_at_right_angles_follows_pythagoras():
     one = truth()
-    g = one.gains
+    g = one.gains.real
     # Sines alone, in both: a pattern orthogonal to the true one over contacts, of half its norm, added to every mode.
     other = torch.randn(12, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     other -= g * ((g * other).sum(0) / g.square().sum(0))
     other *= 0.5 * g.norm(dim=0) / other.norm(dim=0)
     sines = Modes(ModalBank(one.frequency, one.damping), -1j * (g + other))
     # cos^2 of the angle between them is 1 / (1 + 1/4).
-    scores = compare_modes(sines, CONTACTS, replace(one, quadrature=0 * g))
+    scores = compare_modes(sines, CONTACTS, replace(one, gains=one.gains.real + 0j))
     assert torch.allclose(scores.gain_error, torch.full((4,), 0.5, dtype=torch.float64), rtol=1e-9)
     assert torch.allclose(scores.mac, torch.full((4,), 0.8, dtype=torch.float64), rtol=1e-9)
 
@@ -206,7 +204,7 @@ def test_what_cannot_be_compared_is_refused():
     with raises(EvaluationError, name="predicted", value=[12, 3]):
         compare_modes(Modes(good.bank, one.amplitudes[:, :3]), CONTACTS, one)
     with raises(EvaluationError, name="truth", value=0.0):
-        compare_modes(good, CONTACTS, replace(one, gains=0 * one.gains, quadrature=0 * one.gains))
+        compare_modes(good, CONTACTS, replace(one, gains=0 * one.gains))
     broken = amplitudes()
     broken[3, 2] = math.nan
     with raises(EvaluationError, name="predicted", row=3):

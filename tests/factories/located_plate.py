@@ -77,7 +77,7 @@ def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLA
 @cache
 def fitted_field(taps: int) -> SoundField:
     impacts = struck(taps, seed=5)
-    values = torch.complex(*(each.double() for each in fit_gains(impacts.sounds, bank(), sample_rate=RATE)))
+    values = fit_gains(impacts.sounds, bank(), sample_rate=RATE).to(torch.complex128)
     return field_of(mixture_of(impacts.contacts, values, bank(), plate_surface_points(PLATE, 1500)))
 
 

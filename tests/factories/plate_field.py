@@ -55,4 +55,4 @@ def plate_extraction(impacts: Impacts) -> Extraction:
     gains = modes.gains.float()
     level = float(impacts.sounds.square().mean().sqrt()) * 0.01
     bank = ModalBank(modes.frequency + 0.2, modes.damping * 1.05)
-    return Extraction(bank, gains, Residual(torch.full((33,), level)), torch.zeros_like(gains))
+    return Extraction(bank, gains + 0j, Residual(torch.full((33,), level)))

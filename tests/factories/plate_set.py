@@ -53,7 +53,7 @@ def fill_plates(
         write_capture(Capture(name, impacts, _surface(plate) if truth else None), folder / name)
         if truth:
             modes = plate_modes(plate, impacts.contacts, highest=HIGHEST, contact_time=5e-4)
-            known = Truth(modes.frequency, modes.damping, modes.gains, 0 * modes.gains, impacts.names)
+            known = Truth(modes.frequency, modes.damping, modes.gains + 0j, impacts.names)
             write_truth(known, folder / name / TRUTH)
     return folder
 

@@ -1,5 +1,6 @@
 """A field fitted to a plate whose modes are known in closed form."""
 
+import cmath
 import math
 from dataclasses import replace
 from functools import cache
@@ -128,7 +129,6 @@ def flipped(modes: Extraction) -> Extraction:
         modes.bank.take(order),
         modes.gains[:, order],
         modes.residual,
-        modes.quadrature[:, order],
     )
 
 
@@ -156,9 +156,9 @@ def test_modes_that_start_late_keep_their_phase_unless_sines_are_asked_for(phase
     late = synthesize(
         modes.gains, modes.bank.frequency, modes.bank.damping, turn, samples=impacts.sounds.shape[1], sample_rate=RATE
     )
-    amplitudes = {"gains": modes.gains * math.cos(1.2), "quadrature": modes.gains * math.sin(1.2)}
     config = replace(LONG, steps=0, residual=False, phase=phase)
-    field = fitted(config, train=replace(impacts, sounds=late), modes=replace(modes, **amplitudes))
+    turned = replace(modes, gains=modes.gains * cmath.exp(1.2j))
+    field = fitted(config, train=replace(impacts, sounds=late), modes=turned)
     error = float((field.render(impacts.contacts) - late).square().sum() / late.square().sum())
     # A sine holds cos^2 1.2 = .13 of the energy of one that starts 1.2 radians later.
     if phase == "common":
@@ -298,7 +298,7 @@ def test_warm_up_aims_at_the_gains_that_sines_can_express():
 
 def test_without_a_warm_up_modes_are_as_strong_as_they_were_found_whatever_their_phase():
     modes = plate_extraction(plate_impacts())
-    late = replace(modes, gains=0 * modes.gains, quadrature=modes.gains)
+    late = replace(modes, gains=1j * modes.gains)
     sines, cosines = (fitted(replace(SHORT, warmup_steps=0), modes=each).gain_field for each in (modes, late))
     assert float(sines.gain_scale.min()) > 0
     assert torch.allclose(cosines.gain_scale, sines.gain_scale)
@@ -318,9 +318,7 @@ def test_a_silent_recording_and_a_mode_that_is_never_excited_do_no_harm():
     frequency = torch.cat([modes.bank.frequency, torch.tensor([3900.0], dtype=torch.float64)])
     damping = torch.cat([modes.bank.damping, torch.tensor([20.0], dtype=torch.float64)])
     zeros = torch.zeros(12, 1)
-    more = Extraction(
-        ModalBank(frequency, damping), torch.cat([modes.gains, zeros], 1), modes.residual, torch.zeros(12, 13)
-    )
+    more = Extraction(ModalBank(frequency, damping), torch.cat([modes.gains, zeros], 1), modes.residual)
     field = fitted(VALIDATED, train=replace(impacts, sounds=sounds), modes=more)
     assert all(bool(torch.isfinite(each).all()) for each in bits(field).values())
     gains = field.gains(impacts.contacts).abs().mean(0)
@@ -342,7 +340,7 @@ def test_recordings_that_cannot_be_fitted_are_refused():
     with raises(FitError, name="modes", value=pytest.approx(2302.0, abs=1.0)):
         fitted(SHORT, train=replace(impacts, sample_rate=4000.0))
     none = torch.zeros(0, dtype=torch.float64)
-    empty = Extraction(ModalBank(none, none), torch.zeros(12, 0), modes.residual, torch.zeros(12, 0))
+    empty = Extraction(ModalBank(none, none), torch.zeros(12, 0) + 0j, modes.residual)
     with raises(FitError, name="modes", value=0):
         fitted(SHORT, modes=empty)
 

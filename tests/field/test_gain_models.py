@@ -43,7 +43,7 @@ every_kind = pytest.mark.parametrize(
 DIRECTIONAL = ("directional", "elastic", "scaled elastic", "body", "scaled body")
 """Fields that know directions of impacts."""
 REAL = ("attention", "attention with dampings", "scaled attention with dampings", "body", "scaled body")
-"""Fields without a quadrature and without a standard deviation."""
+"""Fields of real gains, without a standard deviation."""
 
 
 def sound_field(gains: GainModel, *, noise: float = 0.0) -> SoundField:
@@ -53,7 +53,7 @@ def sound_field(gains: GainModel, *, noise: float = 0.0) -> SoundField:
 def parts(field: GainModel, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> list[torch.Tensor]:
     """Return all that a field knows at contacts."""
     known = field.predict(contacts, directions)
-    said = [known.mean, known.quadrature, known.damping, field.posterior(contacts, directions).std]
+    said = [known.mean, known.damping, field.posterior(contacts, directions).std]
     return [each for each in said if each is not None]
 
 
@@ -78,8 +78,9 @@ def test_gains_are_a_number_a_contact_and_mode(name):
     assert isinstance(field, GainModel)
     for count in (7, 1, 0):
         known = field.predict(PLACES[:count], BLOWS[:count])
-        for each in (known.mean, known.quadrature, known.damping):
-            assert each is None or (each.shape, each.dtype) == ((count, MODES), torch.float32)
+        kind = torch.float32 if name in REAL else torch.complex64
+        assert (known.mean.shape, known.mean.dtype) == ((count, MODES), kind)
+        assert known.damping is None or (known.damping.shape, known.damping.dtype) == ((count, MODES), torch.float32)
         deviation = field.posterior(PLACES[:count], BLOWS[:count]).std
         assert deviation is None or (deviation.shape, deviation.dtype) == ((count, MODES, 2), torch.float32)
     assert all(bool(torch.isfinite(each).all()) for each in parts(field, PLACES, BLOWS))
@@ -120,8 +121,6 @@ def test_an_impact_from_the_other_side_has_opposite_gains_or_its_direction_is_no
     here, there = field.predict(PLACES, BLOWS), field.predict(PLACES, -BLOWS)
     sign = -1.0 if name in DIRECTIONAL else 1.0
     assert torch.equal(there.mean, sign * here.mean)
-    if here.quadrature is not None:
-        assert torch.equal(there.quadrature, sign * here.quadrature)
     deviations = [field.posterior(PLACES, directions).std for directions in (BLOWS, -BLOWS)]
     assert deviations == [None, None] or torch.equal(*deviations)
 
@@ -174,14 +173,14 @@ def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
 def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
     field = ALL[name]()
     known, times = field.point_estimate(PLACES, BLOWS), torch.arange(600, dtype=torch.float64) / 8000.0
-    ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
-    factors = torch.ones_like(known.mean) if known.damping is None else known.damping
+    along, ahead = known.parts.unbind(2)
+    factors = torch.ones_like(along) if known.damping is None else known.damping
     assert (float(ahead.abs().max()) > 0) == (name not in REAL)
     expected = torch.zeros(7, 600, dtype=torch.float64)
     for mode in range(MODES):
         angle = 2 * torch.pi * BANK.frequency[mode] * times + PHASE[mode]
         decay = torch.exp(-BANK.damping[mode] * factors[:, mode, None].double() * times)
-        waves = known.mean[:, mode, None] * torch.sin(angle) + ahead[:, mode, None] * torch.cos(angle)
+        waves = along[:, mode, None] * torch.sin(angle) + ahead[:, mode, None] * torch.cos(angle)
         expected += decay * waves
     renderer = sound_field(field)
     assert isinstance(renderer, Renderer)

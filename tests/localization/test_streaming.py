@@ -36,7 +36,7 @@ def locator() -> Locator:
 def stream(*, noise: float = 1e-3) -> Tensor:
     """Return all blows, each ringing on beneath the following ones, in noise."""
     gains = locator().gains[list(STRUCK)].to(torch.complex128) * torch.tensor(FORCES, dtype=torch.float64)[:, None]
-    sounds = synthesize(gains.real, BANK.frequency, BANK.damping, samples=4000, sample_rate=RATE, quadrature=gains.imag)
+    sounds = synthesize(gains, BANK.frequency, BANK.damping, samples=4000, sample_rate=RATE)
     total = torch.zeros(BEGINS[-1] + 4000, dtype=torch.float64)
     for begin, sound in zip(BEGINS, sounds, strict=True):
         total[begin : begin + 4000] += sound
@@ -146,8 +146,7 @@ def test_ringing_is_followed_and_fitted_exactly() -> None:
     size = torch.ones(len(BANK))
     modes = Ringing.of(BANK, size, sample_rate=RATE, window=480)
     amplitudes = torch.complex(*torch.randn(2, len(BANK), generator=torch.Generator().manual_seed(0)).double())
-    parts = {"samples": 1200, "sample_rate": RATE, "quadrature": amplitudes.imag[None]}
-    sound = synthesize(amplitudes.real[None], BANK.frequency, BANK.damping, **parts)[0]
+    sound = synthesize(amplitudes[None], BANK.frequency, BANK.damping, samples=1200, sample_rate=RATE)[0]
     assert torch.allclose(modes.render(amplitudes, 1200), sound, atol=1e-9)
     assert torch.allclose(modes.render(modes.after(amplitudes, 300), 900), sound[300:], atol=1e-9)
     assert torch.allclose(modes.fit(sound[:480], 0.0), amplitudes, atol=1e-6)

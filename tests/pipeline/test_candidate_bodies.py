@@ -82,7 +82,7 @@ def recorded(count: int, seed: int = 0) -> tuple[Impacts, Extraction]:
     impacts = Impacts(contacts, sounds, RATE, names, directions.float())
     found = fit_sine_gains(sounds, bank, sample_rate=RATE)
     residual = Residual(torch.full((65,), LEVEL))
-    return impacts, Extraction(bank, found, residual, torch.zeros_like(found))
+    return impacts, Extraction(bank, found + 0j, residual)
 
 
 def case(count: int = 12, **changes: torch.Tensor | None) -> GainData:
@@ -179,7 +179,7 @@ def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
     impacts = Impacts(torch.zeros(draws, 3), noise, RATE, tuple(str(row) for row in range(draws)))
     for frequency, damping in ((800.0, 3.0), (2500.0, 60.0)):
         bank = ModalBank(still + frequency, still + damping)
-        modes = Extraction(bank, gains, Residual(torch.full((65,), LEVEL)), gains)
+        modes = Extraction(bank, torch.complex(gains, gains), Residual(torch.full((65,), LEVEL)))
         made = GainData(impacts, features(), modes, still, gains, CONFIG)
         scatter = float(fit_sine_gains(noise, bank, sample_rate=RATE).double().square().mean())
         assert float(gain_variance(made)) == pytest.approx(scatter, rel=0.1)

@@ -29,9 +29,7 @@ def contact() -> ContactMap:
     field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), RATE, SAMPLES, Origin("plate"))
     locator = Locator.of(field)
     gains = locator.gains[[STRUCK]].to(torch.complex128)
-    (sound,) = synthesize(
-        gains.real, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=RATE, quadrature=gains.imag
-    )
+    (sound,) = synthesize(gains, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=RATE)
     noise = torch.randn(SAMPLES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return locator.locate((sound + 1e-3 * sound.abs().max() * noise).float())
 

@@ -35,11 +35,12 @@ def rings(simulation: Simulation) -> torch.Tensor:
     assert truth.starts is not None
     samples = torch.arange(simulation.recordings.shape[1], dtype=torch.float64)
     rows = []
-    for start, gains, quadrature in zip(truth.starts, truth.gains, truth.quadrature, strict=True):
+    for start, gains in zip(truth.starts, truth.gains, strict=True):
         times = (samples - start) / simulation.recipe.sample_rate
         turns = 2 * math.pi * truth.frequency[:, None] * times
         decay = torch.exp(-truth.damping[:, None] * times.clamp(min=0.0))
-        rows.append((times >= 0.0) * (gains @ (decay * torch.sin(turns)) + quadrature @ (decay * torch.cos(turns))))
+        waves = gains.real @ (decay * torch.sin(turns)) + gains.imag @ (decay * torch.cos(turns))
+        rows.append((times >= 0.0) * waves)
     return torch.stack(rows)
 
 
@@ -206,7 +207,7 @@ def test_a_written_object_is_an_ordinary_capture_with_views_and_truth(simulation
     assert len(views) == 3
     assert views[0].image.shape == (48, 48, 3)
     truth = read_truth(folder)
-    for name in ("frequency", "damping", "gains", "quadrature", "contacts", "starts"):
+    for name in ("frequency", "damping", "gains", "contacts", "starts"):
         assert torch.equal(getattr(truth, name), getattr(simulation.truth, name))
     assert truth.names == simulation.truth.names
     assert truth.recipe == simulation.recipe.values()

@@ -101,7 +101,7 @@ def describe(field: SoundField) -> dict[str, Any]:
 
 def gains_at(field: SoundField, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points modes"]:
     """Return the gains at many points, without a warning for a point of the field's own that is off its surface."""
-    return torch.cat([field.known(part).mean for part in torch.split(points, _BATCH)])
+    return torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])
 
 
 def draw_field(

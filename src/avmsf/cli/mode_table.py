@@ -93,7 +93,7 @@ def levels(amplitudes: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes
 
 def amplitudes(extraction: Extraction) -> Float[Tensor, "contacts modes"]:
     """Return the modes' amplitudes in each recording, whatever their phase."""
-    return torch.hypot(extraction.gains, extraction.quadrature)
+    return extraction.gains.abs()
 
 
 def mode_table(title: str, rows: Sequence[ModeRow], quality: Mapping[int, QualityRow] | None = None) -> object:

@@ -255,10 +255,7 @@ class FieldAtContacts:
         """Return the sounds of the modes, edited if an edit is given, without the residual; differentiable in it."""
         if edit is None:
             return self.field.modal_sounds(self.known, self.samples)
-        scale, quadrature = edit.scale.exp().to(self.known.mean), self.known.quadrature
-        scaled = replace(
-            self.known, mean=self.known.mean * scale, quadrature=None if quadrature is None else quadrature * scale
-        )
+        scaled = replace(self.known, mean=self.known.mean * edit.scale.exp().to(self.known.mean))
         return replace(self.field, bank=edit.bank(self.field.bank)).modal_sounds(scaled, self.samples)
 
     def loudest(self, count: int) -> Int[Tensor, " edited"]:

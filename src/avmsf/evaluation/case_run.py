@@ -123,7 +123,7 @@ class ObjectData:
         signs of the gains, and which the truth of all does not have."""
         truth = None if evaluation.time_zero == "peak" else truth_of(dataset, identifier)
         digest = hashlib.sha256(self.impacts.digest().encode())
-        for tensor in () if truth is None else (truth.frequency, truth.damping, truth.gains, truth.quadrature):
+        for tensor in () if truth is None else (truth.frequency, truth.damping, truth.gains.real, truth.gains.imag):
             digest.update(tensor.contiguous().numpy().tobytes())
         self.digest = digest.hexdigest()
         """Of all that values depend on of the object's recordings and truth."""

@@ -131,7 +131,7 @@ class FieldMethod:
         if len(rows_by_place(train.contacts)) < _FEWEST_TO_VALIDATE or not held:
             return base, {"validated": False}
         learnt = [row for row in range(len(train)) if row not in held]
-        taken = replace(modes, gains=modes.gains[learnt], quadrature=modes.quadrature[learnt])
+        taken = modes.take(learnt)
         candidates = list(grid.candidates(base))
         errors = [
             _envelope_error(self._fitted(task, train.take(learnt), features, taken, config), train.take(held))
@@ -207,10 +207,6 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
     power = float(train.sounds.double().square().mean())
     # A mode of gain one has the energy 1 / (4 d) over time, and so the mean power 1 / (4 d) over the duration.
     gain = math.sqrt(power * train.duration / float((1 / (4 * damping)).sum()))
-    gains = torch.full((len(train), modes), gain)
-    return Extraction(
-        ModalBank(frequency, damping),
-        gains,
-        Residual(torch.full((bins,), _NOISE * math.sqrt(power))),
-        torch.zeros_like(gains),
-    )
+    gains = torch.full((len(train), modes), gain) + 0j
+    residual = Residual(torch.full((bins,), _NOISE * math.sqrt(power)))
+    return Extraction(ModalBank(frequency, damping), gains, residual)

@@ -90,7 +90,7 @@ class ModalBaseline(_Trained, ABC):
 
         Of two impacts from opposite sides of a thin wall the gains are opposite too, and their mean would be silence.
         """
-        amplitudes = torch.complex(self.extraction.quadrature, -self.extraction.gains)
+        amplitudes = -1j * self.extraction.gains
         return amplitudes * orientation_signs(self.train.contacts, self.train.directions).to(amplitudes)[:, None]
 
     @abstractmethod
@@ -103,14 +103,8 @@ class ModalBaseline(_Trained, ABC):
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the modes' sound at each contact, and the noise where there is any."""
         amplitudes, samples = self.complex_gains(contacts), self.train.sounds.shape[1]
-        sounds = synthesize(
-            -amplitudes.imag,
-            self.bank.frequency,
-            self.bank.damping,
-            samples=samples,
-            sample_rate=self.train.sample_rate,
-            quadrature=amplitudes.real,
-        )
+        bank, rate = self.bank, self.train.sample_rate
+        sounds = synthesize(1j * amplitudes, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
         if not self.noise:
             return sounds
         generator = torch.Generator().manual_seed(self.seed)
@@ -210,24 +204,14 @@ class RandomImpact:
 
 
 def floor(test: Impacts, bank: ModalBank, *, sines: bool = False) -> Float[Tensor, "contacts samples"]:
-    """Return the test sounds as `bank` expresses them best: their own gains, in phase and in quadrature.
+    """Return the test sounds as `bank` expresses them best: their own complex gains.
 
     No gains that are predicted for the same modes come nearer in the squared error of the waveform. With `sines` they
     are damped sines without cosines: all that the paper's equation 3 has.
     """
-    gains, quadrature = (
-        (fit_sine_gains(test.sounds, bank, sample_rate=test.sample_rate), None)
-        if sines
-        else fit_gains(test.sounds, bank, sample_rate=test.sample_rate)
-    )
-    return synthesize(
-        gains,
-        bank.frequency,
-        bank.damping,
-        samples=test.sounds.shape[1],
-        sample_rate=test.sample_rate,
-        quadrature=quadrature,
-    )
+    rate, samples = test.sample_rate, test.sounds.shape[1]
+    gains = (fit_sine_gains if sines else fit_gains)(test.sounds, bank, sample_rate=rate)
+    return synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
 
 
 @dataclass(frozen=True, eq=False)

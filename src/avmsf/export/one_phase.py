@@ -26,7 +26,7 @@ def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
     phase that is common to all points, so that it changes at the mode's nodal lines.
     """
     amplitude = torch.complex(field.sine.double(), field.cosine.double())
-    phase = common_phase(field.sine, field.cosine)
+    phase = common_phase(amplitude)
     along = (amplitude * torch.polar(torch.ones_like(phase), -phase)).real
     return torch.where(along < 0, -amplitude.abs(), amplitude.abs()).float()
 
@@ -56,12 +56,11 @@ def approximation_error(
     rows = field.spread(_COMPARED_POINTS)
     zero = torch.zeros(len(rows), len(field.frequency))
     rendered = synthesize(
-        zero if sine is None else sine[rows],
+        torch.complex(zero if sine is None else sine[rows], zero if cosine is None else cosine[rows]),
         field.frequency,
         damping if damping.ndim == 1 else damping[rows],
         samples=field.samples,
         sample_rate=field.sample_rate,
-        quadrature=zero if cosine is None else cosine[rows],
     )
     reference = field.render(rows)
     peak = float(reference.abs().max())

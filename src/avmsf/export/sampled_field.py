@@ -90,13 +90,8 @@ class SampledField:
         parts = torch.split(places, _BATCH)
         ways = [None] * len(parts) if directions is None else torch.split(directions, _BATCH)
         known = [sound_field.known(part, directions=way) for part, way in zip(parts, ways, strict=True)]
-        along, ahead = torch.cos(sound_field.phase), torch.sin(sound_field.phase)
-        sines, cosines = [], []
-        for part in known:
-            mean = part.mean.double()
-            quadrature = torch.zeros_like(mean) if part.quadrature is None else part.quadrature.double()
-            sines.append((mean * along - quadrature * ahead)[:, audible].float())
-            cosines.append((mean * ahead + quadrature * along)[:, audible].float())
+        turn = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase)
+        gains = torch.cat([(part.mean * turn)[:, audible].to(torch.complex64) for part in known])
         damping = sound_field.bank.damping[audible]
         factors = [part.damping[:, audible] for part in known if part.damping is not None]
         return cls(
@@ -104,8 +99,8 @@ class SampledField:
             torch.nn.functional.normalize(normals.float(), dim=1),
             sound_field.bank.frequency[audible],
             damping * torch.cat(factors) if factors else damping,
-            torch.cat(sines),
-            torch.cat(cosines),
+            gains.real.contiguous(),
+            gains.imag.contiguous(),
             sound_field.noise().float(),
             sound_field.sample_rate,
             sound_field.origin.per_newton,
@@ -173,12 +168,11 @@ class SampledField:
         parts = []
         for chosen in torch.split(rows, _RENDER_BATCH):
             modes = synthesize(
-                self.sine[chosen],
+                torch.complex(self.sine[chosen], self.cosine[chosen]),
                 self.frequency,
                 self.damping if self.shared_damping else self.damping[chosen],
                 samples=length,
                 sample_rate=self.sample_rate,
-                quadrature=self.cosine[chosen],
             )
             parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
         sounds = torch.cat(parts)

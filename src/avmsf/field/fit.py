@@ -102,7 +102,7 @@ def fingerprint(data: GainData, estimator: GainEstimator) -> str:
     digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
     tensors = [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
     # Phases, and without a warm-up how strong the modes are, are those of the extraction.
-    for tensor in (*tensors, modes.gains, modes.quadrature):
+    for tensor in (*tensors, modes.gains.real, modes.gains.imag):
         digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

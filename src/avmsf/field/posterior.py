@@ -184,13 +184,13 @@ def coverage(
 
 def _spectra(field: SoundField, modes: Tensor) -> Tensor:
     """Return the spectrum of each mode by itself, [modes, 2, frequencies], of a gain of one in either part."""
-    one = torch.eye(len(modes), dtype=torch.float64)
+    one = torch.eye(len(modes), dtype=torch.complex128)
     sounds = [
         synthesize(
-            first, field.bank.frequency[modes], field.bank.damping[modes], field.phase[modes],
-            samples=field.samples, sample_rate=field.sample_rate, quadrature=second,
+            gains, field.bank.frequency[modes], field.bank.damping[modes], field.phase[modes],
+            samples=field.samples, sample_rate=field.sample_rate,
         )
-        for first, second in ((one, torch.zeros_like(one)), (torch.zeros_like(one), one))
+        for gains in (one, 1j * one)
     ]  # fmt: skip
     return torch.fft.rfft(torch.stack(sounds, dim=1))
 

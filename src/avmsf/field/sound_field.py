@@ -157,10 +157,11 @@ class SoundField:
     def gains(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Float[Tensor, "contacts modes"]:
         """Return the signed amplitudes at the contacts (object frame, meters), in the unit of the training sounds.
 
+        They are those along each mode's phase; `complex_gains` has what is ahead of it too.
         `directions`, unit vectors, are those of the impacts; without them they go straight into the surface.
         """
         places, ways = self._impacts(contacts, directions)
-        return self.known(places, directions=ways).mean
+        return self.known(places, directions=ways).mean.real
 
     def complex_gains(
         self, contacts: ArrayLike, *, directions: ArrayLike | None = None
@@ -282,5 +283,4 @@ class SoundField:
             self.phase[rows],
             samples=samples,
             sample_rate=self.sample_rate,
-            quadrature=None if known.quadrature is None else known.quadrature[:, rows],
         )

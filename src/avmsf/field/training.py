@@ -195,7 +195,6 @@ class TrainingRun(nn.Module):
             self.phase,
             samples=self.samples,
             sample_rate=self.sample_rate,
-            quadrature=gains.quadrature,
         )
         if not self.config.residual:
             return sounds
@@ -238,7 +237,7 @@ class TrainingRun(nn.Module):
 
         Each mode weighs as its energy over time does, gain^2 / (4 d): by the sound that it makes; or alike (paper).
         """
-        gains = self.network.read(targets.rows).mean
+        gains = self.network.read(targets.rows).mean.real
         return ((gains - targets.gains).square() * self.weight).sum(1).mean()
 
     def state(self) -> dict[str, Any]:

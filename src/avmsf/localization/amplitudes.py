@@ -115,12 +115,11 @@ class Extractor:
     ) -> tuple[Float64[Tensor, " bands"], float]:
         """Return the noise's power in bands up to half the sample rate, and on the mean what is there throughout."""
         modelled = synthesize(
-            values.real[None],
+            values[None],
             self.bank.frequency,
             self.bank.damping,
             samples=self.samples,
             sample_rate=self.sample_rate,
-            quadrature=values.imag[None],
         )[0]
         # Each amplitude takes its share of the noise away.
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)

@@ -273,5 +273,4 @@ def predict_ringing(
     extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
     values = extractor.extract(sound[begin:stop], color=None).values
     values = values * poles_of(bank, rate) ** (start - begin)
-    sines, cosines = values.real[None], values.imag[None]
-    return synthesize(sines, bank.frequency, bank.damping, samples=samples, sample_rate=rate, quadrature=cosines)[0]
+    return synthesize(values[None], bank.frequency, bank.damping, samples=samples, sample_rate=rate)[0]

@@ -70,8 +70,7 @@ def predict(
             variances.append(torch.zeros(known.mean.shape))
         else:
             variances.append((factor * known.std).square().sum(2).float())
-        ahead = torch.zeros_like(known.mean) if known.quadrature is None else known.quadrature
-        gains.append(torch.complex(known.mean.float(), ahead.float()) * rotated)
+        gains.append(known.mean.to(torch.complex64) * rotated)
         if known.damping is not None:
             dampings.append(known.damping.float())
     return torch.cat(gains), torch.cat(variances), torch.cat(dampings) if dampings else None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Complex, Float, Float64
 from scipy.special import betainc
 from torch import Tensor
 
@@ -38,17 +38,14 @@ class ModalBank:
 
 # A hammer's push takes time and sound takes time to the microphone, so that no recording starts as pure sines. The
 # contact decides a mode's strength and sign; what shifts its phase, pulse and path to the microphone, stays.
-def common_phase(
-    gains: Float[Tensor, "contacts modes"], quadrature: Float[Tensor, "contacts modes"]
-) -> Float64[Tensor, " modes"]:
+def common_phase(gains: Complex[Tensor, "contacts modes"]) -> Float64[Tensor, " modes"]:
     """Return the phase of each mode, radians in (-pi/2, pi/2], that all contacts agree on best.
 
-    Mode k starts at contact i as gains sin + quadrature cos = Im(a_ik exp(i w t)) with a = gains + i quadrature. The
-    phase p that leaves most energy in the real part of a exp(-i p), over all contacts and whatever their signs, is half
-    the argument of the sum over contacts of a^2.
+    Mode k starts at contact i as Im(c_ik exp(i w t)) with the gain c. The phase p that leaves most energy in the real
+    part of c exp(-i p), over all contacts and whatever their signs, is half the argument of the sum over contacts of
+    c^2.
     """
-    amplitudes = torch.complex(gains.double(), quadrature.double())
-    return torch.angle(amplitudes.square().sum(dim=0)) / 2
+    return torch.angle(gains.to(torch.complex128).square().sum(dim=0)) / 2
 
 
 def turned_like(

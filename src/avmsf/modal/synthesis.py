@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Inexact
 from torch import Tensor
 
 _BLOCK = 512
@@ -19,24 +19,23 @@ fastest from about 256 on."""
 
 
 def synthesize(
-    gains: Float[Tensor, "contacts modes"],
+    gains: Inexact[Tensor, "contacts modes"],
     frequency: Float64[Tensor, " modes"],
     damping: Float64[Tensor, "*contacts modes"],
     phase: Float64[Tensor, " modes"] | None = None,
     *,
     samples: int,
     sample_rate: float,
-    quadrature: Float[Tensor, "contacts modes"] | None = None,
 ) -> Float[Tensor, "contacts samples"]:
-    """Return the sum over modes of gains exp(-d t) sin(2 pi f t) (paper, eq. 3), plus quadrature's cosines if given.
+    """Return the sum over modes of Im(c exp((-d + 2 pi i f) t)): of real gains c sines, as in the paper's eq. 3.
 
-    `frequency` in Hz, `damping` in 1/s, shared by all contacts or with one row a contact; sines and cosines are ahead
-    by `phase`, radians, zero without it; differentiable in all of them. Modes at or above half the sample rate would
-    alias: the caller leaves them out. The output has the dtype of `gains`: in float32 its error is about 1e-7 of the
-    loudest sample, in float64 it is exact.
+    `frequency` in Hz, `damping` in 1/s, shared by all contacts or with one row a contact; sines are ahead by `phase`,
+    radians, zero without it; differentiable in all of them. Modes at or above half the sample rate would alias: the
+    caller leaves them out. The output has the precision of `gains`: in float32 its error is about 1e-7 of the loudest
+    sample, in float64 it is exact.
     """
     # As the real part of a exp(i x), since products of complex tables are few calls.
-    amplitudes = torch.complex(torch.zeros_like(gains) if quadrature is None else quadrature, -gains)
+    amplitudes = torch.complex(gains.imag if gains.is_complex() else torch.zeros_like(gains), -gains.real)
     if phase is not None:
         amplitudes = amplitudes * torch.exp(1j * phase).to(amplitudes.dtype)
     blocks = math.ceil(samples / _BLOCK)

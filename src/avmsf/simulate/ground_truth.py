@@ -29,6 +29,7 @@ _KIND = FileKind(
     formats=(1, 2),
 )
 _MODES, _TABLES = ("frequency", "damping"), ("gains", "quadrature")
+"""Tensors of a file: the real and the imaginary part of the gains are two."""
 _OPTIONAL = ("contacts", "starts")
 _RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}
 """Settings of recipes in files of earlier versions, and their names now."""
@@ -38,18 +39,16 @@ _RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}
 class Truth:
     """The modes in a set of simulated recordings, row for row of its `Impacts`.
 
-    Recording i is, but for noise, the sum over modes k of exp(-d_k t) (gains[i, k] sin(2 pi f_k t) + quadrature[i, k]
-    cos(2 pi f_k t)), with t the time since the impact's sound arrived, and silence before.
+    Recording i is, but for noise, the sum over modes k of Im(gains[i, k] exp((-d_k + 2 pi i f_k) t)), with t the time
+    since the impact's sound arrived, and silence before.
     """
 
     frequency: Float64[Tensor, " modes"]
     """Damped frequencies, Hz, ascending."""
     damping: Float64[Tensor, " modes"]
     """Amplitude decay rates, 1/s."""
-    gains: Float64[Tensor, "contacts modes"]
-    """Signed amplitudes in phase, in the unit of the recordings."""
-    quadrature: Float64[Tensor, "contacts modes"]
-    """Amplitudes in quadrature."""
+    gains: Complex128[Tensor, "contacts modes"]
+    """In the unit of the recordings: the real part of sines, the imaginary part of cosines."""
     names: tuple[str, ...]
     """The recordings' names, in the order of the rows."""
     recipe: dict[str, Any] = field(default_factory=dict)
@@ -63,7 +62,7 @@ class Truth:
     @property
     def amplitudes(self) -> Complex128[Tensor, "contacts modes"]:
         """Amplitudes A: recording i is the real part of the sum of A[i] exp((-d + 2 pi i f) t)."""
-        return torch.complex(self.quadrature, -self.gains)
+        return -1j * self.gains
 
     def after(self, seconds: float) -> "Truth":
         """Return the same modes with time counted from `seconds` later in all recordings, before where negative.
@@ -71,8 +70,7 @@ class Truth:
         Each mode's amplitude is multiplied by exp(pole * seconds). `starts` still name the impacts.
         """
         poles = torch.complex(-self.damping, 2 * math.pi * self.frequency)
-        amplitudes = self.amplitudes * torch.exp(poles * seconds)
-        return replace(self, gains=-amplitudes.imag, quadrature=amplitudes.real.clone())
+        return replace(self, gains=self.gains * torch.exp(poles * seconds))
 
 
 def write_truth(truth: Truth, path: str | Path) -> None:
@@ -82,8 +80,8 @@ def write_truth(truth: Truth, path: str | Path) -> None:
     could not be read back.
     """
     path = Path(path)
-    tensors = {name: getattr(truth, name) for name in (*_MODES, *_TABLES, *_OPTIONAL)}
-    tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
+    tensors = {name: getattr(truth, name) for name in (*_MODES, *_OPTIONAL) if getattr(truth, name) is not None}
+    tensors |= {"gains": truth.gains.real.contiguous(), "quadrature": truth.gains.imag.contiguous()}
     record = {"names": list(truth.names), "recipe": truth.recipe}
     _expect(tensors, record, path)
     write_tensors(path, tensors, _KIND.to_text(record, path, name="recipe"), _KIND)
@@ -101,7 +99,8 @@ def read_truth(path: str | Path) -> Truth:
     record = _KIND.parse(text, path, _check_record)
     _expect(tensors, record, path)
     recipe = {_RENAMED.get(name, name): value for name, value in record["recipe"].items()}
-    return Truth(names=tuple(record["names"]), recipe=recipe, **tensors)
+    gains = torch.complex(tensors.pop("gains"), tensors.pop("quadrature"))
+    return Truth(gains=gains, names=tuple(record["names"]), recipe=recipe, **tensors)
 
 
 def _check_record(record: dict[str, Any]) -> None:

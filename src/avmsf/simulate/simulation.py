@@ -47,14 +47,8 @@ def recorded(
     first = starts.ceil().clamp(min=0.0)
     late = (first - starts) / sample_rate
     moved = amplitudes * torch.exp(poles * late[:, None])
-    sounds = synthesize(
-        -moved.imag,
-        poles.imag / (2 * math.pi),
-        -poles.real,
-        samples=samples,
-        sample_rate=sample_rate,
-        quadrature=moved.real,
-    )
+    frequency, damping = poles.imag / (2 * math.pi), -poles.real
+    sounds = synthesize(1j * moved, frequency, damping, samples=samples, sample_rate=sample_rate)
     whole = torch.zeros_like(sounds)
     for row, begin in enumerate(first.long().tolist()):
         whole[row, begin:] = sounds[row, : samples - begin]
@@ -223,8 +217,7 @@ def record(
     truth = Truth(
         frequency=body.vibration.frequency,
         damping=body.vibration.damping,
-        gains=-amplitudes.imag,
-        quadrature=amplitudes.real.clone(),
+        gains=1j * amplitudes,
         names=tuple(f"{row + 1:03d}.wav" for row in range(len(sounds))),
         recipe=recipe.values(),
         contacts=strikes.places,

@@ -47,7 +47,7 @@ def error_elsewhere(model: MixtureGains) -> torch.Tensor:
     asked = impacts(60, seed=5)
     gains = model.predict(asked.points, asked.directions)
     true = measured(asked, noise=0.0).values
-    error = torch.complex(gains.mean, gains.quadrature) - true
+    error = gains.mean - true
     return (error.abs().square().mean(0) / true.abs().square().mean(0)).sqrt()
 
 

@@ -29,12 +29,12 @@ def direction() -> torch.Tensor:
 
 def read(gains: RefinedGains) -> torch.Tensor:
     found = gains.read(torch.arange(CONTACTS))
-    return torch.complex(found.mean.double(), found.quadrature.double()).detach()
+    return found.mean.to(torch.complex128).detach()
 
 
 def mean_at_contacts(gains) -> torch.Tensor:
     found = gains.predict(gains.contacts, gains.training.directions)
-    return torch.complex(found.mean.double(), found.quadrature.double())
+    return found.mean.to(torch.complex128)
 
 
 def test_gains_start_as_the_models_mean_at_the_contacts():

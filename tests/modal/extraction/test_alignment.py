@@ -168,8 +168,7 @@ def test_extraction_aligns_first_and_its_file_keeps_the_alignment(tmp_path: Path
     assert torch.equal(once.alignment.delays, again.alignment.delays)
     assert torch.equal(once.aligned(impacts).sounds, again.aligned(impacts).sounds)
     assert torch.equal(once.aligned(impacts.take([3])).sounds, again.aligned(impacts).sounds[3:4])
-    amplitude = torch.complex(found.quadrature.double(), -found.gains.double())
-    assert coherence(amplitude, found.bank.damping) > 0.99
+    assert coherence(found.gains.to(torch.complex128), found.bank.damping) > 0.99
 
 
 @pytest.mark.skipif(not (SHARED / "tree43").is_dir(), reason="needs the measured data: set AVMSF_SHARED")

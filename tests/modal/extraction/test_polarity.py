@@ -1,5 +1,7 @@
 """Recordings of inverted sign, among contacts that are near one another and far apart."""
 
+from dataclasses import replace
+
 import torch
 
 from avmsf.capture.impacts import Impacts
@@ -18,7 +20,7 @@ def beam(contacts: int, *, seed: int = 0) -> tuple[Extraction, Impacts]:
     shapes = shapes + 0.02 * torch.randn(shapes.shape, dtype=torch.float64, generator=generator)
     phase = torch.rand(6, dtype=torch.float64, generator=generator) * 3
     bank = ModalBank(100 * number.square(), 5 * number)
-    modes = Extraction(bank, (shapes * phase.cos()).float(), Residual(torch.zeros(17)), (shapes * phase.sin()).float())
+    modes = Extraction(bank, (shapes * torch.exp(1j * phase)).to(torch.complex64), Residual(torch.zeros(17)))
     points = torch.stack([along, torch.zeros(contacts), torch.zeros(contacts)], dim=1)
     names = tuple(f"{row:03d}.wav" for row in range(contacts))
     return modes, Impacts(points.float(), torch.zeros(contacts, 64), 8000.0, names)
@@ -27,7 +29,7 @@ def beam(contacts: int, *, seed: int = 0) -> tuple[Extraction, Impacts]:
 def inverted(modes: Extraction, rows: list[int]) -> Extraction:
     signs = torch.ones(len(modes.gains), 1)
     signs[rows] = -1
-    return Extraction(modes.bank, modes.gains * signs, modes.residual, modes.quadrature * signs)
+    return replace(modes, gains=modes.gains * signs)
 
 
 def test_each_inverted_recording_is_named_and_no_other() -> None:
@@ -49,10 +51,8 @@ def test_opposite_directions_are_no_inversion() -> None:
 
 def test_far_contacts_and_few_recordings_are_not_judged() -> None:
     modes, impacts = beam(30)
-    modes = Extraction(
-        modes.bank, torch.randn(modes.gains.shape, generator=torch.Generator().manual_seed(1)), modes.residual,
-        torch.zeros_like(modes.quadrature),
-    )  # fmt: skip
+    random = torch.randn(modes.gains.shape, generator=torch.Generator().manual_seed(1))
+    modes = replace(modes, gains=random + 0j)
     assert inverted_recordings(modes, impacts) == ()
     few, struck = beam(5)
     assert inverted_recordings(inverted(few, [1]), struck) == ()

@@ -32,10 +32,8 @@ def bank_of(*poles: tuple[float, float]) -> ModalBank:
 TRUTH = bank_of((400.0, 8.0), (700.0, 15.0), (1500.0, 30.0))
 
 
-def record(bank: ModalBank, gains: Tensor, *, noise: float = LEVEL, seed: int = 0, quadrature: float = 0.0) -> Tensor:
-    sounds = synthesize(
-        gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE, quadrature=quadrature * gains
-    )
+def record(bank: ModalBank, gains: Tensor, *, noise: float = LEVEL, seed: int = 0) -> Tensor:
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
     return sounds + noise * torch.randn(sounds.shape, generator=seeded(seed), dtype=torch.float64)
 
 
@@ -48,8 +46,7 @@ def shapes(contacts: int, modes: int, seed: int = 3) -> Tensor:
 
 
 def fitted(sounds: Tensor, bank: ModalBank) -> Extraction:
-    gains, quadrature = fit_gains(sounds, bank, sample_rate=RATE)
-    return Extraction(bank, gains, Residual(torch.zeros(5)), quadrature)
+    return Extraction(bank, fit_gains(sounds, bank, sample_rate=RATE), Residual(torch.zeros(5)))
 
 
 def quality_of(sounds: Tensor, bank: ModalBank) -> ModeQuality:
@@ -139,11 +136,9 @@ def test_a_pole_that_is_fitted_to_a_strong_modes_remains_is_no_mode() -> None:
 def test_coherence_is_one_for_one_phase_modulo_pi_and_low_for_random_phases() -> None:
     bank = bank_of((700.0, 15.0))
     gains = shapes(64, 1)
-    assert float(quality_of(record(bank, gains, quadrature=-0.7), bank).coherence) > 0.999
+    assert float(quality_of(record(bank, (1 - 0.7j) * gains), bank).coherence) > 0.999
     turned = torch.polar(torch.ones(64, 1), 2 * math.pi * torch.rand(64, 1, generator=seeded(8))).to(torch.complex128)
-    sounds = synthesize(
-        turned.real, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE, quadrature=turned.imag
-    )
+    sounds = synthesize(turned, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
     # Of 64 random phases the resultant is 1/8 in the root mean square.
     assert float(quality_of(sounds, bank).coherence) < 0.35
 

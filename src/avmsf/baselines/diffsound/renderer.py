@@ -104,8 +104,8 @@ class DiffSound:
             raise LocationError(
                 "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
             )
-        sine, cosine = fit_gains(audible[None], self.bank, sample_rate=self.sample_rate)
-        return cosine_distance(gains.to(torch.complex64), torch.complex(sine[0], cosine[0]), self.bank.frequency)
+        found = fit_gains(audible[None], self.bank, sample_rate=self.sample_rate)[0]
+        return cosine_distance(gains.to(torch.complex64), found, self.bank.frequency)
 
 
 def fit_diffsound(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Complex128, Float, Float64
+from jaxtyping import Complex, Complex128, Float, Float64
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.distance import cdist
 from torch import Tensor
@@ -43,12 +43,11 @@ class GainData:
     @property
     def values(self) -> Complex128[Tensor, "contacts modes"]:
         """The extracted gains: amplitudes along each mode's phase, and a quarter of a period ahead of it."""
-        return along_phase(self.modes.gains, self.modes.quadrature, self.phase)
+        return along_phase(self.modes.gains, self.phase)
 
     def take(self, rows: Sequence[int]) -> "GainData":
         """Return the data of some of the recordings, with the same modes and phases."""
-        modes = replace(self.modes, gains=self.modes.gains[rows], quadrature=self.modes.quadrature[rows])
-        return replace(self, train=self.train.take(rows), modes=modes, gains=self.gains[rows])
+        return replace(self, train=self.train.take(rows), modes=self.modes.take(rows), gains=self.gains[rows])
 
 
 def gain_data(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainData:
@@ -61,7 +60,7 @@ def gain_data(train: Impacts, features: FeatureField, modes: Extraction, config:
     modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
     phase = torch.zeros_like(modes.bank.frequency)
     if config.phase == "common":
-        phase = common_phase(modes.gains, modes.quadrature)
+        phase = common_phase(modes.gains)
     if config.residual_start == "quietest":
         power = noise_power(train.sounds, bins=len(modes.residual.magnitude)).mean(0)
         modes = replace(modes, residual=Residual(power.sqrt()))
@@ -72,18 +71,16 @@ def gain_data(train: Impacts, features: FeatureField, modes: Extraction, config:
         gains = signs * fit_sine_gains(train.sounds, modes.bank, sample_rate=train.sample_rate, phase=phase)
     else:
         # No aim then, they only say how strong the modes are: what of the extraction's own has the phase does.
-        turned = modes.gains * torch.cos(phase) + modes.quadrature * torch.sin(phase)
+        turned = modes.gains.real * torch.cos(phase) + modes.gains.imag * torch.sin(phase)
         gains = signs * turned.to(train.sounds)
     return GainData(train, features, modes, phase, gains, config)
 
 
 def along_phase(
-    gains: Float[Tensor, "contacts modes"],
-    quadrature: Float[Tensor, "contacts modes"],
-    phase: Float64[Tensor, " modes"],
+    gains: Complex[Tensor, "contacts modes"], phase: Float64[Tensor, " modes"]
 ) -> Complex128[Tensor, "contacts modes"]:
-    """Return amplitudes of sines and cosines as those along each mode's phase (radians) and a quarter period ahead."""
-    return torch.complex(gains.double(), quadrature.double()) * torch.polar(torch.ones_like(phase), -phase)
+    """Return gains relative to each mode's phase, radians: the real part along it, the imaginary one 90 deg ahead."""
+    return gains.to(torch.complex128) * torch.polar(torch.ones_like(phase), -phase)
 
 
 def orientation_signs(

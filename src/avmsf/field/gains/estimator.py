@@ -107,7 +107,7 @@ class MixtureEstimator(GainEstimator):
         # A recording of another position than its label would pull the others' gains to its sound.
         run = trainer.run("fit", refined, data.take(used.tolist()), rows[used], warmup=0, steps=data.config.steps)
         order, rate = run.order, data.train.sample_rate
-        measured = along_phase(*fit_gains(data.train.sounds, run.trained, sample_rate=rate), data.phase[order])
+        measured = along_phase(fit_gains(data.train.sounds, run.trained, sample_rate=rate), data.phase[order])
         reason = "as set" if data.config.damping == SHARED else "the only form of this gain model"
         damping = {"damping": SHARED, "validated": False, "damping_reason": reason}
         model = refined.finished(order, measured[used])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Complex128, Float, Float64
+from jaxtyping import Complex128, Float, Float64, Inexact
 from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
@@ -22,29 +22,27 @@ Directions = Float[Tensor, "contacts 3"] | None
 class Gains:
     """How strongly impacts at some contacts excite each mode."""
 
-    mean: Float[Tensor, "contacts modes"]
-    """Signed amplitudes of what starts with each mode's phase, in the unit of the training sounds."""
-    quadrature: Float[Tensor, "contacts modes"] | None = None
-    """Signed amplitudes of what is a quarter of a period ahead of that; None where there is nothing of it."""
+    mean: Inexact[Tensor, "contacts modes"]
+    """Signed amplitudes of what starts with each mode's phase, in the unit of the training sounds; the imaginary part
+    is what is a quarter of a period ahead of that. Real where there is nothing of it."""
     damping: Float[Tensor, "contacts modes"] | None = None
     """Factors on the modes' dampings; None where these are the same everywhere."""
     std: Float[Tensor, "contacts modes 2"] | None = None
-    """Posterior standard deviations of gains and quadrature, without measurement noise; None where not known."""
+    """Posterior standard deviations of real and imaginary part, without measurement noise; None where not known."""
 
     @classmethod
     def of(cls, series: Float64[Tensor, "contacts series"]) -> "Gains":
         """Return gains of series as `series_of` has them, in float32."""
-        return cls(*series.float().chunk(2, dim=1))
+        return cls(torch.complex(*series.float().chunk(2, dim=1)))
 
     @property
     def parts(self) -> Float64[Tensor, "contacts modes 2"]:
-        """The gains and the quadrature."""
-        quadrature = torch.zeros_like(self.mean) if self.quadrature is None else self.quadrature
-        return torch.stack([self.mean, quadrature], dim=2).double()
+        """Real and imaginary parts."""
+        return torch.view_as_real(self.mean.to(torch.complex128))
 
     @property
     def power(self) -> Float64[Tensor, "contacts modes"]:
-        """Squares of the amplitudes whatever their phase, gains and quadrature together."""
+        """Squares of the amplitudes, whatever their phase."""
         return self.parts.square().sum(2)
 
     def energy(self, damping: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:

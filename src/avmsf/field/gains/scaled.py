@@ -157,10 +157,9 @@ class ScaledGains(GainModel):
         return cls(fitted, tensors["mode_factors"], float(record["size_factor"]))
 
     def _scaled(self, known: Gains) -> Gains:
-        mean = (known.mean.double() * self.scale).float()
-        quadrature = None if known.quadrature is None else (known.quadrature.double() * self.scale).float()
+        mean = (known.mean * self.scale).to(known.mean.dtype)
         std = None if known.std is None else (known.std.double() * self.scale.abs()[:, None]).float()
-        return replace(known, mean=mean, quadrature=quadrature, std=std)
+        return replace(known, mean=mean, std=std)
 
 
 def _named(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

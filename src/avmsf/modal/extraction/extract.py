@@ -7,12 +7,13 @@ work that goes on after an interruption needs the very ones it began with.
 import hashlib
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
@@ -41,13 +42,16 @@ class Extraction:
     __repr__ = short_repr
 
     bank: ModalBank
-    gains: Float[Tensor, "contacts modes"]
-    """Signed amplitude of exp(-d t) sin(2 pi f t) in each recording, in the recordings' own unit."""
+    gains: Complex[Tensor, "contacts modes"]
+    """The mode is Im(c exp((-d + 2 pi i f) t)) in a recording of gain c, in the recordings' own unit: the real part is
+    what starts as a sine, the imaginary part what starts as a cosine."""
     residual: Residual
-    quadrature: Float[Tensor, "contacts modes"]
-    """Amplitude of exp(-d t) cos(2 pi f t) in each recording: the part of the mode that does not start as a sine."""
     alignment: Alignment | None = None
     """How the recordings were aligned first; None where they were taken as they are."""
+
+    def take(self, rows: Sequence[int]) -> "Extraction":
+        """Return the gains of some of the recordings, with the same modes."""
+        return replace(self, gains=self.gains[rows])
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings, these or others of the object, with the starts that the gains are of."""
@@ -91,12 +95,9 @@ def extract_sounds(
     bank = finder.find(sounds, sample_rate)
     if len(bank) == 0:
         raise _no_mode(sounds, sample_rate)
-    gains, quadrature = fit_gains(sounds, bank, sample_rate=sample_rate)
-    modes = synthesize(
-        gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
-    )
-    residual = estimate_residual(sounds, modes, bins=noise_bins(sounds.shape[1]))
-    return Extraction(bank, gains, residual, quadrature)
+    gains = fit_gains(sounds, bank, sample_rate=sample_rate)
+    modes = synthesize(gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate)
+    return Extraction(bank, gains, estimate_residual(sounds, modes, bins=noise_bins(sounds.shape[1])))
 
 
 def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ExtractionError:
@@ -146,8 +147,7 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
     tensors = {
         "frequency": found.bank.frequency,
         "damping": found.bank.damping,
-        "gains": found.gains,
-        "quadrature": found.quadrature,
+        "gains": torch.view_as_real(found.gains),
         "residual": found.residual.magnitude,
     }
     if found.alignment is not None:
@@ -171,9 +171,8 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
         kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
         return Extraction(
             ModalBank(read["frequency"], read["damping"]),
-            read["gains"],
+            torch.view_as_complex(read["gains"].contiguous()),
             Residual(read["residual"]),
-            read["quadrature"],
             Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
         )
     except (FieldFileError, KeyError):

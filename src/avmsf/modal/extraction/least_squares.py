@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex128, Float, Float64, Int64
+from jaxtyping import Complex, Complex128, Float, Float64, Int64
 from torch import Tensor
 
 from avmsf.modal.inner_products import gram, poles_of, project
@@ -16,15 +16,13 @@ _RIDGE = 1e-13
 
 def fit_gains(
     sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float
-) -> tuple[Float[Tensor, "contacts modes"], Float[Tensor, "contacts modes"]]:
-    """Return the in-phase (sine) and quadrature (cosine) amplitudes of `bank`'s modes that fit each sound best.
+) -> Complex[Tensor, "contacts modes"]:
+    """Return the gains c of `bank`'s modes, Im(c exp((-d + 2 pi i f) t)), that fit each sound best.
 
-    Least squares over the whole sound; amplitudes in the unit and dtype of `sounds`.
+    Least squares over the whole sound; gains in the unit and precision of `sounds`: sines and i times cosines.
     """
     system = NormalEquations.of(sounds, poles_of(bank, sample_rate))
-    coefficients = system.solve()
-    gains, quadrature = coefficients.to(sounds.dtype).chunk(2, dim=1)
-    return gains, quadrature
+    return torch.complex(*system.solve().to(sounds.dtype).chunk(2, dim=1))
 
 
 def fit_sine_gains(

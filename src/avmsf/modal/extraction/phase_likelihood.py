@@ -94,8 +94,7 @@ class MeasuredPhases:
         `background` is the noise's power at each mode (`background_power`).
         """
         rate, samples = impacts.sample_rate, impacts.sounds.shape[1]
-        gains, quadrature = fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
-        amplitude = torch.complex(quadrature, -gains)
+        amplitude = -1j * fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
         # The squared samples of exp(-d t) cos(2 pi f t) add up to this.
         energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
         scale = (amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()

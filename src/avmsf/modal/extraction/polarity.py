@@ -41,11 +41,11 @@ def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
     if modes.alignment is not None and len(left := torch.nonzero(modes.alignment.agreement < 0.5)):
         rows = [row for row in range(len(impacts)) if row not in left]
         impacts = impacts.take(rows)
-        modes = replace(modes, gains=modes.gains[rows], quadrature=modes.quadrature[rows], alignment=None)
+        modes = replace(modes.take(rows), alignment=None)
     signs, found = torch.ones(len(impacts), 1, dtype=torch.float64), list[int]()
     while len(impacts) >= _MIN_RECORDINGS and len(found) < len(impacts) // 3:
         # One at a time: an inverted recording spoils what is predicted at its neighbors.
-        turned = replace(modes, gains=modes.gains * signs, quadrature=modes.quadrature * signs)
+        turned = replace(modes, gains=modes.gains * signs)
         correlation = _predicted(turned, impacts)
         usual, worst = float(correlation.median()), int(correlation.argmin())
         deviation = max(_NORMAL * float((correlation - usual).abs().median()), 1 / math.sqrt(len(modes.bank)))
@@ -60,9 +60,10 @@ def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
 
 def _predicted(modes: Extraction, impacts: Impacts) -> Float64[Tensor, " contacts"]:
     """Return the correlation, over modes, of each recording's gains with those predicted from all others."""
-    phase = common_phase(modes.gains, modes.quadrature)
-    along = modes.gains.double() * phase.cos() + modes.quadrature.double() * phase.sin()
-    energy = (modes.gains.double().square() + modes.quadrature.double().square()) / modes.bank.damping
+    phase = common_phase(modes.gains)
+    gains = modes.gains.to(torch.complex128)
+    along = gains.real * phase.cos() + gains.imag * phase.sin()
+    energy = (gains.real.square() + gains.imag.square()) / modes.bank.damping
     # Every recording counts alike, however loud, and every mode by its energy.
     along = along / modes.bank.damping.sqrt() / energy.sum(1, keepdim=True).sqrt().clamp_min(1e-300)
     contacts = impacts.contacts.double()

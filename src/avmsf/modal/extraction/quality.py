@@ -76,7 +76,7 @@ def measure_quality(
     system = NormalEquations.of(scaled, poles_of(bank, sample_rate), weighted=True)
     explained, _ = system.lost_without()
     moves = _OwnMoves(*system.own_step(sample_rate))
-    amplitudes = torch.complex(extraction.gains.double(), extraction.quadrature.double())
+    amplitudes = extraction.gains.to(torch.complex128)
     energy = (amplitudes.abs().square() / bank.damping).sum(0)
     # Loud recordings count no more than others for phases and shapes.
     amplitudes = amplitudes[audible] / level[audible, None]

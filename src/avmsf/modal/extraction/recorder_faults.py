@@ -38,7 +38,7 @@ def rate_factors(modes: Extraction, impacts: Impacts) -> dict[str, float]:
     less than half of its energy, and explain half of it or more with all frequencies and dampings times the ratio of
     two usual sample rates, the best of these: its file gives another rate than it was recorded at.
     """
-    power = (modes.gains.double().square() + modes.quadrature.double().square()) / modes.bank.damping
+    power = torch.view_as_real(modes.gains).double().square().sum(-1) / modes.bank.damping
     power = power / power.sum(1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
     ratios = sorted({one / other for one, other in product(_RATES_HZ, _RATES_HZ)} - {1.0})
     found = {}
@@ -153,7 +153,5 @@ def _modal(
     sounds: Float64[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
 ) -> Float64[Tensor, "contacts samples"]:
     """Return what modes explain of sounds, by least squares."""
-    gains, quadrature = fit_gains(sounds, bank, sample_rate=sample_rate)
-    return synthesize(
-        gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate, quadrature=quadrature
-    )
+    gains = fit_gains(sounds, bank, sample_rate=sample_rate)
+    return synthesize(gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate)
