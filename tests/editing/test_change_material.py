@@ -65,7 +65,7 @@ def plate_field(material: Material, *, size: float = 1.0, highest: float = 3000.
 
 
 def gains_of(field: SoundField, contacts: torch.Tensor) -> torch.Tensor:
-    return field.gain_field.predict(contacts).parts
+    return field.gain_field.predict(contacts).parts.permute(2, 0, 1)
 
 
 def expect_same(found: SoundField, expected: SoundField, contacts: torch.Tensor, *, gains: float = SMALL_FLOAT) -> None:

@@ -138,7 +138,7 @@ def test_unrelated_gains_have_a_mac_near_one_over_contacts():
     contacts, modes = 200, 30
     table = torch.randn(4, contacts, modes, generator=generator, dtype=torch.float64)
     bank = ModalBank(torch.linspace(300, 9000, modes, dtype=torch.float64), torch.full((modes,), 10.0).double())
-    one = Truth(bank.frequency, bank.damping, table[0], table[1], ("",) * contacts)
+    one = Truth(bank.frequency, bank.damping, torch.complex(table[0], table[1]), ("",) * contacts)
     places = torch.zeros(contacts, 3, dtype=torch.float64)
     mac = compare_modes(Modes(bank, torch.complex(table[2], table[3])), places, one).figures()["mac"]
     # 1 / 200 for complex numbers; polarities chosen at best leave a little more.

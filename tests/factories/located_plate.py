@@ -40,7 +40,7 @@ class TrueGains(Unsaved):
         gains = plate_modes(self.plate, points, highest=self.highest).gains.float()
         shape = gains.shape
         damping = None if self.factor is None else 1.0 + self.factor * torch.linspace(0, 1, shape[1]).expand(shape)
-        return Gains(gains, 0.4 * gains.roll(1, 1) if self.turned else None, damping)
+        return Gains(gains + 0.4j * gains.roll(1, 1) if self.turned else gains, damping=damping)
 
 
 @cache

@@ -61,7 +61,7 @@ def test_force_polarity_and_onset_do_not_matter():
     assert float(late.distance.min()) < 0.1
 
 
-def test_phase_and_quadrature_are_what_the_field_renders():
+def test_complex_gains_and_phases_are_what_the_field_renders():
     field = field_of(TrueGains(plate_surface_points(PLATE, 600).float(), turned=True), phase=0.7)
     sound = field.modal_sounds(field.known(field.gain_field.points[123:124]), 7200)[0]
     found = Locator.of(field).locate(sound)
@@ -198,7 +198,7 @@ def with_the_modes_of_no_place(seed):
     generator, gains = torch.Generator().manual_seed(seed), locator_of().gains
     drawn = torch.randn(len(bank()), 2, dtype=torch.float64, generator=generator)
     values = torch.view_as_complex(drawn) / gains.abs().square().mean(0).sqrt()
-    return true_field().modal_sounds(Gains(values.real[None], values.imag[None]), 7200)[0].float()
+    return true_field().modal_sounds(Gains(values[None]), 7200)[0].float()
 
 
 @pytest.mark.parametrize("taps", [None, 25])

@@ -131,7 +131,7 @@ def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundFi
     if not isinstance(gains, MixtureGains) or gains.place_count < _MIN_PLACES:
         return field
     samples, places = train.sounds.shape[1], gains.places
-    fitted = field.modal_sounds(Gains(gains.values.real.float(), gains.values.imag.float()), samples)
+    fitted = field.modal_sounds(Gains(gains.values.to(torch.complex64)), samples)
     recordings = (train.sounds - fitted).float()
     rows, signs = gains.nearest(gains.training, places)
     neighbors = (train.sounds[rows] * signs[..., None]).float()

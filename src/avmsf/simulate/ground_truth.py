@@ -80,8 +80,9 @@ def write_truth(truth: Truth, path: str | Path) -> None:
     could not be read back.
     """
     path = Path(path)
-    tensors = {name: getattr(truth, name) for name in (*_MODES, *_OPTIONAL) if getattr(truth, name) is not None}
+    tensors = {"frequency": truth.frequency, "damping": truth.damping}
     tensors |= {"gains": truth.gains.real.contiguous(), "quadrature": truth.gains.imag.contiguous()}
+    tensors |= {name: each for name in _OPTIONAL if (each := getattr(truth, name)) is not None}
     record = {"names": list(truth.names), "recipe": truth.recipe}
     _expect(tensors, record, path)
     write_tensors(path, tensors, _KIND.to_text(record, path, name="recipe"), _KIND)

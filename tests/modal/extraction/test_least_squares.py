@@ -106,7 +106,7 @@ def test_two_modes_of_one_frequency_share_the_gain():
 
 def test_refinement_finds_the_modes_from_nearby():
     truth = bank_of([440.0, 443.0, 1000.0, 2500.0], [3.0, 4.0, 60.0, 20.0])
-    _, _, sounds = draw(truth)
+    _, sounds = draw(truth)
     start = ModalBank(
         truth.frequency + torch.tensor([0.3, -0.3, 4.0, 1.0], dtype=torch.float64),
         truth.damping * torch.tensor([1.5, 0.7, 1.4, 0.6], dtype=torch.float64),
@@ -145,7 +145,7 @@ def test_refinement_of_a_steady_tone_ends_above_no_damping():
 
 def test_lost_energy_is_the_difference_of_two_fits():
     bank = bank_of([440.0, 446.0, 1000.0], [3.0, 4.0, 60.0])
-    _, _, sounds = draw(bank)
+    _, sounds = draw(bank)
     system = NormalEquations.of(sounds, poles_of(bank, RATE))
     lost, apart = system.lost_without()
     for mode in range(3):

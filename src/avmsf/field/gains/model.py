@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -25,6 +25,7 @@ class Gains:
     mean: Inexact[Tensor, "contacts modes"]
     """Signed amplitudes of what starts with each mode's phase, in the unit of the training sounds; the imaginary part
     is what is a quarter of a period ahead of that. Real where there is nothing of it."""
+    _: KW_ONLY
     damping: Float[Tensor, "contacts modes"] | None = None
     """Factors on the modes' dampings; None where these are the same everywhere."""
     std: Float[Tensor, "contacts modes 2"] | None = None

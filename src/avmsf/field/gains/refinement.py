@@ -38,7 +38,7 @@ class RefinedGains(TrainableGains):
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return the gains at some of the model's contacts."""
         parts = (self.start + _applied(self.smoother, self.noise * _STEP * self.shift))[rows]
-        return Gains(parts[..., 0], parts[..., 1])
+        return Gains(torch.complex(parts[..., 0], parts[..., 1]))
 
     def penalty(self) -> Float[Tensor, ""]:
         """Return the squared shifts over the squared standard errors, each mode by its part of the energy."""
