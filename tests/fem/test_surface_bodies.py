@@ -199,7 +199,8 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
 
 
 @pytest.mark.parametrize(
-    ("error", "reason"), [(MemoryError(), "1500 (--body.dofs)"), (SimulationError("badly shaped"), "badly shaped")]
+    ("error", "reason"),
+    [(MemoryError(), "1500 (--set body.dofs=N)"), (SimulationError("badly shaped"), "badly shaped")],
 )
 def test_a_body_stays_coarse_where_a_finer_one_fails(
     monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody, error: Exception, reason: str
@@ -229,7 +230,7 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
     monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 2000)
     found = computed(sheet(), thicknesses=[0.004, 0.012], count=4, dofs=4000, log=messages.append)
     assert [(body.thickness, body.fine) for body in found.bodies] == [(0.004, False)]
-    assert any(message.startswith("wall of 4 mm: ") and "2000 (--body.dofs)" in message for message in messages)
+    assert any(message.startswith("wall of 4 mm: ") and "2000 (--set body.dofs=N)" in message for message in messages)
     assert list(found.refused) == [0.012]
 
 

@@ -41,7 +41,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface, SurfaceKind, read_surface, write_surface
-from avmsf.pipeline.fit import fit_in_stages, guess_in_stages
+from avmsf.pipeline.fit import StagedFit, fit_in_stages, guess_in_stages
 from avmsf.pipeline.record import capture_settings_of, modes_words
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.shape import keep_surface, object_shape
@@ -122,26 +122,31 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
         # Last, so that it is read: the field is not better than averaging recordings.
         say(str(fitted.quality))
     if options.json:
-        print_json(
-            {
-                "field": str(path),
-                "capture": fitted.origin.capture,
-                "modes": int(fitted.is_mode.sum()),
-                "supporting_poles": int((~fitted.is_mode).sum()),
-                "trained_on": list(train.names),
-                "tested_on": [] if test is None else list(test.names),
-                "report": fitted.origin.report,
-                "body": None if fitted.body is None else fitted.body.record(),
-                "scores": score_values(scores),
-                "quality": None if fitted.quality is None else fitted.quality.level,
-                "surface": None if made.surface is None else str(made.surface),
-                "preset": options.preset,
-                "config": asdict(options.pipeline.fit),
-                "features_report": made.report,
-                "stages": [asdict(each) for each in made.stages],
-                "sample_rate": fitted.sample_rate,
-            }
-        )
+        print_json(_values(options, path, fitted, made) | _split_values(train, test, scores))
+
+
+def _values(options: Options, path: Path, fitted: SoundField, made: StagedFit) -> dict[str, Any]:
+    """Return what a fit made, as plain values."""
+    return {
+        "field": str(path),
+        "capture": fitted.origin.capture,
+        "modes": int(fitted.is_mode.sum()),
+        "supporting_poles": int((~fitted.is_mode).sum()),
+        "report": fitted.origin.report,
+        "body": None if fitted.body is None else fitted.body.record(),
+        "quality": None if fitted.quality is None else fitted.quality.level,
+        "surface": None if made.surface is None else str(made.surface),
+        "preset": options.preset,
+        "config": asdict(options.pipeline.fit),
+        "features_report": made.report,
+        "stages": [asdict(each) for each in made.stages],
+        "sample_rate": fitted.sample_rate,
+    }
+
+
+def _split_values(train: Impacts, test: Impacts | None, scores: Mapping[str, Scores]) -> dict[str, Any]:
+    names = {"trained_on": list(train.names), "tested_on": [] if test is None else list(test.names)}
+    return {**names, "scores": score_values(scores)}
 
 
 def _parts(capture: Capture, options: Options) -> tuple[Impacts, Impacts | None]:

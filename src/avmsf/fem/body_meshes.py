@@ -209,7 +209,7 @@ def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: floa
     allowed = [each for each in made if each[0] <= most * dofs] or [min(made, key=itemgetter(0))]
     best, solid = min(allowed, key=lambda each: abs(math.log(each[0] / dofs)))
     if best > most * dofs:
-        got, advice = f"{best} at least", "allow these (--body.dofs), or simplify the mesh"
+        got, advice = f"{best} at least", "allow these (--set body.dofs=N), or simplify the mesh"
         raise SimulationError.expected(
             f"a mesh of {dofs} degrees of freedom", best, got=got, name="dofs", advice=advice
         )
@@ -252,7 +252,7 @@ def expect_memory(dofs: int) -> None:
     if free is not None and needed > free:
         fitting = int(measured * (free / (_CAUTION * peak)) ** (1.0 / power)) // 1000 * 1000
         wanted = f"about {needed / 1e9:.2g} GB of it free for {dofs} degrees of freedom"
-        advice = f"use {max(fitting, MIN_DOFS)} (--body.dofs), or close other programs"
+        advice = f"use {max(fitting, MIN_DOFS)} (--set body.dofs=N), or close other programs"
         raise SimulationError.expected(wanted, free, got=f"{free / 1e9:.2g} GB", name="memory", advice=advice)
 
 

@@ -322,7 +322,7 @@ class SurfaceBodies(CandidateBodies):
         if error > MAX_FREQUENCY_ERROR:
             self._log(
                 f"{name}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
-                f"allow {4 * self.dofs} degrees of freedom (--body.dofs)"
+                f"allow {4 * self.dofs} degrees of freedom (--set body.dofs=N)"
             )
         return modes
 
@@ -338,7 +338,7 @@ class SurfaceBodies(CandidateBodies):
                 return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
             except MemoryError as error:
                 wanted = f"enough memory for {size} degrees of freedom"
-                advice = f"use {max(dofs // 2, MIN_DOFS)} (--body.dofs), or close other programs"
+                advice = f"use {max(dofs // 2, MIN_DOFS)} (--set body.dofs=N), or close other programs"
                 raise SimulationError.expected(wanted, size, got="too little", name="dofs", advice=advice) from error
 
         values: dict[str, Any] = {"wall": thickness, "dofs": dofs, "perturbed": perturbed}

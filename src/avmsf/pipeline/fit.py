@@ -1,7 +1,7 @@
 """From a capture to a field in one call: its shape, from a mesh or from views, its modes, and its gains."""
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -213,23 +213,24 @@ def _fit_shape(
         )
         save(with_record(fitted, config, shape.report), path)
 
-    def is_final(path: Path) -> bool:
-        """Whether a kept field has the elastic family, or there is still none, as for want of memory."""
-        if config.gain_model == NETWORK or Elastic.kind not in load(path).origin.report.get("unavailable", {}):
-            return True
-        try:
-            bodies()
-        except AvmsfError:
-            return True
-        return False
-
     recipe = {**recorded, "features": shape.digest, "fit": asdict(config.fit), "modes": found.digest}
     recipe |= {"gain_model": config.gain_model, "name": capture.name}
     recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
-    kept = stages.keep(FIELD, recipe, make, usable=is_final)
+    kept = stages.keep(FIELD, recipe, make, usable=lambda path: _is_final(path, config, bodies))
     made = {**shape.made, "modes": found, "fit": kept}
     times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
     return StagedFit(kept.path, times, shape.report, modes, made["surface"].path if "surface" in made else None)
+
+
+def _is_final(path: Path, config: PipelineConfig, bodies: Callable[[], object]) -> bool:
+    """Return whether a kept field has the elastic family, or there are still no bodies, as for want of memory."""
+    if config.gain_model == NETWORK or Elastic.kind not in load(path).origin.report.get("unavailable", {}):
+        return True
+    try:
+        bodies()
+    except AvmsfError:
+        return True
+    return False
 
 
 def guess_in_stages(
