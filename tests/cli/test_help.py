@@ -1,16 +1,19 @@
 """What `--help` prints of every verb, and hints for names of earlier versions."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from avmsf.cli import RENAMED, main
+from avmsf.cli.options.common import Configured
 from avmsf.cli.options.edit import Options as EditOptions
+from avmsf.cli.options.evaluate import Options as EvaluateOptions
 from avmsf.cli.options.fit import Options as FitOptions
 from avmsf.cli.options.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
-from avmsf.pipeline.config import PRESETS
+from avmsf.simulate.recipe import named_recipe
 from factories.raising import raises
 
 Streams = pytest.CaptureFixture[str]
@@ -19,12 +22,12 @@ Streams = pytest.CaptureFixture[str]
 @pytest.mark.parametrize(
     ("read", "setting", "value"),
     [
-        (lambda words: FitOptions.parse(["mug", *words]).pipeline, "lift.feature_size", 0.0),
-        (lambda words: FitOptions.parse(["mug", *words]).pipeline, "splat.wrong_masks", 2.0),
+        (lambda words: FitOptions.parse(["mug", *words]).all_settings, "lift.feature_size", 0.0),
+        (lambda words: FitOptions.parse(["mug", *words]).all_settings, "splat.wrong_masks", 2.0),
         (lambda words: EditOptions.parse(["field", "-o", "new", *words]).all_settings, "guide.free_modes", 0),
         (lambda words: EditOptions.parse(["field", "-o", "new", *words]).all_settings, "contacts_per_step", 0),
-        (lambda words: SimulateOptions.parse(words).recipe, "elastic_modes", 0),
-        (lambda words: SimulateOptions.parse(words).recipe, "impacts", 1),
+        (lambda words: SimulateOptions.parse(words).all_settings, "elastic_modes", 0),
+        (lambda words: SimulateOptions.parse(words).all_settings, "impacts", 1),
     ],
 )
 def test_an_error_names_a_setting(read: Callable[[list[str]], object], setting: str, value: float) -> None:
@@ -38,14 +41,60 @@ def test_verbs_of_earlier_versions_lead_to_those_of_today(word: str, capsys: Str
     assert RENAMED[word] in capsys.readouterr().err
 
 
-def test_settings_are_printed_as_a_file_that_gives_them_back(tmp_path: Path, capsys: Streams) -> None:
-    for words, preset in ((["--preset", "paper"], PRESETS["paper"]), (["--set", "splat.steps=7"], None)):
-        with pytest.raises(SystemExit, match="0"):
-            main(["fit", *words, "--print-config"])
-        file = tmp_path / "settings.toml"
-        file.write_text(capsys.readouterr().out)
-        read = FitOptions.parse(["mug", "--config", str(file)]).pipeline
-        assert read == (preset or FitOptions.parse(["mug", *words]).pipeline)
+@pytest.mark.parametrize(
+    ("options", "needed", "words"),
+    [
+        (FitOptions, ["mug"], "--preset paper --set time_zero=null --modes 5 --seed 3 --set fft_sizes=512,256"),
+        (SimulateOptions, [], "--set noise_db=None --set mesh=a.obj -o x mug-ceramic --impacts 5 --set hammer.mass=1"),
+        (EvaluateOptions, ["farthest", "data"], "--set geometry=noisy --set body.wall=0"),
+        (EditOptions, ["field", "-o", "new"], "--set prompt.generated=x.wav --set model_seconds=Infinity"),
+    ],
+)
+def test_settings_are_printed_as_a_file_that_gives_them_back(
+    options: type[Configured], needed: list[str], words: str, tmp_path: Path, capsys: Streams
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        options.parse([*words.split(), "--print-config"])
+    file = tmp_path / "settings.toml"
+    file.write_text(capsys.readouterr().out)
+    assert options.parse([*needed, *words.split()]).all_settings != options.usual
+    read = options.parse([*needed, "--config", str(file)])
+    assert read.all_settings == options.parse([*needed, *words.split()]).all_settings
+
+
+def test_settings_are_read_once(tmp_path: Path) -> None:
+    file = tmp_path / "settings.toml"
+    file.write_text("modes = 5")
+    options = FitOptions.parse(["mug", "--config", str(file)])
+    assert options.all_settings.modes == 5
+    file.unlink()
+    assert options.all_settings.modes == 5
+
+
+@pytest.mark.parametrize("words", [["--set", "kind=bowl"], ["--kind", "bowl"], ["--seed", "0"]])
+def test_the_objects_of_a_set_stay_what_they_are(words: list[str], tmp_path: Path) -> None:
+    with raises(AvmsfError, name=words[-1].partition("=")[0] if "--set" in words else words[0].lstrip("-")):
+        SimulateOptions.parse(["sim-20", "-o", str(tmp_path / "x"), *words]).check_inputs()
+    recipe = named_recipe("mug-ceramic")
+    made = SimulateOptions.parse(["sim-20", "--impacts", "5"]).applied(recipe)
+    assert made == replace(recipe, impacts=5)
+
+
+@pytest.mark.parametrize("words", [["--modes", "4", "--set", "modes=5"], ["--seed", "1", "--set", "fit.seed=2"]])
+def test_a_setting_is_given_once(words: list[str]) -> None:
+    with raises(AvmsfError, name=words[-1].partition("=")[0]):
+        _ = FitOptions.parse(["mug", *words]).all_settings
+
+
+def test_options_that_are_settings_now_lead_to_these() -> None:
+    for options, needed, old, new in (
+        (FitOptions, ["mug"], "--body.wall", "--set body.wall="),
+        (EvaluateOptions, ["farthest", "x"], "--geometry", "--set geometry="),
+        (EditOptions, ["field", "-o", "new"], "--steps", "--set guide.steps="),
+    ):
+        with raises(AvmsfError) as caught:
+            options.parse([*needed, old, "3"])
+        assert new in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -54,12 +103,12 @@ def test_settings_are_printed_as_a_file_that_gives_them_back(tmp_path: Path, cap
 )
 def test_a_setting_has_one_name_and_a_value_of_its_type(setting: str, value: str) -> None:
     with raises(AvmsfError, value=value):
-        _ = FitOptions.parse(["mug", "--set", setting]).pipeline
+        _ = FitOptions.parse(["mug", "--set", setting]).all_settings
 
 
 def test_values_are_numbers_words_truth_values_and_lists_of_these() -> None:
     words = ["fft_sizes=512,256", "background=1,0,0.5", "lift.symmetry=false", "body.wall=0", "views.source=mesh"]
-    made = FitOptions.parse(["mug", *(each for word in words for each in ("--set", word))]).pipeline
+    made = FitOptions.parse(["mug", *(each for word in words for each in ("--set", word))]).all_settings
     assert (made.fit.fft_sizes, made.scene.splat.background) == ((512, 256), (1.0, 0.0, 0.5))
     assert (made.scene.lift.symmetry, made.body.wall, made.scene.views.source) == (False, 0.0, "mesh")
 

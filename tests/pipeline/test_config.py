@@ -26,7 +26,7 @@ PUBLISHED = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start"
 
 def test_the_default_preset_is_the_default() -> None:
     assert PRESETS["default"] == PipelineConfig()
-    assert FitOptions.parse(["mug"]).pipeline == PRESETS["default"]
+    assert FitOptions.parse(["mug"]).all_settings == PRESETS["default"]
 
 
 def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
@@ -50,9 +50,9 @@ def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
 
 
 def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
-    assert FitOptions.parse(["mug", "--preset", "paper"]).pipeline == PRESETS["paper"]
+    assert FitOptions.parse(["mug", "--preset", "paper"]).all_settings == PRESETS["paper"]
     words = ["mug", "--set", "lift.encoder=descriptors", "--preset", "paper", "--set", "fit.steps=7"]
-    mixed = FitOptions.parse(words).pipeline
+    mixed = FitOptions.parse(words).all_settings
     assert (mixed.fit.steps, mixed.fit.clusters) == (7, 256)
     assert (mixed.scene.lift.encoder, mixed.scene.lift.onto) == ("descriptors", "gaussians")
 
@@ -65,7 +65,7 @@ def test_modes_start_from_the_preset_too() -> None:
 
 
 def test_a_seed_is_that_of_all_stages() -> None:
-    made = FitOptions.parse(["mug", "--seed", "4"]).pipeline
+    made = FitOptions.parse(["mug", "--seed", "4"]).all_settings
     assert {made.fit.seed, made.scene.views.seed, made.scene.splat.seed, made.scene.lift.seed} == {4}
 
 
@@ -74,7 +74,7 @@ def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.
     other = PipelineConfig("smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu")
     assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
     monkeypatch.setitem(PRESETS, "paper", other)
-    assert FitOptions.parse(["mug", "--preset", "paper"]).pipeline == other
+    assert FitOptions.parse(["mug", "--preset", "paper"]).all_settings == other
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
@@ -82,7 +82,7 @@ def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
     assert capture_settings_of(PipelineConfig(), own) == own
     assert capture_settings_of(PRESETS["paper"], replace(own, time_zero="onset")) == own
     assert capture_settings_of(
-        FitOptions.parse(["mug", "--output", "f", "--time-zero", "onset"]).pipeline, own
+        FitOptions.parse(["mug", "--output", "f", "--time-zero", "onset"]).all_settings, own
     ) == replace(own, time_zero="onset")
 
 
@@ -90,7 +90,7 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
     page = (Path(__file__).parents[2] / "docs" / "paper-map.md").read_text(encoding="utf-8")
     table = page.partition("## The paper's form of each stage")[2].partition("\n\n`evaluate`")[0]
     words = [word for options in re.findall(r"`(--[^`]*)`", table.partition("|---|")[2]) for word in options.split()]
-    found, paper = FitOptions.parse(["mug", *words]).pipeline, PRESETS["paper"]
+    found, paper = FitOptions.parse(["mug", *words]).all_settings, PRESETS["paper"]
     silent = {name: getattr(paper.fit, name) for name in ("width", "hidden", "layers", "warmup_rate")}
     assert replace(found, fit=replace(found.fit, **silent)) == paper
 

@@ -356,7 +356,7 @@ def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.Captur
 
 def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:
     # The example has 16 contacts at 44,100 Hz where a recipe usually has 40 at 48,000.
-    recipe = options.Options.parse(["example", "--impacts", "40"]).recipe
+    recipe = options.Options.parse(["example", "--impacts", "40"]).all_settings
     assert (recipe.impacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
-    recipe = options.Options.parse(["mug-plastic", "--material", "ceramic"]).recipe
+    recipe = options.Options.parse(["mug-plastic", "--material", "ceramic"]).all_settings
     assert recipe == replace(named_recipe("mug-plastic"), material="ceramic")

@@ -131,7 +131,7 @@ def evaluation_of(
 
     Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
     """
-    device, shared = options.device, options.shared
+    device, shared = options.device, options.all_settings
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
     kept = (options.cache or folder / "features").resolve()

@@ -58,7 +58,7 @@ _SHOWN = 8
 def run(options: Options) -> int:
     """Fit, write, and print a summary; return 130 where Ctrl-C stopped it."""
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
-    settings = capture_settings_of(options.pipeline, read_settings(options.capture, options.settings))
+    settings = capture_settings_of(options.all_settings, read_settings(options.capture, options.settings))
     try:
         if options.until is not None:
             _make_stage(options, settings)
@@ -86,7 +86,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     with ProgressBar() as bar, stages.lock("avmsf fit"):
         made = fit_in_stages(
             capture,
-            options.pipeline,
+            options.all_settings,
             stages,
             train=train,
             features=features,
@@ -137,7 +137,7 @@ def _values(options: Options, path: Path, fitted: SoundField, made: StagedFit) -
         "quality": None if fitted.quality is None else fitted.quality.level,
         "surface": None if made.surface is None else str(made.surface),
         "preset": options.preset,
-        "config": asdict(options.pipeline.fit),
+        "config": asdict(options.all_settings.fit),
         "features_report": made.report,
         "stages": [asdict(each) for each in made.stages],
         "sample_rate": fitted.sample_rate,
@@ -176,7 +176,7 @@ def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
     stages = StageFolder(options.kept)
     with ProgressBar() as bar, stages.lock("avmsf fit"):
         made = guess_in_stages(
-            options.capture, material, options.pipeline, stages, settings=settings, listener=bar.listener
+            options.capture, material, options.all_settings, stages, settings=settings, listener=bar.listener
         )
         guessed, path = load(made), options.output or made
         if options.output is not None:
@@ -200,7 +200,7 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
         scene = SceneStages(
             options.capture,
             stages,
-            options.pipeline.scene,
+            options.all_settings.scene,
             settings=settings,
             listener=bar.listener,
             device=options.device,

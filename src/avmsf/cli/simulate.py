@@ -40,7 +40,7 @@ def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Pa
     if options.what in SETS:
         return {name: options.applied(recipe) for name, recipe in SETS[options.what].items()}, output
     place = output.resolve()
-    return {place.name: options.recipe}, place.parent
+    return {place.name: options.all_settings}, place.parent
 
 
 def _list(*, errors: bool) -> None:

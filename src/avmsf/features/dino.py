@@ -121,7 +121,7 @@ def _download(name: str) -> Path:
         got = f"none: they could not be downloaded ({download_failure(error)})"
         advice = (
             f"save {', '.join(_FILES)} from https://huggingface.co/{name}/tree/main in one FOLDER and use "
-            "lift.encoder=FOLDER, or use lift.encoder=descriptors, which needs no download"
+            "--set lift.encoder=FOLDER, or lift.encoder=descriptors, which needs no download"
         )
         raise SceneError.expected(f"the weights of {name}", name, got=got, name="encoder", advice=advice) from error
 

@@ -222,7 +222,7 @@ EXAMPLE = ObjectRecipe(
     view_size=192,
     surface=False,
 )
-"""`avmsf simulate example` makes it anew; `--surface` adds the mesh."""
+"""`avmsf simulate example` makes it anew; `--set surface=true` adds the mesh."""
 EXAMPLE_FOLDER = Path(__file__).parents[1] / "example"
 """The capture folder that the package ships, made of that recipe: recordings and photographs, no mesh."""
 
@@ -250,13 +250,6 @@ SIM20 = {
     for kind, material in (name.split("-"),)
 }
 """Recipes by the objects' names, in the order in which they are made."""
-NON_SYMMETRIC = tuple(
-    name
-    for name, recipe in SIM20.items()
-    if recipe.kind in ("mug", "skillet", "spoon", "bracket", "blob", "dish", "jug")
-)
-"""Objects whose shape no turn carries onto itself; of mug, skillet and spoon a mirror does."""
-
 ABLATED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
 """Objects of the smaller studies: with and without symmetry, ringing and dull, thick and thin."""
 
@@ -269,6 +262,12 @@ HELD_OUT = {
     for kind, material in (name.split("-"),)
 }
 """Objects of kinds that no constant of the reconstruction, of walls, masks, symmetries and gains was chosen on."""
+NON_SYMMETRIC = tuple(
+    name
+    for name, recipe in (SIM20 | HELD_OUT).items()
+    if recipe.kind in ("mug", "skillet", "spoon", "bracket", "blob", "dish", "jug", "boomerang", "scallop")
+)
+"""Objects whose shape no turn about z carries onto itself; of some a mirror does."""
 SETS = {SET: SIM20, "held-out": HELD_OUT}
 """The recipes of the sets of objects by the sets' names."""
 

@@ -1,22 +1,20 @@
 """What the options of all verbs have in common: how they are parsed and checked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Literal, Self, TypeVar, get_type_hints
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self, TypeVar, get_type_hints
 
 import tyro
 
 from avmsf.cli.options.paths import InputError, path_mark
-from avmsf.cli.options.settings import Assignments, SettingsTable, as_toml, with_settings
-from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset
+from avmsf.cli.options.settings import Assignments, SettingsTable, as_toml, settings_of
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 """An option that is off unless it is given."""
 Unit = Literal["m", "cm", "mm", "in", "ft"]
-_RENAMED = {"--at": "--position", "--picture": "--plots"}
+_RENAMED = {"--at": "--position", "--picture": "--plots", "--to-material": "--to"}
 """Options of earlier versions, and what they are called now."""
-_SECTIONS = ("--views.", "--splat.", "--lift.", "--body.", "--fit.", "--hammer.", "--imperfections.")
-"""Beginnings of options of earlier versions that are settings now."""
 T = TypeVar("T")
 
 
@@ -54,7 +52,7 @@ class Printing(Common):
     """Print the results as one JSON object to standard output, and everything else to standard error."""
 
 
-def parse_options(kind: type[T], verb: str, words: Sequence[str]) -> T:
+def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | None = None) -> T:
     """Return the options that the words spell; leaves by SystemExit for help and for what cannot be understood.
 
     Raises `InputError` for an option that has another name now.
@@ -62,10 +60,8 @@ def parse_options(kind: type[T], verb: str, words: Sequence[str]) -> T:
     for word in words:
         if word in _RENAMED:
             raise InputError.expected(_RENAMED[word], got=word, name=word)
-        if word.startswith(_SECTIONS):
-            setting = word[2:].partition("=")[0].replace("-", "_")
-            raise InputError.expected(f"--set {setting}=VALUE", got=word, name=word)
-    return tyro.cli(kind, prog=f"avmsf {verb}", args=words)
+    given: dict[str, Any] = {} if default is None else {"default": default}
+    return tyro.cli(kind, prog=f"avmsf {verb}", args=words, **given)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,39 +71,45 @@ class Configured(Printing):
     set: Assignments = ()
     """Change a setting, such as splat.steps=500; once per setting."""
     config: SettingsTable = None
-    """Take settings from this file; --set comes after it."""
+    """Take settings from this file; --set and other options come after it."""
     print_config: Flag = False
-    """Print all settings, with what they mean, as a file for --config, and do nothing else."""
+    """Print all settings as they are with these options, with what they mean, as a file for --config, and do nothing
+    else."""
+    usual: ClassVar[object]
+    """The settings where nothing changes them."""
+
+    @property
+    def all_settings(self) -> object:
+        """The settings by the options."""
+        raise NotImplementedError
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> Self:
-        """Return the options that the words spell; with --print-config print the settings and leave by SystemExit."""
-        if "--print-config" in words:
-            print(as_toml(cls.settings_named(words)))
-            raise SystemExit(0)
-        return super().parse(words)
+        """Return the options that the words spell; with --print-config print the settings and leave by SystemExit.
 
-    @classmethod
-    def settings_named(cls, words: Sequence[str]) -> object:
-        """Return the settings that the words spell, of which other options are not read."""
-        chosen, _ = tyro.cli(Configured, args=words, add_help=False, return_unknown_args=True)
-        return with_settings(cls.default_settings(words), chosen.set, chosen.config)
-
-    @classmethod
-    def default_settings(cls, words: Sequence[str]) -> object:
-        """Return the settings that hold where the words change none."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class _Preset:
-    preset: Preset = "default"
-
-
-def preset_of(words: Sequence[str]) -> PipelineConfig:
-    """Return the settings of the preset that the words name."""
-    chosen, _ = tyro.cli(_Preset, args=words, add_help=False, return_unknown_args=True)
-    return PRESETS[chosen.preset]
+        Raises `InputError` also for an option of earlier versions that is a setting now.
+        """
+        own = {each.name for each in fields(cls)}
+        for word in words:
+            name = word.partition("=")[0].replace("-", "_").lstrip("_")
+            if not word.startswith("--") or name in own:
+                continue
+            meant = [full for full, *_ in settings_of(cls.usual) if f".{full}".endswith(f".{name}")]
+            if meant:
+                forms = " or ".join(f"--set {full.removeprefix('scene.')}=VALUE" for full in meant)
+                raise InputError.expected(forms, got=word, name=word)
+        if "--print-config" not in words:
+            return super().parse(words)
+        # What has no default is not read.
+        hints = get_type_hints(cls)
+        needed: dict[str, Any] = {
+            each.name: each.name if hints[each.name] is str else Path(each.name)
+            for each in fields(cls)
+            if each.default is MISSING and each.default_factory is MISSING
+        }
+        verb = cls.__module__.rpartition(".")[2]
+        print(as_toml(parse_options(cls, verb, words, default=cls(**needed)).all_settings))
+        raise SystemExit(0)
 
 
 def option_of(name: str) -> str:

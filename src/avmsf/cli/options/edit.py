@@ -1,8 +1,8 @@
 """Options of `avmsf edit`."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -133,15 +133,12 @@ class Options(Configured):
     position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Contact of these sounds, meters, on the object as it was; by default where it is loudest."""
 
-    @property
+    usual = EditSettings()
+
+    @cached_property
     def all_settings(self) -> EditSettings:
         """The settings."""
-        return with_settings(EditSettings(), self.set, self.config)
-
-    @classmethod
-    def default_settings(cls, words: Sequence[str]) -> EditSettings:
-        """Return the usual settings."""
-        return EditSettings()
+        return with_settings(self.usual, self.set, self.config)
 
     @property
     def changes_material(self) -> bool:
@@ -202,7 +199,7 @@ class Options(Configured):
                 name=self.guides[0],
                 value=tuple(self.guides),
             )
-        usual, prompted = EditSettings(), settings.prompt
+        usual, prompted = self.usual, settings.prompt
         if not self.guides:
             for name in ("parameters", "guide"):
                 if getattr(settings, name) != getattr(usual, name):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -105,15 +106,12 @@ class Options(Configured):
     20 kHz, first second; with localize also each field's heat maps of three recordings, with the true contact
     marked."""
 
-    @property
-    def shared(self) -> EvaluationSettings:
-        """What methods share."""
-        return with_settings(EvaluationSettings(), self.set, self.config)
+    usual = EvaluationSettings()
 
-    @classmethod
-    def default_settings(cls, words: Sequence[str]) -> EvaluationSettings:
-        """Return the usual settings."""
-        return EvaluationSettings()
+    @cached_property
+    def all_settings(self) -> EvaluationSettings:
+        """What methods share."""
+        return with_settings(self.usual, self.set, self.config)
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
@@ -127,7 +125,7 @@ class Options(Configured):
                 "names of the recordings to test on", name="--test", advice="such as --test 009.wav,010.wav"
             )
         expect_device(self.device, raising=EvaluationError)
-        _ = self.shared
+        _ = self.all_settings
         detect_dataset(self.data)
 
 

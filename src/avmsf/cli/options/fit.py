@@ -1,7 +1,7 @@
 """Options of `avmsf fit`."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,7 +9,7 @@ import tyro
 
 from avmsf.capture.filenames import expect_views
 from avmsf.cli.options.checks import OutputError, expect_device, expect_rows, read_settings
-from avmsf.cli.options.common import Configured, Flag, option_of, preset_of
+from avmsf.cli.options.common import Configured, Flag, option_of
 from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
 from avmsf.cli.options.settings import with_settings
 from avmsf.errors import EvaluationError, FitError
@@ -89,25 +89,22 @@ class Options(Configured):
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device for Gaussians (with gsplat), DINOv2, training end to end and the network; by default the GPU if there is
     one. Mode extraction, finite elements and the Gaussian process run on the CPU."""
-    seed: int = 0
-    """Random seed of all stages."""
+    seed: int | None = None
+    """Random seed of all stages, by default 0."""
     preset: Preset = "default"
     """All settings. default: takes seconds to minutes. paper: everything as published, the middle of each published
     list; takes hours."""
 
-    @property
-    def pipeline(self) -> PipelineConfig:
-        """All settings as one."""
-        config = with_settings(PRESETS[self.preset], self.set, self.config)
-        if self.seed:
-            config = replace(config, fit=replace(config.fit, seed=self.seed), scene=config.scene.with_seed(self.seed))
-        names = ("gain_model", "extraction", "modes", "time_zero", "device")
-        return replace(config, **{name: value for name in names if (value := getattr(self, name)) is not None})
+    usual = PRESETS["default"]
 
-    @classmethod
-    def default_settings(cls, words: Sequence[str]) -> PipelineConfig:
-        """Return the settings of the preset that the words name."""
-        return preset_of(words)
+    @cached_property
+    def all_settings(self) -> PipelineConfig:
+        """The preset with the settings that are given."""
+        seeds = ("fit.seed", "scene.views.seed", "scene.splat.seed", "scene.lift.seed")
+        options = {name: getattr(self, name) for name in ("gain_model", "extraction", "modes", "time_zero", "device")}
+        return with_settings(
+            PRESETS[self.preset], self.set, self.config, {**options, **dict.fromkeys(seeds, self.seed)}
+        )
 
     @property
     def kept(self) -> Path:
@@ -123,8 +120,8 @@ class Options(Configured):
             NewFile(_SUFFIXES[self.until]).check(self.output)
         if self.plots is not None and self.until != "surface":
             raise OutputError.expected("--until surface with it", self.until, name="--plots")
-        expect_device(self.device, raising=FitError)
-        config = self.pipeline
+        config = self.all_settings
+        expect_device(config.device, raising=FitError)
         self._check_split()
         settings = read_settings(self.capture, self.settings)
         if self.material is not None:
@@ -153,6 +150,9 @@ class Options(Configured):
     def _check_unused(self, config: PipelineConfig) -> None:
         """Raise FitError for options that nothing would read."""
         given = {each.name for each in fields(self) if getattr(self, each.name) != each.default}
+        for name in ("gain_model", "time_zero"):
+            if getattr(config, name) != getattr(self.usual, name):
+                given.add(name)
         if config.gain_model in ("auto", "elastic"):
             given.discard("gain_model")
         if config.body.supports == "try":

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import math
 import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +11,7 @@ from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from types import UnionType
+from types import MappingProxyType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
@@ -29,23 +30,31 @@ _WIDTH = 100
 """Columns of the comments of a file of settings."""
 
 
-def with_settings(config: T, assignments: Sequence[str] = (), file: Path | None = None) -> T:
-    """Return a configuration with the settings of a TOML file, and then those of the form NAME=VALUE.
+def with_settings(
+    config: T, assignments: Sequence[str], file: Path | None, options: Mapping[str, Any] = MappingProxyType({})
+) -> T:
+    """Return a configuration with the settings of a TOML file, and then those of the form NAME=VALUE and of options.
 
     A name is a path through the nested configurations, such as scene.splat.steps, or the end of one that has only one
-    meaning, such as splat.steps. Raises InputError for a name that is unknown or has several meanings, and for a value
-    of another type, and what the configurations raise for values out of range.
+    meaning, such as splat.steps. `options` have full names; None is one that was not given. Raises InputError for a
+    name that is unknown or has several meanings, for a setting that is given as an option too, and for a value of
+    another type, and what the configurations raise for values out of range.
     """
     known = {name: hint for name, hint, _, _ in settings_of(config)}
+    chosen = {name: value for name, value in options.items() if value is not None}
     given: dict[str, Any] = {}
-    for name, value in [*_read(file), *map(_assigned, assignments)]:
-        full = _full_name(name, known, file)
-        given[full] = _parsed(full, value, known[full])
-    return _changed(config, given)
+    for source, values in ((file, _read(file)), (None, map(_assigned, assignments))):
+        for name, value in values:
+            full = _full_name(name, known, source)
+            if source is None and full in chosen:
+                advice = "leave one out"
+                raise InputError.expected("the setting once", got="it as an option too", name=name, advice=advice)
+            given[full] = _parsed(full, value, known[full])
+    return _changed(config, given | chosen)
 
 
 def as_toml(config: object) -> str:
-    """Return a configuration as TOML, with the meaning of each setting as a comment; what is None is commented out."""
+    """Return a configuration as TOML, with the meaning of each setting as a comment; None is the text "null"."""
     lines: list[str] = []
     section = ""
     for name, _, value, meaning in sorted(settings_of(config), key=lambda each: each[0].count(".") > 0):
@@ -54,8 +63,14 @@ def as_toml(config: object) -> str:
             lines += ["", f"[{owner}]"]
             section = owner
         lines += textwrap.wrap(" ".join(meaning.split()), _WIDTH, initial_indent="# ", subsequent_indent="# ")
-        lines.append(f"# {last} =" if value is None else f"{last} = {json.dumps(value)}")
+        lines.append(f"{last} = {_toml(value)}")
     return "\n".join(lines)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return json.dumps("null" if value is None else value, default=str)
 
 
 def settings_of(config: object, owner: str = "") -> Iterator[tuple[str, Any, Any, str]]:
@@ -130,6 +145,8 @@ def _parsed(name: str, value: Any, hint: Any) -> Any:
 
 def _readings(text: str) -> Iterator[Any]:
     """Yield what a text may mean: a number, true, false or null, a list of these, or the text itself."""
+    if text == "None":
+        yield None
     for words in (text, f"[{text}]"):
         with suppress(ValueError):
             yield json.loads(words)

@@ -1,7 +1,7 @@
 """Options of `avmsf simulate`."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -56,33 +56,30 @@ class Options(Configured):
     views: int | None = None
     """Images to render, on three circles around the object; 0 for none."""
 
-    def applied(self, recipe: ObjectRecipe) -> ObjectRecipe:
-        """Return a recipe with the settings and options that are given."""
-        names = (*_IDENTITY, "impacts", "seconds", "sample_rate", "thickness", "size", "views")
-        given = {name: value for name in names if (value := getattr(self, name)) is not None}
-        return replace(with_settings(recipe, self.set, self.config), **given)
+    usual = ObjectRecipe()
 
-    @property
-    def recipe(self) -> ObjectRecipe:
+    def applied(self, recipe: ObjectRecipe) -> ObjectRecipe:
+        """Return a recipe with the settings and options that are given; of a set's object what it is stays."""
+        names = (*_IDENTITY, "impacts", "seconds", "sample_rate", "thickness", "size", "views")
+        made = with_settings(recipe, self.set, self.config, {name: getattr(self, name) for name in names})
+        return replace(made, **{name: getattr(recipe, name) for name in _IDENTITY}) if self.what in SETS else made
+
+    @cached_property
+    def all_settings(self) -> ObjectRecipe:
         """The recipe of a single object."""
         return self.applied(_recipe_of(self.what))
-
-    @classmethod
-    def default_settings(cls, words: Sequence[str]) -> ObjectRecipe:
-        """Return the recipe of the object that the first of the words names."""
-        return _recipe_of(next((word for word in words if not word.startswith("-")), None))
 
     def check_inputs(self) -> None:
         """Raise `InputError` for a mesh that does not exist, `SimulationError` for options that do not fit."""
         super().check_inputs()
         if self.output is None and not self.list:
             raise SimulationError("--output: expected a folder, got none; --list names the objects", name="output")
-        changed, usual = self.recipe, _recipe_of(self.what)
+        _ = self.all_settings
+        named = {each.partition("=")[0].strip() for each in self.set}
         for name in _IDENTITY if self.what in SETS else ():
-            if (value := getattr(changed, name)) != getattr(usual, name):
-                raise SimulationError(
-                    f"--{name}: expected none with {self.what}, got {value}; leave it out", name=name, value=str(value)
-                )
+            if getattr(self, name) is not None or name in named:
+                advice = "leave it out"
+                raise SimulationError.expected(f"none with {self.what}", got="one", name=name, advice=advice)
 
 
 _IDENTITY = ("kind", "mesh", "material", "seed")
