@@ -20,7 +20,7 @@ from avmsf.cli.printing import console, decimals, next_command, print_json, say,
 from avmsf.cli.progress import ProgressBar
 from avmsf.cli.writing import Level, write_sound
 from avmsf.editing.distillation import DecoderDistillation
-from avmsf.editing.guided import PARAMETERISATIONS, Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.guided import PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
 from avmsf.editing.material import LAWS, edit, infer_material
 from avmsf.editing.modal_edit import EDITS, remarks, silenced
 from avmsf.editing.reference import Reference
@@ -187,7 +187,7 @@ def _guided(options: Options, settings: EditSettings, field: SoundField, old: Ma
             bar.step("edit", reached.step, reached.steps, message)
 
         edited = edit_towards(
-            field, guide, config=settings.guide, parameters=PARAMETERISATIONS[settings.parameters], progress=progress,
+            field, guide, config=settings.guide, parameters=PARAMETERIZATIONS[settings.parameters], progress=progress,
             checkpoint=checkpoint,
         )  # fmt: skip
     if curve is None:

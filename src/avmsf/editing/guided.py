@@ -75,7 +75,7 @@ The rates are this package's, those of the common factors above; Audio-SDS state
 SEARCHED = replace(INDEPENDENT, name="searched", searches=True)
 """Independent modes, initialized by the search for common factors: what remains is the effect of the hierarchy."""
 
-PARAMETERISATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEPENDENT, SEARCHED)}
+PARAMETERIZATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEPENDENT, SEARCHED)}
 """All of them, by name."""
 
 

@@ -49,15 +49,17 @@ def method_named(name: str) -> Method:
     """Return the method of this name. Raises EvaluationError that lists the known ones, and for a missing path."""
     entry, settings = method_entry(name), {}
     if entry.path:
-        path = Path(name.partition(":")[2]).expanduser()
-        if not path.name or not (path.is_dir() if entry.path.startswith("a folder") else path.is_file()):
+        given = name.partition(":")[2]
+        path = Path(given).expanduser()
+        if not given or not (path.is_dir() if entry.is_folder else path.is_file()):
             raise EvaluationError(
                 f"{name}: expected {entry.path} after `{kind_of(name)}:`, found none",
-                file=path if path.name else None,
+                file=path if given else None,
                 name="method",
                 value=name,
             )
-        settings = {"path": path}
+        # However it is written: results of one path are those of one method.
+        name, settings = f"{kind_of(name)}:{path}", {"path": path}
     made: Method
     if entry.make:
         made = resolve(entry.make)(name, **entry.settings, **settings)

@@ -65,6 +65,8 @@ class MethodEntry:
     settings: Mapping[str, Any] = field(default_factory=dict)
     path: str = ""
     """The folder or file that it reads, for a method whose name goes on with `:` and a path."""
+    is_folder: bool = False
+    """Whether that is a folder."""
 
 
 def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
@@ -118,6 +120,7 @@ METHODS: dict[str, MethodEntry] = {
         "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
         make="methods:sonicgauss",
         path="a folder with the published weights",
+        is_folder=True,
     ),
     "sonicgauss-small": MethodEntry(
         "SonicGauss's objective at a small size, trained from scratch on simulated objects",
@@ -128,6 +131,7 @@ METHODS: dict[str, MethodEntry] = {
         "sounds of another system, from files",
         make="recorded:RecordedMethod",
         path="a folder with a folder of wav files for every object",
+        is_folder=True,
     ),
 }
 """All methods by name, in the order of tables."""

@@ -161,6 +161,7 @@ class SurfaceBodies(CandidateBodies):
         self.supports, self.dofs = supports, dofs
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self._meshes.shape is None else COARSE_WALL_DOFS)
+        self._coarse_only = set[tuple[float | None, Support | None]]()
         self._solid, self._solved = once(self._make_solid), once(self._solve)
 
     @cached_property
@@ -199,13 +200,15 @@ class SurfaceBodies(CandidateBodies):
         Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned,
         which was good enough to choose by, and `log` is called with the reason.
         """
-        if body.fine:
+        key = body.thickness, body.support
+        if body.fine or key in self._coarse_only:
             return body
         try:
             if body.support is None:
                 return self._body(body.thickness, fine=True)
             return replace(body, elastic=self.modes(body.thickness, support=body.support), fine=True)
         except SimulationError as error:
+            self._coarse_only.add(key)
             self._log(f"{body.name}: using the coarse mesh: {error}")
             return body
 

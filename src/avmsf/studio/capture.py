@@ -78,7 +78,7 @@ def read_upload(content: bytes) -> Recording:
 
 
 class ImpactTable:
-    """A capture's `impacts.csv` as it is now. A change leaves all other lines to the last byte."""
+    """A capture's `impacts.csv` as it is now. A change leaves all other rows to the last byte."""
 
     def __init__(self, folder: Path) -> None:
         """Read the table; a folder without one has no rows. Raises CaptureError."""
