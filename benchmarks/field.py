@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float64
+from jaxtyping import Complex128
 from torch import Tensor
 
 from avmsf.capture import Impacts
@@ -20,6 +20,7 @@ from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
+from avmsf.field.gains.data import along_phase
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.posterior import coverage
 from avmsf.field.sound_field import SoundField
@@ -282,7 +283,7 @@ def _judge(
     for method in METHODS:
         figures |= _of_method(method, scores[method])
     known = fields["auto"]
-    heard = measured_parts(test, known)
+    heard = measured_gains(test, known)
     held = coverage(known, test.contacts, heard, directions=test.directions, level=0.9)
     figures |= {"auto.coverage90": held.plain, "auto.coverage90_by_energy": held.by_energy}
     figures |= {"extract_seconds": extracted - begun, "fit_seconds": done - extracted}
@@ -294,11 +295,10 @@ def _judge(
     return figures
 
 
-def measured_parts(test: Impacts, field: SoundField) -> Float64[Tensor, "contacts modes 2"]:
-    """Return the recordings' own gains with a field's modes: along each mode's phase, and a quarter period ahead."""
+def measured_gains(test: Impacts, field: SoundField) -> Complex128[Tensor, "contacts modes"]:
+    """Return the recordings' own gains with a field's modes, relative to each mode's phase."""
     gains = fit_gains(test.sounds.double(), field.bank, sample_rate=test.sample_rate)
-    turned = gains * torch.polar(torch.ones_like(field.phase), -field.phase)
-    return torch.view_as_real(turned)
+    return along_phase(gains, field.phase)
 
 
 def _of_method(method: str, scores: Scores) -> Figures:

@@ -27,7 +27,7 @@ from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.bodies import make_body
 from avmsf.simulate.recipe import SIM20, named_recipe
 from avmsf.simulate.simulation import simulate_object
-from benchmarks.field import measured_parts
+from benchmarks.field import measured_gains
 from benchmarks.material import surface_features
 from benchmarks.report import Options, Report, Table, log
 from benchmarks.scans import processor_seconds, scans
@@ -137,7 +137,7 @@ def _coverage(options: Options) -> Report:
             modes = extract_modes(train)
             field = fit(train, surface_features(made.capture), modes, steps, gains=estimator)
             test = modes.aligned(test)
-        held = coverage(field, test.contacts, measured_parts(test, field), directions=test.directions, level=0.9)
+        held = coverage(field, test.contacts, measured_gains(test, field), directions=test.directions, level=0.9)
         rows.append([name, held.plain, held.by_energy, evaluate(field, test).mean()["relative_stft"]])
         log(f"physics.coverage: {name}: {held.plain:.3f}, by energy {held.by_energy:.3f}, error {rows[-1][3]:.3f}")
     plain, by_energy, error = torch.tensor([[float(value) for value in row[1:]] for row in rows]).mean(0).tolist()

@@ -71,8 +71,8 @@ class SplitCase:
 
     def coverage(self, field: SoundField) -> float:
         """Return the part of the held-out gains, by energy, in their intervals of 90 %."""
-        parts = along_phase(fit_gains(self.test.sounds, field.bank, sample_rate=field.sample_rate), field.phase)
-        return coverage(field, self.test.contacts, parts, directions=self.test.directions).by_energy
+        gains = along_phase(fit_gains(self.test.sounds, field.bank, sample_rate=field.sample_rate), field.phase)
+        return coverage(field, self.test.contacts, gains, directions=self.test.directions).by_energy
 
     def error(self, field: SoundField) -> float:
         """Return the relative STFT error at the held-out contacts."""

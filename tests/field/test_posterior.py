@@ -64,7 +64,7 @@ def test_what_is_drawn_from_the_model_is_covered() -> None:
     for seed in range(6):
         values = drawn_gains(everywhere, seed=seed)
         field = sound_field(elastic_field(everywhere[:16], values[:16]))
-        found = coverage(field, everywhere[16:], values[16:])
+        found = coverage(field, everywhere[16:], torch.view_as_complex(values[16:]))
         rates.append((found.plain, found.by_energy))
     plain, by_energy = torch.tensor(rates).mean(0).tolist()
     # Gains of one mode hang together: six fields of four modes scatter by about .02.
@@ -78,7 +78,8 @@ def test_a_wider_interval_covers_more() -> None:
     for seed in range(4):
         values = drawn_gains(everywhere, seed=seed)
         field = sound_field(positional_field(everywhere[:20], values[:20]))
-        rates.append([coverage(field, everywhere[20:], values[20:], level=each).plain for each in (0.3, 0.6, 0.9)])
+        measured = torch.view_as_complex(values[20:])
+        rates.append([coverage(field, everywhere[20:], measured, level=each).plain for each in (0.3, 0.6, 0.9)])
     low, middle, high = torch.tensor(rates).mean(0).tolist()
     assert low < middle < high
     assert high == pytest.approx(0.9, abs=0.08)
@@ -88,9 +89,9 @@ def test_an_impact_from_below_has_the_opposite_gain_where_directions_are_known()
     everywhere = bar_contacts(60, seed=13)
     values = drawn_gains(everywhere, seed=0)
     side = torch.where(torch.arange(40) % 2 == 0, -1.0, 1.0).double()[:, None]
-    turned = side[:, :, None] * values[20:]
+    turned = side * torch.view_as_complex(values[20:])
     field = sound_field(elastic_field(everywhere[:20], values[:20]))
-    straight = coverage(field, everywhere[20:], values[20:]).plain
+    straight = coverage(field, everywhere[20:], torch.view_as_complex(values[20:])).plain
     assert coverage(field, everywhere[20:], turned, directions=side * DOWN).plain == straight
     assert coverage(field, everywhere[20:], turned).plain < straight - 0.1
 
@@ -181,10 +182,11 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     assert torch.equal(louder.gain_field.contacts, 2.0 * field.gain_field.contacts)
     known = field.gain_field.posterior(others).std * factor[:, None]
     torch.testing.assert_close(louder.gain_field.posterior(2.0 * others).std.double(), known, rtol=1e-6, atol=0)
-    heard = coverage(louder, 2.0 * others, values[12:] * factor[:, None])
-    assert heard.plain == coverage(field, others, values[12:]).plain
+    measured = torch.view_as_complex(values[12:])
+    heard = coverage(louder, 2.0 * others, measured * factor)
+    assert heard.plain == coverage(field, others, measured).plain
     weights = ModalBank(BANK.frequency, BANK.damping / factor**2)
-    assert heard.by_energy == pytest.approx(coverage(replace(field, bank=weights), others, values[12:]).by_energy)
+    assert heard.by_energy == pytest.approx(coverage(replace(field, bank=weights), others, measured).by_energy)
 
 
 def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
@@ -255,8 +257,8 @@ def test_what_cannot_be_said_is_refused() -> None:
         spectrum_band(field, contacts[0], level=1.0)
     with raises(FitError, name="field", value="edited"):
         unedited_mixture(adjust_modes(field))
-    with raises(FitError, name="parts", value=[6, 3, 2]):
-        coverage(field, contacts, values[:, :3])
+    with raises(FitError, name="gains", value=[6, 3]):
+        coverage(field, contacts, torch.view_as_complex(values[:, :3].contiguous()))
 
 
 def test_a_suggestion_that_no_side_shows_is_drawn_all_the_same() -> None:

@@ -8,7 +8,7 @@ from itertools import pairwise
 from statistics import NormalDist
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
@@ -155,29 +155,29 @@ def spectrum_band(
 def coverage(
     field: SoundField,
     contacts: Float[Tensor, "contacts 3"],
-    parts: Float64[Tensor, "contacts modes 2"],
+    gains: Complex128[Tensor, "contacts modes"],
     *,
     directions: Float[Tensor, "contacts 3"] | None = None,
     level: float = LEVEL,
 ) -> Coverage:
     """Return which part of the gains measured at other contacts lies in the interval of this level.
 
-    `parts`: amplitudes along each of the field's modes' phases and a quarter of a period ahead, of
-    each mode up to a phase that all contacts share, of each contact up to their common sign where the field knows no
-    directions of impacts. The interval is normal, with the posterior standard deviation of a measured gain, so it holds
-    the scatter of an impact as well. Raises as `fitted_mixture`, and FitError for gains of other modes.
+    `gains` are relative to the phases of the field's modes, of each mode up to a phase that all contacts share, of each
+    contact up to their common sign where the field knows no directions of impacts. The interval is normal, with the
+    posterior standard deviation of a measured gain, so it holds the scatter of an impact as well. Raises as
+    `fitted_mixture`, and FitError for gains of other modes.
     """
     _expect_level(level)
-    gains, scale = fitted_mixture(field), scale_of(field).square()[:, None]
-    if parts.shape != (shape := (len(contacts), len(field.bank), 2)):
+    model, scale = fitted_mixture(field), scale_of(field).square()[:, None]
+    if gains.shape != (shape := (len(contacts), len(field.bank))):
         advice = "give gains of the contacts and of the field's modes"
-        raise FitError.expected(f"the shape {list(shape)}", list(parts.shape), name="parts", advice=advice)
+        raise FitError.expected(f"the shape {list(shape)}", list(gains.shape), name="gains", advice=advice)
     predicted, deviation = posterior(field, contacts, directions)
-    spread = (deviation.square() + scale * gains.noise().square()).sqrt()
-    parts = turned_like(parts, predicted)
+    spread = (deviation.square() + scale * model.noise().square()).sqrt()
+    parts = torch.view_as_real(turned_like(gains, torch.view_as_complex(predicted.contiguous())))
     within = (parts - predicted).abs() <= NormalDist().inv_cdf(0.5 + level / 2.0) * spread
     energy = (
-        scale * torch.view_as_real(gains.values).square().mean(0) / (4.0 * field.bank.damping.double())[:, None]
+        scale * torch.view_as_real(model.values).square().mean(0) / (4.0 * field.bank.damping.double())[:, None]
     ).expand_as(parts)
     return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
 

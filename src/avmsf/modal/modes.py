@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float, Float64
+from jaxtyping import Complex, Complex128, Float, Float64
 from scipy.special import betainc
 from torch import Tensor
 
@@ -49,15 +49,14 @@ def common_phase(gains: Complex[Tensor, "contacts modes"]) -> Float64[Tensor, " 
 
 
 def turned_like(
-    parts: Float64[Tensor, "contacts modes 2"], others: Float64[Tensor, "contacts modes 2"]
-) -> Float64[Tensor, "contacts modes 2"]:
-    """Return gains in two parts with each mode turned, by one phase for all contacts, to where they suit others best.
+    gains: Complex128[Tensor, "contacts modes"], others: Complex128[Tensor, "contacts modes"]
+) -> Complex128[Tensor, "contacts modes"]:
+    """Return gains with each mode turned, by one phase for all contacts, to where they suit others best.
 
     A mode whose frequency has moved a little has turned for a sound as a whole, and has the same gains.
     """
-    one, other = torch.view_as_complex(parts.contiguous()), torch.view_as_complex(others.contiguous())
-    turn = (one.conj() * other).sum(0)
-    return torch.view_as_real(one * torch.polar(torch.ones_like(turn.real), turn.angle()))
+    turn = (gains.conj() * others).sum(0)
+    return gains * torch.polar(torch.ones_like(turn.real), turn.angle())
 
 
 _EXPONENTS: dict[str, float] = {"half-sine": 1.0, "hertz": 1.5}

@@ -57,8 +57,7 @@ class RefinedGains(TrainableGains):
         model = self.model.with_values(self.model.values + torch.view_as_complex(moved.contiguous())).take(order)
         if measured is None:
             return model
-        turned = turned_like(torch.view_as_real(measured), torch.view_as_real(model.values))
-        return replace(model, measured=torch.view_as_complex(turned.contiguous()))
+        return replace(model, measured=turned_like(measured, model.values))
 
 
 def _applied(smoother: Tensor, values: Float64[Tensor, "contacts modes 2"] | Tensor) -> Tensor:
