@@ -297,7 +297,9 @@ class _Search:
         scales, shifts = [(factor, False) for factor in fits], [False]
         if count >= _BOUNDS.fit_contacts:
             scales, shifts = scales + [(factor, True) for factor in (1.0, 0.8 * ratio, ratio)], [False, True]
-        middle, own = (points.amin(0) + points.amax(0) for points in (torch.from_numpy(self.tree.data), self.contacts))
+        # A copy, for the tree's points cannot be written to, which torch warns of.
+        points = torch.from_numpy(self.tree.data.copy())
+        middle, own = (each.amin(0) + each.amax(0) for each in (points, self.contacts))
         for rarity, axes in _axes() if off and count >= _BOUNDS.axes_contacts else [(0.0, _IDENTITY)]:
             for (factor, scaled), shifted in itertools.product(scales, shifts):
                 # From box to box.
