@@ -137,5 +137,5 @@ def test_the_table_has_each_contacts_place(tmp_path):
     with raises(ExportError, file=place, name="--overwrite"):
         write_faust(field, path)
     assert not path.exists()
-    write_faust(field, path, force=True)
+    write_faust(field, path, overwrite=True)
     assert len(place.read_text().splitlines()) == 1 + POINTS

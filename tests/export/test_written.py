@@ -35,14 +35,14 @@ def test_an_export_is_replaced_only_if_asked_and_nothing_else_is(tmp_path):
     write_folder(tmp_path / "out", fill("a.txt", "in/c.txt"), {})
     with raises(ExportError, file=tmp_path / "out", name="--overwrite"):
         write_folder(tmp_path / "out", fill("b.txt"), {})
-    write_folder(tmp_path / "out", fill("b.txt"), {}, force=True)
+    write_folder(tmp_path / "out", fill("b.txt"), {}, overwrite=True)
     assert listed(tmp_path) == ["out/b.txt", "out/manifest.json"]
     (tmp_path / "out" / "notes.txt").write_text("mine")
     with raises(ExportError, file=tmp_path / "out", name="--overwrite", value=["notes.txt"]):
-        write_folder(tmp_path / "out", fill("a.txt"), {}, force=True)
+        write_folder(tmp_path / "out", fill("a.txt"), {}, overwrite=True)
     (tmp_path / "out" / "manifest.json").write_text('{"files": ["b.txt", "manifest.json", "notes.txt"]}')
     with raises(ExportError, file=tmp_path / "out", value=["b.txt", "manifest.json", "notes.txt"]):
-        write_folder(tmp_path / "out", fill("a.txt"), {}, force=True)
+        write_folder(tmp_path / "out", fill("a.txt"), {}, overwrite=True)
     assert listed(tmp_path) == ["out/b.txt", "out/manifest.json", "out/notes.txt"]
 
 
@@ -54,7 +54,7 @@ def test_what_fails_half_way_leaves_all_as_it_was(tmp_path):
         raise OSError(28, "No space left on device")
 
     with raises(ExportError, file=tmp_path / "out", value="No space left on device"):
-        write_folder(tmp_path / "out", fail, {}, force=True)
+        write_folder(tmp_path / "out", fail, {}, overwrite=True)
     assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
 
 
@@ -73,13 +73,13 @@ def test_a_file_that_exists_is_replaced_only_if_asked(tmp_path):
     with raises(ExportError, file="a.ply", name="--overwrite"):
         write_file(tmp_path / "a.ply", b"other")
     assert (tmp_path / "a.ply").read_bytes() == b"ours"
-    write_file(tmp_path / "a.ply", b"other", force=True)
+    write_file(tmp_path / "a.ply", b"other", overwrite=True)
     assert (tmp_path / "a.ply").read_bytes() == b"other"
 
 
 def test_files_and_folders_are_told_apart(tmp_path):
     (tmp_path / "file").write_text("avmsf")
     with raises(ExportError, file=tmp_path / "file", value="file"):
-        write_folder(tmp_path / "file", fill("a.txt"), {}, force=True)
+        write_folder(tmp_path / "file", fill("a.txt"), {}, overwrite=True)
     with raises(ExportError, file=tmp_path, value="folder"):
-        write_file(tmp_path, b"avmsf", force=True)
+        write_file(tmp_path, b"avmsf", overwrite=True)

@@ -66,7 +66,7 @@ def check_surface(
     if placement.on_surface:
         return surface, []
     lines = [f'{key} = "{value}"' for key, value in fitting_units_of(placement, settings).items()]
-    advice = f" If so, write {' and '.join(lines)} in capture.toml" if lines else ""
+    advice = f". If so, write {' and '.join(lines)} in capture.toml" if lines else ""
     found = placement.describe([f"row {impact.line}" for impact in impacts]) + advice
     farthest = float(placement.distances.max())
     if placement.other_unit:

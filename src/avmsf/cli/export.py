@@ -196,7 +196,7 @@ def _web(field: SoundField, options: Options) -> Written:
         surface=None if isinstance(source, Surface) else field.gain_field.surface,
         strikes=_recordings(field, options.capture),
         limit=options.contacts or POINTS["web"],
-        force=options.overwrite,
+        overwrite=options.overwrite,
     )
 
 
@@ -214,13 +214,13 @@ def _gltf(field: SoundField, options: Options) -> Written:
     cloud = _gaussians(source, meters, sampled)
     if cloud is not None and isinstance(source, Path):
         cloud_file, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
-        check_free(cloud_file, force=options.overwrite)
+        check_free(cloud_file, overwrite=options.overwrite)
         seen = DisplayGeometry.of_gaussians(cloud, sampled)
-        written = write_gltf(sampled, options.output, geometry=seen, up=options.up, force=options.overwrite)
-        copied = write_file(cloud_file, content, force=options.overwrite)
+        written = write_gltf(sampled, options.output, geometry=seen, up=options.up, overwrite=options.overwrite)
+        copied = write_file(cloud_file, content, overwrite=options.overwrite)
         return replace(written, sizes={**written.sizes, **copied})
     shown, remarks = (None, ()) if source is None else read_display_geometry(source, sampled, meters=meters)
-    written = write_gltf(sampled, options.output, geometry=shown, up=options.up, force=options.overwrite)
+    written = write_gltf(sampled, options.output, geometry=shown, up=options.up, overwrite=options.overwrite)
     return replace(written, remarks=remarks + written.remarks)
 
 
@@ -231,7 +231,7 @@ def _faust(field: SoundField, options: Options) -> Written:
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:
             say(f"note: {len(sampled)} of these are written, as many as Faust compiles in reasonable time")
-    return write_faust(sampled, options.output, noise=noise, force=options.overwrite)
+    return write_faust(sampled, options.output, noise=noise, overwrite=options.overwrite)
 
 
 def _demo(field: SoundField, options: Options) -> Written:
@@ -257,7 +257,7 @@ def _demo(field: SoundField, options: Options) -> Written:
         cloud=cloud,
         variant=options.variant,
         precision=options.precision,
-        force=options.overwrite,
+        overwrite=options.overwrite,
     )
 
 
@@ -281,7 +281,7 @@ def _wavs(field: SoundField, options: Options) -> Written:
         layers=layers,
         seconds=options.seconds,
         noise=not options.no_noise,
-        force=options.overwrite,
+        overwrite=options.overwrite,
     )
 
 
@@ -297,7 +297,7 @@ def _loud(sampled: SampledField) -> SampledField:
 
 def _uff(field: SoundField, options: Options) -> Written:
     return write_universal(
-        _sampled(field, options), options.output, functions=options.functions, force=options.overwrite
+        _sampled(field, options), options.output, functions=options.functions, overwrite=options.overwrite
     )
 
 

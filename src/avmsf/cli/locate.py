@@ -20,6 +20,7 @@ from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, rows_of
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.locate import RECORDING, Options
 from avmsf.cli.printing import console, next_command, print_json, say
+from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import AvmsfError, LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
@@ -69,7 +70,8 @@ def run(options: Options) -> int:
     summary = _summary(found)
     if summary is not None:
         screen.print(_summary_line(summary, options.probability), soft_wrap=True)
-    next_command("avmsf suggest", options.field)
+    if known.field.gain_field.contacts is not None and not known.field.origin.report.get(EDITS):
+        next_command("avmsf suggest", options.field)
     if options.json:
         results = {"impacts": found, "summary": summary, "failures": failures}
         print_json({"field": str(options.field), "quality": verdict, **results})

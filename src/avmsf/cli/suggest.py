@@ -2,7 +2,6 @@
 
 import csv
 import io
-import shlex
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +11,7 @@ from avmsf._utils.text import counted, format_number
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.suggest import PICTURE, TABLE, Options
-from avmsf.cli.printing import console, next_command, print_json, say, table
+from avmsf.cli.printing import console, next_step, print_json, say, table
 from avmsf.cli.writing import write_text
 from avmsf.field.next_contacts import Suggestions, suggest, unedited_mixture
 from avmsf.field.posterior import relative_gain_std
@@ -63,7 +62,7 @@ def run(options: Options) -> int:
         save_picture(picture, paths[PICTURE])
         for path in paths.values():
             say(f"wrote {path}")
-    next_command(f"avmsf fit CAPTURE -o {shlex.quote(str(options.field))}")
+    next_step("record these, then avmsf fit CAPTURE -o NEW.safetensors")
     if options.json:
         print_json(
             {

@@ -13,7 +13,8 @@ that every file is compared with.
 - `write_demo`: the layout of the paper's web demo.
 
 `avmsf.write` chooses the writer by a file's ending. Files and folders are written atomically, and replaced only with
-`force=True`. Start reading at `sampled_field`, then `one_phase` for formats with real amplitudes only, then any writer.
+`overwrite=True`. Start reading at `sampled_field`, then `one_phase` for formats with real amplitudes only, then any
+writer.
 """
 
 import lazy_loader

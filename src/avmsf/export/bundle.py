@@ -43,9 +43,9 @@ class Bundle:
     remarks: tuple[str, ...] = ()
     """Notes on what the page leaves out."""
 
-    def write(self, folder: str | Path, *, force: bool = False) -> Written:
-        """Write a folder, atomically. Raises `ExportError` for one that is not empty, unless `force` is set."""
-        sizes = write_folder(Path(folder), partial(write_files, self.files), dict(self.manifest), force=force)
+    def write(self, folder: str | Path, *, overwrite: bool = False) -> Written:
+        """Write a folder, atomically. Raises `ExportError` for one that is not empty, unless `overwrite` is set."""
+        sizes = write_folder(Path(folder), partial(write_files, self.files), dict(self.manifest), overwrite=overwrite)
         return Written(sizes, self.remarks)
 
 

@@ -24,7 +24,7 @@ MAX_NUMBERS = 150_000
 """Maximum of all tables together: with 128 modes Faust compiles as many in half a minute."""
 
 
-def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, force: bool = False) -> Written:
+def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, overwrite: bool = False) -> Written:
     """Write a `.dsp` with controls, or a `.lib` without them, by the path's ending, and a table of the contacts.
 
     The table is `contacts_path(path)`: the coordinates of each `contact`, object frame, meters. Without `noise` only
@@ -48,8 +48,10 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, fo
         ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
     )
     table, contacts = contacts_path(path), "\n".join(["contact,x,y,z", *rows, ""])
-    check_free(table, force=force)
-    sizes = write_file(path, text.encode(), force=force) | write_file(table, contacts.encode(), force=force)
+    check_free(table, overwrite=overwrite)
+    sizes = write_file(path, text.encode(), overwrite=overwrite) | write_file(
+        table, contacts.encode(), overwrite=overwrite
+    )
     return Written(sizes, tuple(remarks))
 
 

@@ -44,7 +44,7 @@ def write_gltf(
     *,
     geometry: DisplayGeometry | None = None,
     up: Axis = "z",
-    force: bool = False,
+    overwrite: bool = False,
 ) -> Written:
     """Write the object, or its points, and one modal model, with the modes sorted by energy.
 
@@ -59,7 +59,7 @@ def write_gltf(
     order = importance(sampled, damping)
     gains = signed_amplitudes(sampled)
     document, arrays = _document(sampled, geometry or DisplayGeometry.of_points(sampled), up, order, gains, damping)
-    sizes = write_file(path, _glb(document, arrays), force=force)
+    sizes = write_file(path, _glb(document, arrays), overwrite=overwrite)
     return Written(sizes, _remarks(sampled), *approximation_error(sampled, sine=gains, damping=damping))
 
 

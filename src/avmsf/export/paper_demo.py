@@ -34,7 +34,7 @@ def write_demo(
     cloud: GaussianCloud | None = None,
     variant: str = "original",
     precision: Precision = "float32",
-    force: bool = False,
+    overwrite: bool = False,
 ) -> Written:
     """Write the demo's folder; where there is no `cloud` whose centers are the field's points, with a disc at each.
 
@@ -80,7 +80,7 @@ def write_demo(
             shutil.copytree(folder / other, place / other)
 
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
-    sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *others])}, force=force)
+    sizes = write_folder(folder, fill, {**manifest, "variants": sorted([variant, *others])}, overwrite=overwrite)
     written = torch.from_numpy(gains.astype(np.float32))
     remarks = ["every mode starts as a cosine in the demo, with the field's level"]
     if field.noise.any():

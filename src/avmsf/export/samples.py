@@ -67,7 +67,7 @@ def write_grid(
     seconds: float | None = None,
     level_db: float = -1.0,
     noise: bool = True,
-    force: bool = False,
+    overwrite: bool = False,
 ) -> Written:
     """Write a float32 wav for every contact and layer, the table and the instrument.
 
@@ -112,7 +112,7 @@ def write_grid(
     files[INSTRUMENT] = _instrument(field.name, records, curves).encode()
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in ordered]
-    sizes = write_folder(Path(folder), partial(write_files, files), manifest, force=force)
+    sizes = write_folder(Path(folder), partial(write_files, files), manifest, overwrite=overwrite)
     remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB"]
     if ordered != list(layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)

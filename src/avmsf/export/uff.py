@@ -34,7 +34,7 @@ _MAX_LINES = 1 << 16
 """Frequencies of a response function, at most."""
 
 
-def write_universal(field: SampledField, path: str | Path, *, functions: int = 16, force: bool = False) -> Written:
+def write_universal(field: SampledField, path: str | Path, *, functions: int = 16, overwrite: bool = False) -> Written:
     """Write points, modes, and the response functions of `functions` points (by farthest point sampling).
 
     If all modes start as sines, shapes are real: normal modes with undamped frequency and damping ratio. Otherwise they
@@ -69,7 +69,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     if leaning > _STRAIGHT:
         axis = f"their reference direction is the nearest axis, up to {leaning:.0f} degrees off"
         remarks.append(f"response functions are of impacts against the normal; {axis}")
-    return Written(write_file(path, content, force=force), tuple(remarks))
+    return Written(write_file(path, content, overwrite=overwrite), tuple(remarks))
 
 
 def response_frequencies(field: SampledField) -> Float64[np.ndarray, " lines"]:

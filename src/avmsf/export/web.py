@@ -55,20 +55,20 @@ MEDIA_TYPES = {
 
 
 def write_webpage(
-    field: SoundField | SampledField, output: str | Path, *, force: bool = False, **options: Any
+    field: SoundField | SampledField, output: str | Path, *, overwrite: bool = False, **options: Any
 ) -> Written:
     """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
 
     `options` are those of `make_bundle`, whose errors are raised: `object`, `surface` and `strikes` to show, `limit` of
-    contacts. What exists is replaced only with `force`.
+    contacts. What exists is replaced only with `overwrite`.
     """
     output, bundle = Path(output), make_bundle(field, **options)
     if output.suffix.lower() in PAGE_SUFFIXES:
-        return Written(write_file(output, single_file(bundle).encode(), force=force), bundle.remarks)
+        return Written(write_file(output, single_file(bundle).encode(), overwrite=overwrite), bundle.remarks)
     content = {**_needed(page_files(), bundle), **bundle.files}
     html = _titled(content["index.html"].decode(), bundle)
     content["index.html"] = with_policy(html, directives_of(html)).encode()
-    sizes = write_folder(output, partial(write_files, content), dict(bundle.manifest), force=force)
+    sizes = write_folder(output, partial(write_files, content), dict(bundle.manifest), overwrite=overwrite)
     return Written(sizes, bundle.remarks)
 
 

@@ -39,8 +39,8 @@ def write(
     `to` is the format, by default that of the ending: .html a web page, .glb glTF, .dsp and .lib Faust, .uff modal
     analysis. Folders take "web", "wavs" (a sample set) or "avmsf-demo" (the layout of the paper's demo). At most
     `contacts` points, spread over the object, are written, by default as many as the format's tools read easily.
-    `options` are those of the format's writer in `avmsf.export`, such as `strikes=` of `write_webpage`, or `force=True`
-    to replace files. Raises ExportError for an unknown ending, and as the writer.
+    `options` are those of the format's writer in `avmsf.export`, such as `strikes=` of `write_webpage`, or
+    `overwrite=True` to replace files. Raises ExportError for an unknown ending, and as the writer.
     """
     output = Path(output)
     kind = _SUFFIXES.get(output.suffix.lower()) if to is None else to
@@ -56,5 +56,7 @@ def write(
         return write_webpage(field, output, limit=limit, **options)
     sampled = SampledField.of(field, points_on_object(field.gain_field), limit=limit)
     writer: Any = _WRITERS[kind]
+    if kind == "wavs":
+        options = {"contacts": len(sampled), **options}
     written: Written = writer(sampled, output, **options)
     return written

@@ -65,14 +65,14 @@ def pack(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[s
     return bytes(content), records
 
 
-def write_file(path: Path, content: bytes, *, force: bool = False) -> dict[Path, int]:
-    """Write one file atomically and return its size. Raises `ExportError` if it exists, unless `force` is set."""
-    check_free(path, force=force)
+def write_file(path: Path, content: bytes, *, overwrite: bool = False) -> dict[Path, int]:
+    """Write one file atomically and return its size. Raises `ExportError` if it exists, unless `overwrite` is set."""
+    check_free(path, overwrite=overwrite)
     write_whole(path, lambda place: place.write_bytes(content), raising=ExportError)
     return {path: len(content)}
 
 
-def check_free(path: Path, *, folder: bool = False, force: bool = False) -> None:
+def check_free(path: Path, *, folder: bool = False, overwrite: bool = False) -> None:
     """Raise `ExportError` if `write_file`, or `write_folder`, would for what exists there."""
     if not path.exists():
         return
@@ -82,7 +82,7 @@ def check_free(path: Path, *, folder: bool = False, force: bool = False) -> None
         raise ExportError.expected(f"a free name, or a {wanted}", other, got=f"a {other}", file=path, advice=advice)
     found = _files_in(path) if folder else [path.name]
     wanted, advice = "a free name", "choose another, or add --overwrite to replace it"
-    if force:
+    if overwrite:
         wanted, advice = "a folder with the files of an export alone", "choose another folder, or remove its files"
         found = sorted(set(found) - _exported(path)) if folder else []
     if found:
@@ -91,16 +91,16 @@ def check_free(path: Path, *, folder: bool = False, force: bool = False) -> None
 
 
 def write_folder(
-    folder: Path, fill: Callable[[Path], None], manifest: Mapping[str, object], *, force: bool = False
+    folder: Path, fill: Callable[[Path], None], manifest: Mapping[str, object], *, overwrite: bool = False
 ) -> dict[Path, int]:
     """Let `fill` write files into a temporary folder, add the manifest, rename it to `folder`; return the sizes.
 
-    The manifest lists the files. Raises `ExportError` for a folder with files; with `force` it is replaced if it has
-    the files of an export and no others.
+    The manifest lists the files. Raises `ExportError` for a folder with files; with `overwrite` it is replaced
+    if it has the files of an export and no others.
     """
-    check_free(folder, folder=True, force=force)
+    check_free(folder, folder=True, overwrite=overwrite)
     # What a link leads to is replaced, and the link stays.
-    with new_folder(folder.resolve(), raising=ExportError, replace=force) as place:
+    with new_folder(folder.resolve(), raising=ExportError, replace=overwrite) as place:
         fill(place)
         names = [*_files_in(place), MANIFEST]
         content = {"generator": generator(), **manifest, "files": names}

@@ -384,4 +384,4 @@ def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
 
 def _without(reason: str) -> str:
     """Return the note of a body that cannot be had, where there are others; without an error's advice."""
-    return f"not tried as the body: {reason.partition('; ')[0]}; the other candidates are compared"
+    return f"not a candidate body: {reason.partition('; ')[0].replace(': wall: expected', ': expected')}"

@@ -24,7 +24,7 @@ from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import read_surface, surface_points, write_surface
 from avmsf.photographs import read_views
 from avmsf.photographs.nerf_json import stated_moves
-from avmsf.pipeline.config import CACHED_FIELD, DESCRIPTORS, PipelineConfig
+from avmsf.pipeline.config import CACHED_FIELD, DESCRIPTORS, PRESETS, PipelineConfig
 from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import FEATURES, ProgressListener, SceneStages
 from avmsf.pipeline.stages import Kept, StageFolder
@@ -127,6 +127,8 @@ def shape_of(
     if scene is not None:
         given = None if features is None else (features, report)
         return _shape_of_views(capture, config, scene, given, listener)
+    if config.scene != PRESETS["default"].scene and is_mesh(capture.surface):
+        listener.log("the object's shape is its mesh: settings of views, Gaussians and features are not used")
     points = _points_of(capture, config, features, listener.log)
     surface, digest = object_shape(capture.surface, None)
     made = _surface_stage(stages, surface, digest, listener) if shaped else {}

@@ -60,10 +60,10 @@ class Options(Configured):
     material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Compute an approximate field of an object without recordings from its shape and its material: ceramic, glass,
     wood, plastic, iron, polycarbonate or steel."""
-    train_fraction: float | None = None
+    train_fraction: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Fit to all recordings at this fraction of the contacts, spread as far apart as possible, and compute the error
     at the others. Contacts closer than 1 % of the extent of all count as one."""
-    train_count: int | None = None
+    train_count: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Fit to all recordings at this number of contacts, spread as far apart as possible."""
     start: int = 0
     """Row of impacts.csv, counted from 0, whose contact this choice starts from."""
@@ -82,14 +82,14 @@ class Options(Configured):
     Gaussian process over one family, for study; symmetry needs a shape, visual image features."""
     extraction: ExtractionMethod | None = None
     """How modes are extracted, by default high-resolution; see `avmsf modes --help`."""
-    modes: int | None = None
+    modes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Maximum number of modes, by default 128."""
     time_zero: TimeZero | None = None
     """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
     """Device for Gaussians (with gsplat), DINOv2, training end to end and the network; by default the GPU if there is
     one. Mode extraction, finite elements and the Gaussian process run on the CPU."""
-    seed: int | None = None
+    seed: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Random seed of all stages, by default 0."""
     preset: Preset = "default"
     """All settings. default: takes seconds to minutes. paper: everything as published, the middle of each published

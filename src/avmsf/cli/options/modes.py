@@ -1,6 +1,7 @@
 """Options of `avmsf modes`."""
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import tyro
 
@@ -20,7 +21,7 @@ class Options(Printing):
     extraction: ExtractionMethod | None = None
     """How modes are extracted, by default high-resolution: ESPRIT in subbands, which separates modes a few hertz apart.
     short-time: the paper's method, bin by bin of a short-time spectrum."""
-    modes: int | None = None
+    modes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Maximum number of modes, by default 128."""
     time_zero: TimeZero | None = None
     """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""

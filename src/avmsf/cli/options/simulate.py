@@ -32,29 +32,29 @@ class Options(Configured):
     """Only list the sets' objects, the shapes and the materials."""
     cache: CacheFolder = None
     """Cache of elastic modes, which take most of the time: other hammers, noises and views are then fast."""
-    kind: str | None = None
+    kind: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Shape; --list names them."""
     mesh: Annotated[
         Path | None, tyro.conf.arg(metavar="MESH"), Existing("a mesh: obj, ply, glb or stl", ("a mesh or Gaussians",))
     ] = None
     """A mesh or scan instead of a shape, in meters."""
-    material: str | None = None
+    material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Name in the table of materials; --list names them."""
-    seed: int | None = None
+    seed: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Random seed of the shape's proportions, the contacts, the noise and the imperfections."""
-    impacts: int | None = None
-    """Number of impacts."""
-    seconds: float | None = None
-    """Length of each recording that is used, from its onset. The files are longer."""
-    sample_rate: int | None = None
-    """Sample rate, Hz."""
-    thickness: float | None = None
+    impacts: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Number of impacts; by default 40."""
+    seconds: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Length of each recording that is used, from its onset, by default 2 s. The files are longer."""
+    sample_rate: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Sample rate, Hz; by default 48000."""
+    thickness: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Wall thickness, meters. By default that of a shape is drawn at random, and a mesh is a solid body; with a
     thickness the mesh is the outside of a wall."""
-    size: float | None = None
+    size: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """Longest side of the bounding box, meters; by default that of the random shape or of the mesh."""
-    views: int | None = None
-    """Images to render, on three circles around the object; 0 for none."""
+    views: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Images to render, on three circles around the object: a multiple of 3, by default 72; 0 for none."""
 
     usual = ObjectRecipe()
 
