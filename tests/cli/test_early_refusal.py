@@ -62,6 +62,8 @@ REFUSED = (
     "fit good --until features -o f.ply",
     "modes good --plots modes.png",
     "export field.safetensors --to wavs -o s.wav",
+    "export field.safetensors --to wavs -o good --overwrite",
+    "export field.safetensors --to faust -o theirs.dsp",
     "locate field.safetensors field.safetensors",
     "render good/001.wav --position 0 0 0 -o s",
     "fit field.safetensors -o f.safetensors",
@@ -99,6 +101,7 @@ def place(tmp_path: Path) -> Path:
         *(f"property float {name}" for name in NEEDED),
     ]
     (tmp_path / "cut.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + bytes(4 * len(NEEDED) + 1))
+    (tmp_path / "theirs.dsp").touch()
     (tmp_path / "wrong.safetensors").write_bytes(b"RIFF and so on")
     field = STORED.read_bytes()
     (tmp_path / "field.safetensors").write_bytes(field)

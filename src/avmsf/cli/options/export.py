@@ -21,6 +21,7 @@ from avmsf.export.formats import (
     Format,
     Precision,
 )
+from avmsf.export.writing import check_free
 from avmsf.field.header import read_record
 from avmsf.modal.config import PulseShape
 
@@ -132,6 +133,9 @@ class Options(Printing):
         if self.contacts is not None and self.contacts < 1:
             raise ExportError.expected("1 or more", self.contacts, name="--contacts")
         _OUTPUTS[self.to].check(self.output)
+        # A web page is a file or, by a name without its suffix, a folder.
+        suffixes = getattr(_OUTPUTS[self.to], "suffixes", ())
+        check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
         read_record(self.field)
 
     @classmethod
