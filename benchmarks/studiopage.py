@@ -22,6 +22,7 @@ from typing import Any
 import soundfile
 import torch
 
+from avmsf._utils.arrays import fibonacci_sphere
 from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import page_files
@@ -84,10 +85,7 @@ def measure_page() -> Report:
 
 def ball_table(count: int = GAUSSIANS, modes: int = MODES) -> SampledField:
     """Return a ball whose modes are waves over it: as large as a page's field gets, with nothing to be learned."""
-    order = torch.arange(count, dtype=torch.float64) + 0.5
-    height, turn = 1 - 2 * order / count, order * math.pi * (1 + math.sqrt(5))
-    around = (1 - height**2).sqrt()
-    normals = torch.stack([around * turn.cos(), around * turn.sin(), height], dim=1).float()
+    normals = fibonacci_sphere(count).float()
     draw = torch.Generator().manual_seed(0)
     waves = torch.randn(3, modes, generator=draw) * torch.linspace(2, 12, modes)
     sine = torch.sin(normals @ waves) * torch.linspace(1, 0.1, modes)

@@ -8,7 +8,7 @@ from typing import Any, SupportsIndex
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import ArrayError
@@ -98,6 +98,15 @@ def _finite(found: Tensor, name: str) -> Tensor:
 
 Seed = int | torch.Generator | None
 """What decides chance: a number, a generator that goes on from where it is, or None for the number 0."""
+
+
+def fibonacci_sphere(count: int) -> Float64[Tensor, "count 3"]:
+    """Return unit vectors on a spherical Fibonacci lattice (Gonzalez, Mathematical Geosciences 42, 2010)."""
+    row = torch.arange(count, dtype=torch.float64)
+    height = 1.0 - (2.0 * row + 1.0) / count
+    turn = row * math.pi * (3.0 - math.sqrt(5.0))
+    flat = (1.0 - height.square()).sqrt()
+    return torch.stack([flat * torch.cos(turn), flat * torch.sin(turn), height], dim=1)
 
 
 def generator_of(seed: Seed) -> torch.Generator:

@@ -2,11 +2,11 @@
 
 import re
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
+from avmsf._utils.progress import calling
 from avmsf._utils.text import printable
 
 SILENCE_SECONDS = 4.0
@@ -73,19 +73,6 @@ def _without_numbers(text: str) -> str:
 @contextmanager
 def beating(text: str) -> Iterator[None]:
     """Print something every few seconds while the block runs; `text` until `printed` or `doing` say what goes on."""
-    ended = threading.Event()
-
-    def beat() -> None:
-        # A standard error that was closed costs the lines alone.
-        with suppress(OSError, ValueError):
-            while not ended.wait(_TICK_SECONDS):
-                _activity.repeat()
-
     _activity.now(text)
-    thread = threading.Thread(target=beat, name="avmsf-heartbeat", daemon=True)
-    thread.start()
-    try:
+    with calling(_activity.repeat, every=_TICK_SECONDS):
         yield
-    finally:
-        ended.set()
-        thread.join()

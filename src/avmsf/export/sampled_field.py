@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.arrays import fibonacci_sphere
 from avmsf.errors import ExportError
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
@@ -239,11 +240,7 @@ def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "point
     edges, first = np.unique(edges, axis=0, return_index=True)
     tree = minimum_spanning_tree(coo_matrix((bend[first], edges.T), shape=(len(places),) * 2).tocsr())
     count, part = connected_components(tree, directed=False)
-    # Evenly distributed directions: a Fibonacci spiral on the sphere.
-    height = 1 - (2 * np.arange(_VIEWS) + 1) / _VIEWS
-    turn = np.pi * (3 - np.sqrt(5)) * np.arange(_VIEWS)
-    across = np.sqrt(1 - height**2)
-    views = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
+    views = fibonacci_sphere(_VIEWS).numpy()
     for number in range(count):
         members = np.flatnonzero(part == number)
         order, parents = breadth_first_order(tree, members[0], directed=False)

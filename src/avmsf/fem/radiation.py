@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
+from avmsf._utils.arrays import fibonacci_sphere
 from avmsf.errors import SimulationError
 from avmsf.fem.damping import Vibration
 from avmsf.fem.elastic_modes import ElasticModes
@@ -111,15 +112,6 @@ def radiated_pressure(
     middle = 0.5 * (modes.nodes.amax(0) + modes.nodes.amin(0))
     reach = _FAR_FIELD_RATIO * float((modes.nodes.amax(0) - modes.nodes.amin(0)).norm())
     power = torch.zeros(len(vibration.poles), dtype=torch.float64)
-    for way in _evenly(directions):
+    for way in fibonacci_sphere(directions):
         power += radiated(modes, vibration, middle + reach * way).abs().square()
     return reach / DISTANCE * (power / directions).sqrt()
-
-
-def _evenly(count: int) -> Float64[Tensor, "count 3"]:
-    """Return unit vectors on a spherical Fibonacci lattice (Gonzalez, Mathematical Geosciences 42, 2010)."""
-    row = torch.arange(count, dtype=torch.float64)
-    height = 1.0 - (2.0 * row + 1.0) / count
-    turn = row * math.pi * (3.0 - math.sqrt(5.0))
-    flat = (1.0 - height.square()).sqrt()
-    return torch.stack([flat * torch.cos(turn), flat * torch.sin(turn), height], dim=1)

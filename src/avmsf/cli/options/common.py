@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, TypeVar, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
@@ -16,6 +16,9 @@ Unit = Literal["m", "cm", "mm", "in", "ft"]
 _RENAMED = {"--at": "--position", "--picture": "--plots", "--to-material": "--to"}
 """Options of earlier versions, and what they are called now."""
 T = TypeVar("T")
+# Not Self, which run-time checks of types cannot read in a dataclass.
+C = TypeVar("C", bound="Common")
+S = TypeVar("S", bound="Configured")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +31,7 @@ class Common:
     """Print each step of the work as it begins."""
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> Self:
+    def parse(cls: type[C], words: Sequence[str]) -> C:
         """Return the options that the words spell, see `parse_options`; the module has the verb's name."""
         return parse_options(cls, cls.__module__.rpartition(".")[2], words)
 
@@ -84,7 +87,7 @@ class Configured(Printing):
         raise NotImplementedError
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> Self:
+    def parse(cls: type[S], words: Sequence[str]) -> S:
         """Return the options that the words spell; with --print-config print the settings and leave by SystemExit.
 
         Raises `InputError` also for an option of earlier versions that is a setting now.

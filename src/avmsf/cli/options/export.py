@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
 import tyro
 
@@ -139,7 +139,7 @@ class Options(Printing):
         read_record(self.field)
 
     @classmethod
-    def parse(cls, words: Sequence[str]) -> Self:
+    def parse(cls, words: Sequence[str]) -> "Options":
         """Return the options that the words spell."""
         if ("--to", "sfz") in pairwise(words):
             raise ExportError.expected("--to wavs, which writes an SFZ instrument too", "sfz", name="--to")
