@@ -138,7 +138,7 @@ def _with_lens(
 
 def _with_mask(
     photograph: Photograph, folder: Path, pixels: UInt8[np.ndarray, "height width channels"], findings: Findings
-) -> UInt8[np.ndarray, "height width channels"]:
+) -> UInt8[np.ndarray, "height width masked_channels"]:
     """Return the image with the mask that lies in a file, where it has none of its own."""
     named = [] if photograph.mask is None else [photograph.mask]
     paths = [path for path in (*named, *mask_paths(photograph.name, folder)) if path.is_file()] or named

@@ -52,7 +52,7 @@ def series_color(number: int) -> str:
     return SERIES[number % len(SERIES)]
 
 
-def titled_figure(title: str, width: float, height: float) -> Figure:
+def titled_figure(title: str, width: float | int, height: float | int) -> Figure:
     """Return an empty figure of this size, inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title)
