@@ -27,7 +27,6 @@ from avmsf.field.sound_field import SoundField
 from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.modal.extraction.extract import extract_modes
-from avmsf.field.gains.data import along_phase
 from avmsf.modal.extraction.least_squares import fit_gains
 from benchmarks.look import finish, lift_pictures, pictures, slab, speckled
 from benchmarks.material import IMPULSE, STRUCK, PlateCase, capture_in_place, surface_features

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf.errors import AvmsfWarning, CaptureWarning, SceneError
+from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import SplatProgress, splat
@@ -82,19 +82,6 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
         splat(views, replace(config, seed=5), checkpoint=place)
     with raises(SceneError, file=place, value=["view, initial point or setting"]):
         splat(views[1:], config, checkpoint=place)
-
-
-def test_a_file_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "splat.ckpt").write_text("half of one")
-    with raises(SceneError, file="splat.ckpt", value=None):
-        splat(ball_views(5), QUICK, checkpoint=tmp_path / "splat.ckpt")
-
-
-def test_a_checkpoint_that_cannot_be_written_costs_no_result(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with warns(AvmsfWarning, file="file/splat.ckpt"):
-        cloud = splat(ball_views(5), replace(QUICK, steps=5), checkpoint=tmp_path / "file" / "splat.ckpt")
-    assert len(cloud)
 
 
 def test_progress_tells_what_the_last_step_did() -> None:

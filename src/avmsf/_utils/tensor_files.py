@@ -1,6 +1,5 @@
-"""Tensors in files: safetensors with one text, and checkpoints of work that may be interrupted."""
+"""Tensors in safetensors files with one text."""
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -59,40 +58,3 @@ def expect_tensors(tensors: Mapping[str, Tensor], skeleton: Mapping[str, Tensor]
         if not bool(torch.isfinite(tensor).all()):
             low, high = (float(each) for each in tensor.aminmax())
             raise error(f"{name} to be finite", f"{low:.3g} to {high:.3g}", name, (low, high))
-
-
-def write_checkpoint(
-    path: Path, state: Mapping[str, Any], identity: Mapping[str, str], *, raising: type[AvmsfError]
-) -> None:
-    """Write a state, tensors, numbers, text and containers of these, and what it belongs to. Raises `raising`."""
-    # By way of memory: torch's own writer reports a full disk as a RuntimeError of its archive format.
-    content = io.BytesIO()
-    torch.save({"identity": dict(identity), "state": dict(state)}, content)
-    write_whole(path, lambda place: place.write_bytes(content.getvalue()), raising=raising)
-
-
-def read_checkpoint(
-    path: Path, identity: Mapping[str, str], *, what: str, raising: type[AvmsfError]
-) -> dict[str, Any] | None:
-    """Return the state at `path`, None where there is none.
-
-    Raises `raising` for a file that is no checkpoint of `what`, and for one of another identity: a digest of each thing
-    that decides the result, by what errors call it.
-    """
-    if not path.exists():
-        return None
-    try:
-        content = torch.load(path, weights_only=True, map_location="cpu")
-        state, found = content["state"], content["identity"]
-        other = sorted(name for name in identity.keys() | found.keys() if identity.get(name) != found.get(name))
-    # torch.load raises whatever unpacking raises, with the advice to trust the file.
-    except Exception as error:
-        advice = "delete it or name another"
-        raise raising.expected(
-            f"a checkpoint of {what}", got="another or a damaged file", file=path, advice=advice
-        ) from error
-    if other:
-        wanted = f"a checkpoint of {what} with the same {' and '.join(other)}"
-        advice = "delete it to start again, or repeat its arguments to continue it"
-        raise raising.expected(wanted, other, got="another", file=path, advice=advice)
-    return dict(state)

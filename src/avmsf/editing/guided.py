@@ -2,8 +2,6 @@
 
 import hashlib
 import math
-import time
-import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -16,11 +14,11 @@ from safetensors.torch import save
 from torch import Tensor
 
 from avmsf._utils.caching import key_of, source_digest
-from avmsf._utils.tensor_files import read_checkpoint, write_checkpoint
+from avmsf._utils.checkpoint import Checkpoint
 from avmsf.editing.clips import Sounds, level
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
-from avmsf.errors import AvmsfWarning, EditError
+from avmsf.errors import EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
@@ -143,7 +141,6 @@ _MAX_POINTS = 2000
 """Maximum number of points of the surface that are used as contacts."""
 _MAX_FAILED_STEPS = 20
 """Consecutive steps without a finite target after which the edit ends with an error."""
-_CHECKPOINT_SECONDS = 30.0
 
 
 @runtime_checkable
@@ -210,8 +207,7 @@ def edit_towards(
     or the loss are not finite.
     """
     config = GuidedEditConfig() if config is None else config
-    run = _Optimization(field, guide, config, parameters, None if checkpoint is None else Path(checkpoint))
-    return run.finish(progress)
+    return _Optimization(field, guide, config, parameters, checkpoint).finish(progress)
 
 
 class _Optimization:
@@ -223,12 +219,11 @@ class _Optimization:
         guide: Guide,
         config: GuidedEditConfig,
         parameters: Parameterization,
-        checkpoint: Path | None,
+        checkpoint: str | Path | None,
     ) -> None:
         if guide.sample_rate != field.sample_rate:
             raise EditError.expected(f"the field's {field.sample_rate:g} Hz", guide.sample_rate, name="sample_rate")
         self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
-        self.checkpoint, self.saved_at = checkpoint, time.monotonic()
         points = field.gain_field.points
         self.points = points if len(points) <= _MAX_POINTS else points[farthest_points(points, _MAX_POINTS)]
         probes = self.points[farthest_points(self.points, min(len(self.points), _MAX_PROBES))]
@@ -247,10 +242,9 @@ class _Optimization:
         settings = {**asdict(config), **asdict(parameters)}
         # The interval of previews does not change the result.
         del settings["preview_every"]
-        self.identity = checkpoint_identity(field, probes, guide.describe(), settings)
-        state = None
-        if checkpoint is not None:
-            state = read_checkpoint(checkpoint, self.identity, what="an edit", raising=EditError)
+        identity = checkpoint_identity(field, probes, guide.describe(), settings)
+        self.checkpoint = Checkpoint(checkpoint, identity, what="the edit", raising=EditError)
+        state = self.checkpoint.read()
         searching = state is None and parameters.searches
         start = guide.start(self.probes) if searching else ModalEdit.none(self.field.bank)
         self.variables = EditVariables(start, self.probes.loudest(config.free_modes), parameters)
@@ -269,7 +263,7 @@ class _Optimization:
                     preview = self._preview() if due else None
                     factors, place = (edit.pitch_factor, edit.decay_factor), self.loudest_point if due else None
                     progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview, place))
-                if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
+                if self.checkpoint.due:
                     self._save()
         except KeyboardInterrupt:
             # Amid a step's changes there is nothing to keep but what was saved before.
@@ -336,16 +330,7 @@ class _Optimization:
         return FieldAtContacts.at(self.field, contacts, samples=max(1, samples))
 
     def _save(self) -> None:
-        if self.checkpoint is None:
-            return
-        state = {"variables": self.variables.state(), "step": self.step, "failed": self.failed}
-        try:
-            write_checkpoint(self.checkpoint, state, self.identity, raising=EditError)
-        except EditError as error:
-            # A full disk costs the checkpoint, not the edit.
-            message = f"the edit continues without a checkpoint: {error}"
-            warnings.warn(AvmsfWarning(message, **error.attributes), stacklevel=2)
-        self.saved_at = time.monotonic()
+        self.checkpoint.save({"variables": self.variables.state(), "step": self.step, "failed": self.failed})
 
 
 def checkpoint_identity(

@@ -71,7 +71,7 @@ def fit(
     estimator = MixtureEstimator() if gains is None else gains
     trainer = Trainer(
         {"input, configuration or version": fingerprint(data, estimator)},
-        checkpoint=None if checkpoint is None else Path(checkpoint),
+        checkpoint=checkpoint,
         progress=progress,
         device=usable_device(device, raising=FitError, kinds=TRAINABLE),
     )

@@ -1,8 +1,6 @@
 """What fits gain models: estimators, and the runs of training that they ask for, which a checkpoint may continue."""
 
 import math
-import time
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,9 +11,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.device import steps_between_losses
-from avmsf._utils.tensor_files import read_checkpoint, write_checkpoint
-from avmsf.errors import AvmsfWarning, FieldFileError, FitError
+from avmsf.errors import FieldFileError, FitError
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import GainModel
@@ -23,7 +21,6 @@ from avmsf.field.losses import spectral_loss
 from avmsf.field.training import Targets, TrainableGains, TrainingRun
 from avmsf.modal.spectra import envelope
 
-_CHECKPOINT_SECONDS = 30.0
 _VALIDATION_STEPS = 10
 """Steps between validations."""
 
@@ -51,19 +48,17 @@ class Trainer:
         self,
         identity: Mapping[str, str],
         *,
-        checkpoint: Path | None,
+        checkpoint: str | Path | None,
         progress: Callable[[Progress], None] | None,
         device: torch.device,
     ) -> None:
-        self.checkpoint, self.progress, self.device = checkpoint, progress, device
+        self.progress, self.device = progress, device
         # Each kind of device draws noise of its own.
-        self.identity = {**identity, "device": device.type}
-        state: dict[str, Any] | None = None
-        if checkpoint is not None:
-            state = read_checkpoint(checkpoint, self.identity, what="a fit", raising=FieldFileError)
-        self.trials: dict[str, dict[str, Any]] = {} if state is None else state["trials"]
-        self.running: dict[str, Any] | None = None if state is None else state["running"]
-        self.saved_at = time.monotonic()
+        identity = {**identity, "device": device.type}
+        self.checkpoint = Checkpoint(checkpoint, identity, what="the fit", raising=FieldFileError)
+        state = self.checkpoint.read() or {"trials": {}, "running": None}
+        self.trials: dict[str, dict[str, Any]] = state["trials"]
+        self.running: dict[str, Any] | None = state["running"]
 
     def run(
         self,
@@ -91,15 +86,13 @@ class Trainer:
                 validation.best = self.running["validation"]
         end, every = warmup + steps, steps_between_losses(self.device)
         try:
-            while True:
-                # First in the loop, so that a run which goes on takes the validation that an interruption may have cut
-                # off; a second one at the same step changes nothing.
-                if (validation is not None and validation.stops(run, end)) or run.step >= end:
-                    break
+            # First in the loop, so that a run which goes on takes the validation that an interruption may have cut off;
+            # a second one at the same step changes nothing.
+            while not (validation is not None and validation.stops(run, end)) and run.step < end:
                 loss = run.advance(targets)
                 if run.step % every == 0 or run.step in (warmup, end):
                     self._note(Progress(name, run.step, end, float(loss), warmup))
-                if time.monotonic() - self.saved_at > _CHECKPOINT_SECONDS:
+                if self.checkpoint.due:
                     self._save(name, run, validation)
         except KeyboardInterrupt:
             # Amid a step's changes there is nothing to keep but what was saved before.
@@ -107,7 +100,7 @@ class Trainer:
                 self._save(name, run, validation)
             raise
         if validation is not None:
-            self.trials[name] = {**validation.best, "steps": max(0, validation.best["steps"] - warmup)}
+            self.trials[name] = validation.best
         else:
             # The work is done but the field is not saved yet: should that fail, it need not be done again.
             self._save(name, run, None)
@@ -115,29 +108,18 @@ class Trainer:
 
     def _note(self, progress: Progress) -> None:
         if not math.isfinite(progress.loss):
-            got, advice = (
-                f"{progress.loss} at step {progress.step}",
-                "lower learning_rate, warmup_rate or correction_rate",
-            )
+            got = f"{progress.loss} at step {progress.step}"
+            advice = "lower learning_rate, warmup_rate or correction_rate"
             raise FitError.expected("a finite loss", progress.loss, got=got, name=progress.stage, advice=advice)
         if self.progress is not None:
             self.progress(progress)
 
     def _save(self, name: str, run: TrainingRun, validation: "_Validation | None") -> None:
-        if self.checkpoint is None:
-            return
         # On a GPU the loss is read every few steps only: a fit may have diverged since, and could not go on from that.
-        if not run.finite:
+        if self.checkpoint.path is not None and not run.finite:
             self._note(Progress(name, run.step, run.step, math.nan, 0))
         running = {"name": name, "run": run.state(), "validation": None if validation is None else validation.best}
-        state = {"trials": self.trials, "running": running}
-        try:
-            write_checkpoint(self.checkpoint, state, self.identity, raising=FieldFileError)
-        except FieldFileError as error:
-            # A full disk costs the checkpoint, not the fit.
-            message = f"{error}; the fit continues without a new checkpoint"
-            warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=2)
-        self.saved_at = time.monotonic()
+        self.checkpoint.save({"trials": self.trials, "running": running})
 
 
 class _Validation:
@@ -145,7 +127,7 @@ class _Validation:
 
     def __init__(self, targets: Targets, held: GainData, config: FitConfig) -> None:
         self.targets, self.envelope, self.config = targets, envelope(held.train.sounds), config
-        self.best: dict[str, Any] = {"spectral": float("inf"), "envelope": float("inf"), "steps": 0}
+        self.best: dict[str, Any] = {"spectral": math.inf, "envelope": math.inf, "steps": 0}
 
     def stops(self, run: TrainingRun, end: int) -> bool:
         """Note the errors where it is time, relative and ENV (paper, 4.2); return whether patience is at its end."""
@@ -160,8 +142,8 @@ class _Validation:
             distance = float((envelope(sounds.cpu()) - self.envelope).square().mean(1).sqrt().mean())
         run.generator.set_state(state)
         if not self.config.patience or spectral < self.best["spectral"]:
-            self.best = {"spectral": spectral, "envelope": distance, "steps": run.step}
-        return self.config.patience > 0 and run.step - self.best["steps"] >= self.config.patience
+            self.best = {"spectral": spectral, "envelope": distance, "steps": done}
+        return self.config.patience > 0 and done - self.best["steps"] >= self.config.patience
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """One training run: warm-up on extracted gains, then all parameters end to end (paper, section 3.5)."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -98,12 +99,12 @@ class AdamW:
         ]
 
 
-class TrainableGains(nn.Module):
+class TrainableGains(nn.Module, ABC):
     """Gains in training. Matrices decay towards zero as the config asks for, other parameters do not."""
 
+    @abstractmethod
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return the gains at the contacts that `Targets.rows` stands for, differentiable in the parameters."""
-        raise NotImplementedError
 
     def penalty(self) -> Float[Tensor, ""]:
         """Return the negative log prior of the parameters, in the unit of the spectral loss."""

@@ -4,8 +4,7 @@ import hashlib
 import importlib.util
 import math
 import time
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.device import steps_between_losses
-from avmsf._utils.tensor_files import read_checkpoint, write_checkpoint
-from avmsf.errors import AvmsfWarning, SceneError
+from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.densify import Density
@@ -31,8 +30,7 @@ from avmsf.photographs.cameras import View
 
 _MIN_PROGRESS_STEPS = 10
 """Least number of steps between reports of progress."""
-_CHECKPOINT_SECONDS = 30.0
-_CHECKPOINT_VERSION = 2
+_CHECKPOINT_VERSION = 3
 _BETAS, _EPSILON = (0.9, 0.999), 1e-15
 """Adam's, as in 3DGS."""
 
@@ -78,7 +76,7 @@ def splat(
     config = SplatConfig() if config is None else config
     device = _device(device, rasterizer)
     rasterizer = choose_rasterizer(device) if rasterizer is None else rasterizer
-    began = saved_at = time.monotonic()
+    began = time.monotonic()
     background = choose_background(views, config)
     photographs = comparable_views(views, background)
     cloud = starting_cloud(
@@ -90,35 +88,26 @@ def splat(
     )
     run = _Run(cloud.to(device), photographs, background, config, rasterizer=rasterizer)
     identity = {"view, initial point or setting": _fingerprint(views, cloud, config)}
-    if checkpoint is not None:
-        state = read_checkpoint(Path(checkpoint), identity, what="fit of Gaussians", raising=SceneError)
-        if state is not None:
-            run.resume(state["run"])
+    kept = Checkpoint(checkpoint, identity, what="the fit of the Gaussians", raising=SceneError)
+    if (state := kept.read()) is not None:
+        run.resume(state)
     try:
         while run.step < config.steps:
             loss, rendered, photograph = run.train_step()
-            last, now = run.step == config.steps, time.monotonic()
+            last = run.step == config.steps
             if progress is not None and (last or run.step % max(_MIN_PROGRESS_STEPS, run.losses_every) == 0):
                 likeness = psnr(rendered, photograph)
-                progress(SplatProgress(run.step, config.steps, float(loss), likeness, now - began, run.cloud))
-            if checkpoint is not None and (last or now - saved_at > _CHECKPOINT_SECONDS):
-                _save(run, Path(checkpoint), identity)
-                saved_at = time.monotonic()
+                progress(
+                    SplatProgress(run.step, config.steps, float(loss), likeness, time.monotonic() - began, run.cloud)
+                )
+            if last or kept.due:
+                kept.save(run.state())
     except KeyboardInterrupt:
         # During a step's changes, only the state saved before it is consistent.
-        if checkpoint is not None and run.whole:
-            _save(run, Path(checkpoint), identity)
+        if run.whole:
+            kept.save(run.state())
         raise
     return keep_object(run.cloud, views, rasterizer=rasterizer).to("cpu")
-
-
-def _save(run: "_Run", path: Path, identity: Mapping[str, str]) -> None:
-    try:
-        write_checkpoint(path, {"run": run.state()}, identity, raising=SceneError)
-    except SceneError as error:
-        # A full disk costs the checkpoint, not the run.
-        message = f"the fit of the Gaussians continues without a new checkpoint: {error}"
-        warnings.warn(AvmsfWarning(message, file=error.file, value=error.value), stacklevel=3)
 
 
 def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfig) -> str:

@@ -1,5 +1,6 @@
 """What the options of all verbs have in common: how they are parsed and checked."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -68,7 +69,7 @@ def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | N
 
 
 @dataclass(frozen=True, kw_only=True)
-class Configured(Printing):
+class Configured(Printing, ABC):
     """Options of the verbs that have more settings than options."""
 
     set: Assignments = ()
@@ -82,9 +83,9 @@ class Configured(Printing):
     """The settings where nothing changes them."""
 
     @property
+    @abstractmethod
     def all_settings(self) -> object:
         """The settings by the options."""
-        raise NotImplementedError
 
     @classmethod
     def parse(cls: type[S], words: Sequence[str]) -> S:
