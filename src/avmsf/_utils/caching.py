@@ -102,14 +102,8 @@ def once(make: Callable[Given, Result]) -> Callable[Given, Result]:
 
 @cache
 def _warn_once(folder: Path, reason: str) -> None:
-    warnings.warn(
-        AvmsfWarning(
-            f"{folder}: expected a folder for cached results, got {reason!r}; the next run computes them again",
-            file=folder,
-            value=reason,
-        ),
-        stacklevel=3,
-    )
+    wanted, advice = "a folder for cached results", "the next run computes them again"
+    warnings.warn(AvmsfWarning.expected(wanted, reason, file=folder, advice=advice), stacklevel=3)
 
 
 def key_of(values: dict[str, Any]) -> str:

@@ -60,17 +60,15 @@ def write_lock(
         _expect_excused(error, path)
         yield
         return
+    outermost = lock.lock_counter == 1
     try:
-        outermost = lock.lock_counter == 1
         if outermost:
             _write_holder(path, command)
-        try:
-            yield
-        finally:
-            if outermost:
-                with suppress(OSError):
-                    _holder_of(path).unlink(missing_ok=True)
+        yield
     finally:
+        if outermost:
+            with suppress(OSError):
+                _holder_of(path).unlink(missing_ok=True)
         lock.release()
 
 
@@ -80,8 +78,7 @@ def _expect_excused(error: OSError, path: Path) -> None:
     if error.errno in (*_NO_PLACE, *_NO_LOCKS) or (denied and not os.access(path.parent, os.W_OK)):
         return
     advice = "delete it if no process uses the folder" if denied else way_out(error)
-    reason = error.strerror or str(error)
-    raise AvmsfError(f"{path}: expected a lock, got {reason!r}; {advice}", file=path, value=reason) from error
+    raise AvmsfError.expected("a lock", error.strerror or str(error), file=path, advice=advice) from error
 
 
 def _holder_of(path: Path) -> Path:

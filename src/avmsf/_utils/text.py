@@ -111,11 +111,8 @@ def record_of(example: _Record, values: Any, name: str) -> _Record:
     examples = {each.name: getattr(example, each.name) for each in fields(example)}  # type: ignore[arg-type]
     if values.keys() != examples.keys():
         differing = sorted(values.keys() ^ examples.keys())
-        raise RecordError(
-            f"{name}: expected exactly its own keys; missing or unknown: {', '.join(differing)}",
-            name=f"{name}.{differing[0]}",
-            value=values.get(differing[0]),
-        )
+        got = f"{', '.join(differing)}, missing or unknown"
+        raise RecordError.expected("its own keys", values.get(differing[0]), got=got, name=f"{name}.{differing[0]}")
     return type(example)(**{each: like(value, examples[each], f"{name}.{each}") for each, value in values.items()})
 
 
@@ -126,12 +123,12 @@ def like(value: Any, example: Any, name: str) -> Any:
     if isinstance(example, float) and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
     if type(value) is not type(example):
-        raise RecordError(f"{name}: expected {type(example).__name__}, got {value!r}", name=name, value=value)
+        raise RecordError.expected(type(example).__name__, value, got=repr(value), name=name)
     return value
 
 
 def count_of(value: Any, name: str, *, least: int = 1) -> int:
     """Return a whole number of `least` or more. Raises RecordError for other values."""
     if like(value, 1, name) < least:
-        raise RecordError(f"{name}: expected {least} or more, got {value}", name=name, value=value)
+        raise RecordError.expected(f"{least} or more", value, name=name)
     return int(value)
