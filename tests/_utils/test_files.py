@@ -30,7 +30,7 @@ def test_the_advice_fits_the_systems_error(tmp_path: Path, monkeypatch: pytest.M
     advice = way_out(OSError(number, ""))
     assert str(refused.value).endswith(advice)
     with pytest.raises(ExportError) as refused:
-        write_folder(tmp_path / "folder", lambda place: None, {})
+        write_folder(tmp_path / "folder", {}, {})
     assert str(refused.value).endswith(advice)
 
 
@@ -56,7 +56,7 @@ def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(
             # Another thread that makes a file meanwhile would see the change.
             patched.setattr(os, "umask", lambda mask: changed.append(mask) or 0o027)
             write_whole(tmp_path / "file", lambda place: place.write_text("words"))
-            write_folder(tmp_path / "folder", lambda place: (place / "inside").touch(), {})
+            write_folder(tmp_path / "folder", {"inside": b""}, {})
     finally:
         os.umask(before)
     modes = [(tmp_path / name).stat().st_mode & 0o777 for name in ("file", "folder", "folder/inside")]

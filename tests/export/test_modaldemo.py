@@ -1,7 +1,9 @@
 """The layout of the paper's demo: its bytes are where its manifests say."""
 
+import errno
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -85,7 +87,7 @@ def test_the_gaussians_are_those_given_or_discs_on_the_surface(tmp_path):
         write_demo(field, tmp_path / "few", cloud=given.take(torch.arange(3)))
 
 
-def test_variants_of_the_same_gaussians_gather_in_one_folder(tmp_path):
+def test_variants_of_the_same_gaussians_gather_in_one_folder(tmp_path, monkeypatch):
     first, second = cosines(), replace(cosines(), frequency=1.1 * cosines().frequency)
     write_demo(first, tmp_path / "demo")
     words = " ".join(write_demo(second, tmp_path / "demo", variant="glass", overwrite=True).remarks)
@@ -101,6 +103,13 @@ def test_variants_of_the_same_gaussians_gather_in_one_folder(tmp_path):
     with raises(ExportError, file=tmp_path / "demo", value=["glass"]):
         write_demo(elsewhere, tmp_path / "demo", overwrite=True)
     assert read_arrays(tmp_path / "demo" / "glass")["frequencies"][0] > 450
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with raises(ExportError, file=tmp_path / "demo", value="Permission denied"):
+        write_demo(second, tmp_path / "demo", overwrite=True)
 
 
 def test_what_the_layout_cannot_hold_is_refused(tmp_path):

@@ -2,19 +2,15 @@
 
 import json
 import os
+from pathlib import Path
 
 from avmsf.errors import ExportError
 from avmsf.export.writing import Written, write_file, write_folder
 from factories.raising import raises
 
 
-def fill(*names):
-    def write(place):
-        for name in names:
-            (place / name).parent.mkdir(parents=True, exist_ok=True)
-            (place / name).write_text(name)
-
-    return write
+def named(*names):
+    return {name: name.encode() for name in names}
 
 
 def listed(folder):
@@ -23,7 +19,7 @@ def listed(folder):
 
 def test_a_folder_lists_its_files_and_their_sizes(tmp_path):
     (tmp_path / "out").mkdir()  # An empty folder is free.
-    sizes = write_folder(tmp_path / "out", fill("b.txt", "in/a.txt"), {"name": "x"})
+    sizes = write_folder(tmp_path / "out", named("b.txt", "in/a.txt"), {"name": "x"})
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
     assert manifest["files"] == ["b.txt", "in/a.txt", "manifest.json"]
     assert manifest["name"] == "x"
@@ -32,36 +28,36 @@ def test_a_folder_lists_its_files_and_their_sizes(tmp_path):
 
 
 def test_an_export_is_replaced_only_if_asked_and_nothing_else_is(tmp_path):
-    write_folder(tmp_path / "out", fill("a.txt", "in/c.txt"), {})
+    write_folder(tmp_path / "out", named("a.txt", "in/c.txt"), {})
     with raises(ExportError, file=tmp_path / "out", name="--overwrite"):
-        write_folder(tmp_path / "out", fill("b.txt"), {})
-    write_folder(tmp_path / "out", fill("b.txt"), {}, overwrite=True)
+        write_folder(tmp_path / "out", named("b.txt"), {})
+    write_folder(tmp_path / "out", named("b.txt"), {}, overwrite=True)
     assert listed(tmp_path) == ["out/b.txt", "out/manifest.json"]
     (tmp_path / "out" / "notes.txt").write_text("mine")
     with raises(ExportError, file=tmp_path / "out", name="--overwrite", value=["notes.txt"]):
-        write_folder(tmp_path / "out", fill("a.txt"), {}, overwrite=True)
+        write_folder(tmp_path / "out", named("a.txt"), {}, overwrite=True)
     (tmp_path / "out" / "manifest.json").write_text('{"files": ["b.txt", "manifest.json", "notes.txt"]}')
     with raises(ExportError, file=tmp_path / "out", value=["b.txt", "manifest.json", "notes.txt"]):
-        write_folder(tmp_path / "out", fill("a.txt"), {}, overwrite=True)
+        write_folder(tmp_path / "out", named("a.txt"), {}, overwrite=True)
     assert listed(tmp_path) == ["out/b.txt", "out/manifest.json", "out/notes.txt"]
 
 
-def test_what_fails_half_way_leaves_all_as_it_was(tmp_path):
-    write_folder(tmp_path / "out", fill("a.txt"), {})
+def test_what_fails_half_way_leaves_all_as_it_was(tmp_path, monkeypatch):
+    write_folder(tmp_path / "out", named("a.txt"), {})
 
-    def fail(place):
-        (place / "b.txt").write_text("half")
+    def fail(path, content):
         raise OSError(28, "No space left on device")
 
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with raises(ExportError, file=tmp_path / "out", value="No space left on device"):
-        write_folder(tmp_path / "out", fail, {}, overwrite=True)
+        write_folder(tmp_path / "out", named("b.txt"), {}, overwrite=True)
     assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
 
 
 def test_a_folder_behind_a_link_is_written_to_and_the_link_stays(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
-    sizes = write_folder(tmp_path / "link", fill("a.txt"), {})
+    sizes = write_folder(tmp_path / "link", named("a.txt"), {})
     assert set(sizes) == {tmp_path / "link" / name for name in ("a.txt", "manifest.json")}
     assert (tmp_path / "link").is_symlink()
     assert sorted(os.listdir(tmp_path)) == ["link", "real"]
@@ -80,6 +76,6 @@ def test_a_file_that_exists_is_replaced_only_if_asked(tmp_path):
 def test_files_and_folders_are_told_apart(tmp_path):
     (tmp_path / "file").write_text("avmsf")
     with raises(ExportError, file=tmp_path / "file", value="file"):
-        write_folder(tmp_path / "file", fill("a.txt"), {}, overwrite=True)
+        write_folder(tmp_path / "file", named("a.txt"), {}, overwrite=True)
     with raises(ExportError, file=tmp_path, value="folder"):
         write_file(tmp_path, b"avmsf", overwrite=True)

@@ -19,7 +19,6 @@ from avmsf.cli.printing import next_step, print_result, say
 from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
-from avmsf.export.formats import PAGE_SUFFIXES, POINTS
 from avmsf.export.geometry import DisplayGeometry, holds_gaussians, read_display_geometry, read_object
 from avmsf.export.gltf import write_gltf
 from avmsf.export.paper_demo import write_demo
@@ -27,7 +26,7 @@ from avmsf.export.sampled_field import SampledField, spread_rows
 from avmsf.export.samples import INSTRUMENT, Layer, hertz_layers, write_grid
 from avmsf.export.uff import write_universal
 from avmsf.export.web import write_webpage
-from avmsf.export.writing import Written, check_free, write_file
+from avmsf.export.writing import POINTS, SUFFIXES, Written, check_free, write_file
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
@@ -83,7 +82,7 @@ def _following(options: Options) -> str:
     """Return what to do with the files of a format."""
     output = shlex.quote(str(options.output))
     match options.to:
-        case "web" if options.output.suffix.lower() in PAGE_SUFFIXES:
+        case "web" if options.output.suffix.lower() in SUFFIXES["web"]:
             return f"open {output} in a browser"
         case "web":
             return f"python -m http.server --directory {output}, then open http://localhost:8000 in a browser"

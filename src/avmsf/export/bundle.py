@@ -8,7 +8,6 @@ field's unit.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,9 @@ from jaxtyping import Shaped
 from avmsf.capture.audio import wav_bytes
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
-from avmsf.export.formats import MAX_POINTS
 from avmsf.export.geometry import read_object
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, no_modes, pack, write_files, write_folder
+from avmsf.export.writing import MAX_POINTS, Written, no_modes, pack, write_folder
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.surface import Surface
@@ -45,8 +43,7 @@ class Bundle:
 
     def write(self, folder: str | Path, *, overwrite: bool = False) -> Written:
         """Write a folder, atomically. Raises `ExportError` for one that is not empty, unless `overwrite` is set."""
-        sizes = write_folder(Path(folder), partial(write_files, self.files), dict(self.manifest), overwrite=overwrite)
-        return Written(sizes, self.remarks)
+        return Written(write_folder(Path(folder), self.files, self.manifest, overwrite=overwrite), self.remarks)
 
 
 def make_bundle(

@@ -12,9 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import ExportError
-from avmsf.export.formats import FAUST_SUFFIXES
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, check_free, check_suffix, generator, write_file
+from avmsf.export.writing import SUFFIXES, Written, check_free, check_suffix, generator, write_file
 
 _MIN_POINTS = 16
 """Number of points below which the noise is left out so that more points fit."""
@@ -32,7 +31,7 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, ov
     time.
     """
     path = Path(path)
-    check_suffix(path, FAUST_SUFFIXES)
+    check_suffix(path, SUFFIXES["faust"])
     with_noise = noise and bool(field.noise.any())
     text = faust_library(field, noise=with_noise)
     if path.suffix == ".dsp":

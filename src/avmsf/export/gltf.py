@@ -9,26 +9,25 @@ damping for each mode, and no noise; phases, dampings at each contact and the no
 import json
 import math
 import struct
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf.export.formats import GLTF_SUFFIXES, Axis
 from avmsf.export.geometry import DisplayGeometry
-from avmsf.export.one_phase import approximation_error, importance, shared_dampings, signed_amplitudes
+from avmsf.export.one_phase import approximation_error, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, check_suffix, generator, no_modes, write_file
+from avmsf.export.writing import SUFFIXES, Axis, Written, check_suffix, generator, no_modes, pack, write_file
 
 EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
-_VERTICES, _INDICES = 34962, 34963
+_TARGETS = {**dict.fromkeys(("POSITION", "NORMAL", "COLOR_0"), 34962), "indices": 34963}
+"""What a buffer view is bound to: vertices, or the indices of triangles."""
 _GRAY = 0.7
 _TURNS: dict[Axis, tuple[float, float, float, float]] = {
     "x": (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)),
@@ -52,75 +51,41 @@ def write_gltf(
     `ExportError` for a name that does not end in .glb, and a field without modes.
     """
     path = Path(path)
-    check_suffix(path, GLTF_SUFFIXES)
+    check_suffix(path, SUFFIXES["gltf"])
     if not len(sampled.frequency):
         raise no_modes(path)
-    damping = shared_dampings(sampled)
-    order = importance(sampled, damping)
-    gains = signed_amplitudes(sampled)
-    document, arrays = _document(sampled, geometry or DisplayGeometry.of_points(sampled), up, order, gains, damping)
-    sizes = write_file(path, _glb(document, arrays), overwrite=overwrite)
-    return Written(sizes, _remarks(sampled), *approximation_error(sampled, sine=gains, damping=damping))
-
-
-@dataclass
-class _Buffer:
-    """The binary chunk, with its buffer views and accessors."""
-
-    content: bytes = b""
-    views: list[dict[str, Any]] = field(default_factory=list)
-    accessors: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, values: Shaped[np.ndarray, "..."], *, bounds: bool = False, target: int | None = None) -> int:
-        """Append an array as float32 or uint32 and return its accessor; arrays with two axes are of type VEC3."""
-        whole = values.dtype.kind in "iu"
-        packed = np.ascontiguousarray(values, dtype="<u4" if whole else "<f4")
-        view = {"buffer": 0, "byteOffset": len(self.content), "byteLength": packed.nbytes}
-        self.views.append(view if target is None else view | {"target": target})
-        self.content += packed.tobytes()
-        record: dict[str, Any] = {
-            "bufferView": len(self.views) - 1,
-            "componentType": _UNSIGNED if whole else _FLOAT,
-            "count": len(packed),
-            "type": "VEC3" if packed.ndim == 2 else "SCALAR",
-        }
-        if bounds:
-            record |= {"min": packed.min(0).tolist(), "max": packed.max(0).tolist()}
-        self.accessors.append(record)
-        return len(self.accessors) - 1
+    damping, gains = shared_dampings(sampled), signed_amplitudes(sampled)
+    document, content = _document(sampled, geometry or DisplayGeometry.of_points(sampled), up, gains, damping)
+    sizes = write_file(path, _glb(document, content), overwrite=overwrite)
+    error = approximation_error(sampled, torch.complex(gains, torch.zeros_like(gains)), damping)
+    return Written(sizes, _remarks(sampled), *error)
 
 
 def _document(
     sampled: SampledField,
     geometry: DisplayGeometry,
     up: Axis,
-    order: Int[Tensor, " modes"],
     gains: Float[Tensor, "points modes"],
     damping: Float[Tensor, " modes"],
 ) -> tuple[dict[str, Any], bytes]:
-    buffer = _Buffer()
-    frequency = sampled.frequency[order]
-    shapes = -sampled.normals.double()[None] * (gains.double()[:, order] / (2 * math.pi * frequency)).T[:, :, None]
-    model = {
-        "name": sampled.name or "object",
-        "frequencies": buffer.add(frequency.numpy()),
-        "decayRates": buffer.add(damping[order].numpy()),
-        "positions": buffer.add(sampled.points.numpy(), bounds=True),
-        "shapes": buffer.add(shapes.reshape(-1, 3).numpy()),
-        "extras": _extras(sampled, order, buffer),
+    """Return the JSON and the binary chunk, whose arrays are in the order of the accessors' numbers."""
+    energy = (sampled.sine.double().square() + sampled.cosine.double().square()).sum(0) / damping
+    order = torch.argsort(energy, descending=True, stable=True)
+    modal, extra, drawn = _modal(sampled, order, gains, damping), _extra(sampled, order), _drawn(geometry)
+    views, accessors, content = _packed([*modal.items(), *extra.items(), *drawn.items()])
+    number = count()
+    facts = {
+        "generator": generator(),
+        "sampleRate": sampled.sample_rate,
+        "samples": sampled.samples,
+        "perNewton": sampled.per_newton,
+        "impulse": "1 N s against the normal is an impact of force 1",
     }
-    primitive: dict[str, Any] = {
-        "attributes": {
-            "POSITION": buffer.add(geometry.vertices.numpy(), bounds=True, target=_VERTICES),
-            "NORMAL": buffer.add(torch.nn.functional.normalize(geometry.normals, dim=1).numpy(), target=_VERTICES),
-        },
-        "mode": _TRIANGLES if len(geometry.faces) else _POINTS,
-        "material": 0,
-    }
-    if geometry.colors is not None:
-        primitive["attributes"]["COLOR_0"] = buffer.add(_linear(geometry.colors).numpy(), target=_VERTICES)
-    if len(geometry.faces):
-        primitive["indices"] = buffer.add(geometry.faces.reshape(-1).numpy(), target=_INDICES)
+    model: dict[str, Any] = {"name": sampled.name or "object", **dict(zip(modal, number, strict=False))}
+    model["extras"] = {"avmsf": facts | dict(zip(extra, number, strict=False))}
+    attributes = dict(zip(drawn, number, strict=False))
+    indices = {name: attributes.pop(name) for name in ("indices",) if name in attributes}
+    primitive = {"attributes": attributes, "mode": _TRIANGLES if indices else _POINTS, "material": 0, **indices}
     shade = 1.0 if geometry.colors is not None else float(_linear(torch.tensor(_GRAY)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
     sounds = {"modalModel": 0}
@@ -133,30 +98,67 @@ def _document(
         "nodes": [{"name": model["name"], "mesh": 0, "rotation": list(_TURNS[up]), "extensions": {EXTENSION: sounds}}],
         "meshes": [{"name": model["name"], "primitives": [primitive]}],
         "materials": [{"pbrMetallicRoughness": surface, "doubleSided": True}],
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": len(buffer.content)}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(content)}],
     }
-    return document, buffer.content
+    return document, content
 
 
-def _extras(sampled: SampledField, order: Int[Tensor, " modes"], buffer: _Buffer) -> dict[str, Any]:
-    """Return what the draft cannot represent; arrays as accessors, mode-major like the shapes."""
-    extras: dict[str, Any] = {
-        "generator": generator(),
-        "sampleRate": sampled.sample_rate,
-        "samples": sampled.samples,
-        "perNewton": sampled.per_newton,
-        "impulse": "1 N s against the normal is an impact of force 1",
-    }
+def _modal(
+    sampled: SampledField,
+    order: Int[Tensor, " modes"],
+    gains: Float[Tensor, "points modes"],
+    damping: Float[Tensor, " modes"],
+) -> dict[str, Tensor]:
+    """Return the arrays of the draft's modal model."""
+    frequency = sampled.frequency[order]
+    shapes = -sampled.normals.double()[None] * (gains.double()[:, order] / (2 * math.pi * frequency)).T[:, :, None]
+    arrays = {"frequencies": frequency, "decayRates": damping[order], "positions": sampled.points}
+    return arrays | {"shapes": shapes.reshape(-1, 3)}
+
+
+def _extra(sampled: SampledField, order: Int[Tensor, " modes"]) -> dict[str, Tensor]:
+    """Return the arrays that the draft has no place for, mode-major like the shapes."""
+    arrays: dict[str, Tensor] = {}
     if sampled.cosine.any():
-        extras["sine"] = buffer.add(sampled.sine[:, order].T.reshape(-1).numpy())
-        extras["cosine"] = buffer.add(sampled.cosine[:, order].T.reshape(-1).numpy())
+        arrays |= {"sine": sampled.sine[:, order].T.reshape(-1), "cosine": sampled.cosine[:, order].T.reshape(-1)}
     if not sampled.shared_damping:
-        extras["decayRates"] = buffer.add(sampled.damping[:, order].T.reshape(-1).numpy())
+        arrays["decayRates"] = sampled.damping[:, order].T.reshape(-1)
     if sampled.noise.any():
-        extras["noise"] = buffer.add(sampled.noise.numpy())
-    return {"avmsf": extras}
+        arrays["noise"] = sampled.noise
+    return arrays
+
+
+def _drawn(geometry: DisplayGeometry) -> dict[str, Tensor]:
+    """Return the attributes of the vertices, and the indices of triangles."""
+    arrays = {"POSITION": geometry.vertices, "NORMAL": torch.nn.functional.normalize(geometry.normals, dim=1)}
+    if geometry.colors is not None:
+        arrays["COLOR_0"] = _linear(geometry.colors)
+    if len(geometry.faces):
+        arrays["indices"] = geometry.faces.reshape(-1)
+    return arrays
+
+
+def _packed(named: Sequence[tuple[str, Tensor]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bytes]:
+    """Return the buffer views, the accessors and the content of arrays, which become float32 or uint32."""
+    arrays = {str(row): array.numpy() for row, (_, array) in enumerate(named)}
+    arrays = {row: array.astype("<u4" if array.dtype.kind in "iu" else "<f4") for row, array in arrays.items()}
+    content, places = pack(arrays)
+    views, accessors = [], []
+    for row, ((name, _), array) in enumerate(zip(named, arrays.values(), strict=True)):
+        view = {"buffer": 0, "byteOffset": places[str(row)]["offset"], "byteLength": array.nbytes}
+        views.append(view | ({"target": _TARGETS[name]} if name in _TARGETS else {}))
+        record: dict[str, Any] = {
+            "bufferView": row,
+            "componentType": _UNSIGNED if array.dtype.kind == "u" else _FLOAT,
+            "count": len(array),
+            "type": "VEC3" if array.ndim == 2 else "SCALAR",
+        }
+        if name in ("positions", "POSITION"):
+            record |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+        accessors.append(record)
+    return views, accessors, content
 
 
 def _glb(document: Mapping[str, Any], content: bytes) -> bytes:

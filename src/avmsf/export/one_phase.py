@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float32, Float64, Int
+from jaxtyping import Complex64, Float32, Float64
 from torch import Tensor
 
 from avmsf.export.sampled_field import SampledField
@@ -42,21 +42,16 @@ def shared_dampings(field: SampledField) -> Float64[Tensor, " modes"]:
 
 
 def approximation_error(
-    field: SampledField,
-    *,
-    sine: Float32[Tensor, "points modes"] | None = None,
-    cosine: Float32[Tensor, "points modes"] | None = None,
-    damping: Float64[Tensor, "*points modes"],
+    field: SampledField, amplitude: Complex64[Tensor, "points modes"], damping: Float64[Tensor, "*points modes"]
 ) -> tuple[float, float]:
-    """Return how far these modes, without noise, are from the field at a few points.
+    """Return how far modes of amplitudes sine + i cosine, without noise, are from the field at a few points.
 
     The largest difference of samples, relative to the largest sample; and the mean difference of short-time magnitude
     spectra, dB, weighted by the field's energy.
     """
     rows = field.spread(_COMPARED_POINTS)
-    zero = torch.zeros(len(rows), len(field.frequency))
     rendered = synthesize(
-        torch.complex(zero if sine is None else sine[rows], zero if cosine is None else cosine[rows]),
+        amplitude[rows],
         field.frequency,
         damping if damping.ndim == 1 else damping[rows],
         samples=field.samples,
@@ -71,9 +66,3 @@ def approximation_error(
     floor, energy = _MIN_MAGNITUDE_RATIO * float(expected.max()), expected.square()
     difference = 20.0 * torch.log10((found + floor) / (expected + floor)).abs()
     return float((rendered - reference).abs().max()) / peak, float((energy * difference).sum() / energy.sum())
-
-
-def importance(field: SampledField, damping: Float64[Tensor, " modes"]) -> Int[Tensor, " modes"]:
-    """Return the modes' rows, sorted by descending energy over all contacts."""
-    energy = (field.sine.double().square() + field.cosine.double().square()).sum(0) / damping
-    return torch.argsort(energy, descending=True, stable=True)

@@ -5,7 +5,6 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from torch import Tensor
 from avmsf.capture.audio import wav_bytes
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, write_files, write_folder
+from avmsf.export.writing import Written, write_folder
 from avmsf.modal.config import PulseShape
 from avmsf.modal.modes import ForcePulse
 
@@ -112,7 +111,7 @@ def write_grid(
     files[INSTRUMENT] = _instrument(field.name, records, curves).encode()
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in ordered]
-    sizes = write_folder(Path(folder), partial(write_files, files), manifest, overwrite=overwrite)
+    sizes = write_folder(Path(folder), files, manifest, overwrite=overwrite)
     remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB"]
     if ordered != list(layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)

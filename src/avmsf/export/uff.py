@@ -19,10 +19,9 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf.errors import ExportError
-from avmsf.export.formats import UNIVERSAL_SUFFIXES
 from avmsf.export.one_phase import shared_dampings
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, check_suffix, generator, write_file
+from avmsf.export.writing import SUFFIXES, Written, check_suffix, generator, write_file
 
 _NORMAL_MODE, _COMPLEX_MODE = 2, 3
 _TRANSLATION = 2
@@ -42,7 +41,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     or .unv, and where pyuff is missing.
     """
     path = Path(path)
-    check_suffix(path, UNIVERSAL_SUFFIXES)
+    check_suffix(path, SUFFIXES["uff"])
     if functions < 0:
         raise ExportError.expected("0 or more", functions, name="functions")
     pyuff = _pyuff()

@@ -14,7 +14,6 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
-from functools import partial
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -22,9 +21,8 @@ from typing import Any
 
 from avmsf.errors import ExportError
 from avmsf.export.bundle import Bundle, make_bundle
-from avmsf.export.formats import PAGE_SUFFIXES
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, generator, write_file, write_files, write_folder
+from avmsf.export.writing import SUFFIXES, Written, generator, write_file, write_folder
 from avmsf.field.sound_field import SoundField
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
@@ -63,13 +61,12 @@ def write_webpage(
     contacts. What exists is replaced only with `overwrite`.
     """
     output, bundle = Path(output), make_bundle(field, **options)
-    if output.suffix.lower() in PAGE_SUFFIXES:
+    if output.suffix.lower() in SUFFIXES["web"]:
         return Written(write_file(output, single_file(bundle).encode(), overwrite=overwrite), bundle.remarks)
     content = {**_needed(page_files(), bundle), **bundle.files}
     html = _titled(content["index.html"].decode(), bundle)
     content["index.html"] = with_policy(html, directives_of(html)).encode()
-    sizes = write_folder(output, partial(write_files, content), dict(bundle.manifest), overwrite=overwrite)
-    return Written(sizes, bundle.remarks)
+    return Written(write_folder(output, content, bundle.manifest, overwrite=overwrite), bundle.remarks)
 
 
 def page_files() -> dict[str, bytes]:

@@ -5,23 +5,17 @@ from typing import Any, get_args
 
 from avmsf.errors import ExportError
 from avmsf.export.faust import write_faust
-from avmsf.export.formats import FAUST_SUFFIXES, GLTF_SUFFIXES, PAGE_SUFFIXES, POINTS, UNIVERSAL_SUFFIXES, Format
 from avmsf.export.gltf import write_gltf
 from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.samples import write_grid
 from avmsf.export.uff import write_universal
 from avmsf.export.web import write_webpage
-from avmsf.export.writing import Written
+from avmsf.export.writing import POINTS, SUFFIXES, Format, Written
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 
-_SUFFIXES: dict[str, Format] = {
-    **dict.fromkeys(PAGE_SUFFIXES, "web"),
-    **dict.fromkeys(GLTF_SUFFIXES, "gltf"),
-    **dict.fromkeys(FAUST_SUFFIXES, "faust"),
-    **dict.fromkeys(UNIVERSAL_SUFFIXES, "uff"),
-}
+_FORMATS: dict[str, Format] = {suffix: name for name, suffixes in SUFFIXES.items() for suffix in suffixes}
 _WRITERS = {
     "gltf": write_gltf,
     "faust": write_faust,
@@ -43,10 +37,10 @@ def write(
     `overwrite=True` to replace files. Raises ExportError for an unknown ending, and as the writer.
     """
     output = Path(output)
-    kind = _SUFFIXES.get(output.suffix.lower()) if to is None else to
+    kind = _FORMATS.get(output.suffix.lower()) if to is None else to
     if kind is None or kind not in get_args(Format):
         raise ExportError.expected(
-            f"a name that ends in {', '.join(_SUFFIXES)}, or to= one of {', '.join(get_args(Format))}",
+            f"a name that ends in {', '.join(_FORMATS)}, or to= one of {', '.join(get_args(Format))}",
             output.suffix if to is None else to,
             file=output,
             name="to",

@@ -1,11 +1,11 @@
-"""Output of exports: atomic files, and folders, that replace others only if asked to, and notes on losses."""
+"""What all writers share: the names of formats, packed arrays, files and folders that are whole, notes on losses."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Shaped
@@ -14,6 +14,27 @@ from avmsf._utils.files import new_folder, write_whole
 from avmsf._utils.text import read_json
 from avmsf.errors import ExportError
 
+Format = Literal["web", "gltf", "faust", "avmsf-demo", "wavs", "uff"]
+Precision = Literal["float16", "float32"]
+Axis = Literal["x", "y", "z"]
+MAX_POINTS = 20_000
+"""Default number of contacts of a page: 20 MB with 128 modes."""
+POINTS: dict[Format, int] = {
+    "web": MAX_POINTS,
+    "gltf": 2000,
+    "faust": 64,
+    "avmsf-demo": 10_000,
+    "wavs": 16,
+    "uff": 1000,
+}
+"""Default number of contacts of each format, which its tools read quickly."""
+SUFFIXES: dict[Format, tuple[str, ...]] = {
+    "web": (".html", ".htm"),
+    "gltf": (".glb",),
+    "faust": (".dsp", ".lib"),
+    "uff": (".uff", ".unv"),
+}
+"""Suffixes of the formats in one file; a page may be a folder too."""
 MANIFEST = "manifest.json"
 
 
@@ -72,6 +93,25 @@ def write_file(path: Path, content: bytes, *, overwrite: bool = False) -> dict[P
     return {path: len(content)}
 
 
+def write_folder(
+    folder: Path, files: Mapping[str, bytes], manifest: Mapping[str, object], *, overwrite: bool = False
+) -> dict[Path, int]:
+    """Write files by their relative paths, and a manifest that lists them, all or none; return the sizes.
+
+    Raises `ExportError` for a folder with files; with `overwrite` it is replaced if it has the files of an export and
+    no others.
+    """
+    check_free(folder, folder=True, overwrite=overwrite)
+    record = {"generator": generator(), **manifest, "files": [*sorted(files), MANIFEST]}
+    contents = {**files, MANIFEST: (json.dumps(record, indent=1) + "\n").encode()}
+    # What a link leads to is replaced, and the link stays.
+    with new_folder(folder.resolve(), raising=ExportError, replace=overwrite) as begun:
+        for name, content in contents.items():
+            (begun / name).parent.mkdir(parents=True, exist_ok=True)
+            (begun / name).write_bytes(content)
+    return {folder / name: len(content) for name, content in contents.items()}
+
+
 def check_free(path: Path, *, folder: bool = False, overwrite: bool = False) -> None:
     """Raise `ExportError` if `write_file`, or `write_folder`, would for what exists there."""
     if not path.exists():
@@ -80,7 +120,9 @@ def check_free(path: Path, *, folder: bool = False, overwrite: bool = False) -> 
         wanted, other = ("folder", "file") if folder else ("file", "folder")
         advice = "choose another name"
         raise ExportError.expected(f"a free name, or a {wanted}", other, got=f"a {other}", file=path, advice=advice)
-    found = _files_in(path) if folder else [path.name]
+    found = [path.name]
+    if folder:
+        found = sorted(each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file())
     wanted, advice = "a free name", "choose another, or add --overwrite to replace it"
     if overwrite:
         wanted, advice = "a folder with the files of an export alone", "choose another folder, or remove its files"
@@ -90,31 +132,6 @@ def check_free(path: Path, *, folder: bool = False, overwrite: bool = False) -> 
         raise ExportError.expected(wanted, found, got=got, file=path, name="--overwrite", advice=advice)
 
 
-def write_folder(
-    folder: Path, fill: Callable[[Path], None], manifest: Mapping[str, object], *, overwrite: bool = False
-) -> dict[Path, int]:
-    """Let `fill` write files into a temporary folder, add the manifest, rename it to `folder`; return the sizes.
-
-    The manifest lists the files. Raises `ExportError` for a folder with files; with `overwrite` it is replaced
-    if it has the files of an export and no others.
-    """
-    check_free(folder, folder=True, overwrite=overwrite)
-    # What a link leads to is replaced, and the link stays.
-    with new_folder(folder.resolve(), raising=ExportError, replace=overwrite) as place:
-        fill(place)
-        names = [*_files_in(place), MANIFEST]
-        content = {"generator": generator(), **manifest, "files": names}
-        (place / MANIFEST).write_text(json.dumps(content, indent=1) + "\n")
-        return {folder / name: (place / name).stat().st_size for name in names}
-
-
-def write_files(files: Mapping[str, bytes], folder: Path) -> None:
-    """Write each file under its relative path."""
-    for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(content)
-
-
 def _exported(folder: Path) -> set[str]:
     """Return the files that a folder's manifest, written here, lists."""
     try:
@@ -122,7 +139,3 @@ def _exported(folder: Path) -> set[str]:
         return set(manifest["files"]) if str(manifest["generator"]).startswith("avmsf ") else set()
     except (OSError, ValueError, KeyError, TypeError):
         return set()
-
-
-def _files_in(folder: Path) -> list[str]:
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())

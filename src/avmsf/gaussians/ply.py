@@ -30,6 +30,12 @@ from avmsf.gaussians.ply_header import (
 
 def write_splats(cloud: GaussianCloud, path: str | Path) -> None:
     """Write the Gaussians as 3DGS does: float32, binary, little endian. Raises `SceneError` where that cannot be."""
+    content = splat_bytes(cloud)
+    write_whole(Path(path), lambda place: place.write_bytes(content), raising=SceneError)
+
+
+def splat_bytes(cloud: GaussianCloud) -> bytes:
+    """Return the content of the file that `write_splats` writes."""
     cloud, count = cloud.detach().to("cpu"), len(cloud)
     higher = cloud.harmonics[:, 1:].mT.reshape(count, -1)
     columns = [cloud.centers, torch.zeros(count, 3), cloud.harmonics[:, 0], higher, cloud.logit_opacities[:, None]]
@@ -37,8 +43,7 @@ def write_splats(cloud: GaussianCloud, path: str | Path) -> None:
     names = [*CENTER, "nx", "ny", "nz", *COLOR, *HIGHER[: higher.shape[1]], *OPACITY, *SCALES, *ROTATION]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
-    content = "\n".join(header).encode("ascii") + table.tobytes()
-    write_whole(Path(path), lambda place: place.write_bytes(content), raising=SceneError)
+    return "\n".join(header).encode("ascii") + table.tobytes()
 
 
 def read_splats(path: str | Path) -> GaussianCloud:

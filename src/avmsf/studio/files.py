@@ -18,8 +18,8 @@ from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureError, CaptureWarning, StudioError
 from avmsf.export.bundle import make_bundle
-from avmsf.export.formats import MAX_POINTS
 from avmsf.export.sampled_field import SampledField, outward_normals, supporting_columns
+from avmsf.export.writing import MAX_POINTS
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.positions import points_on_object
 from avmsf.field.posterior import scale_of

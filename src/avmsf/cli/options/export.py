@@ -12,16 +12,7 @@ import tyro
 from avmsf.cli.options.common import Flag, Printing, Unit, option_of
 from avmsf.cli.options.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
 from avmsf.errors import ExportError
-from avmsf.export.formats import (
-    FAUST_SUFFIXES,
-    GLTF_SUFFIXES,
-    PAGE_SUFFIXES,
-    UNIVERSAL_SUFFIXES,
-    Axis,
-    Format,
-    Precision,
-)
-from avmsf.export.writing import check_free
+from avmsf.export.writing import SUFFIXES, Axis, Format, Precision, check_free
 from avmsf.field.header import read_record
 from avmsf.modal.config import PulseShape
 
@@ -38,12 +29,12 @@ _USED: dict[Format, tuple[str, ...]] = {
 CHOOSING = frozenset(name for name, used in _USED.items() if "position" in used)
 """Formats whose contacts can be given."""
 _OUTPUTS: dict[Format, NewFile | NewFolder] = {
-    "web": NewFile(PAGE_SUFFIXES, or_folder=True),
-    "gltf": NewFile(GLTF_SUFFIXES),
-    "faust": NewFile(FAUST_SUFFIXES),
+    "web": NewFile(SUFFIXES["web"], or_folder=True),
+    "gltf": NewFile(SUFFIXES["gltf"]),
+    "faust": NewFile(SUFFIXES["faust"]),
     "avmsf-demo": NewFolder(),
     "wavs": NewFolder(),
-    "uff": NewFile(UNIVERSAL_SUFFIXES),
+    "uff": NewFile(SUFFIXES["uff"]),
 }
 """What each format writes."""
 _OF_SOME = {name for used in _USED.values() for name in used}
