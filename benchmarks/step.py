@@ -62,19 +62,18 @@ class PlainRun(TrainingRun):
 
 def _distance(sounds: Float[Tensor, "contacts samples"], target: SpectralTarget) -> Float[Tensor, ""]:
     loss = sounds.new_zeros(())
-    for magnitudes, hop in zip(target.magnitudes, target.hops, strict=True):
-        fft_size = 2 * (magnitudes.shape[2] - 1)
+    for each in target.resolutions:
         spectra = torch.stft(
             sounds[:, : target.samples],
-            fft_size,
-            hop,
-            window=torch.hann_window(fft_size),
+            len(each.window),
+            each.hop,
+            window=each.window,
             center=True,
             pad_mode="constant",
             return_complex=True,
         )
         # Both lie frame by frame in memory: turning them costs nothing.
-        loss = loss + (spectra.abs().mT - magnitudes).abs().sum() / magnitudes.sum()
+        loss = loss + (spectra.abs().mT - each.magnitudes).abs().sum() / each.magnitudes.sum()
     return loss
 
 

@@ -15,7 +15,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.losses import SpectralTarget
+from avmsf.field.losses import Resolution, SpectralTarget
 from avmsf.field.trainer import GainEstimator
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.pipeline.config import PipelineConfig
@@ -35,7 +35,7 @@ def on_meta(value: object) -> object:
         return value.to("meta")
     if isinstance(value, tuple):
         return tuple(on_meta(each) for each in value)
-    if isinstance(value, SpectralTarget | Targets):
+    if isinstance(value, Resolution | SpectralTarget | Targets):
         return replace(value, **{each.name: on_meta(getattr(value, each.name)) for each in fields(value)})
     return value
 

@@ -27,19 +27,25 @@ slope is taken as finite there. Recordings divided by their forces have samples 
 
 
 @dataclass(frozen=True, eq=False)
-class SpectralTarget:
-    """Recordings to compare with, as magnitudes: made once, used at every step."""
+class Resolution:
+    """Recordings' magnitudes at one resolution."""
 
-    magnitudes: tuple[Float[Tensor, "contacts _frames _bins"], ...]
-    """One a resolution, each with its own numbers of frames and bins."""
-    norms: tuple[Float64[np.ndarray, " _frames"], ...]
-    """What the distances in their frames are divided by: their sums over contacts and bins."""
-    hops: tuple[int, ...]
-    """Samples between frames, one a resolution."""
-    windows: tuple[Float[Tensor, " _size"], ...]
-    """What frames are multiplied by, one a resolution."""
-    floors: tuple[float, ...]
-    """Least powers that count, one a resolution."""
+    magnitudes: Float[Tensor, "contacts frames bins"]
+    norms: Float64[np.ndarray, " frames"]
+    """What the distances in the frames are divided by: their sums over contacts and bins."""
+    window: Float[Tensor, " size"]
+    """What frames are multiplied by, as long as they are."""
+    hop: int
+    """Samples between frames."""
+    floor: float
+    """Least power that counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralTarget:
+    """Recordings to compare with: made once, used at every step."""
+
+    resolutions: tuple[Resolution, ...]
     samples: int
     """Length of the sounds that are compared: those that are longer are cut."""
 
@@ -60,19 +66,18 @@ def spectral_target(
     if odd:
         raise ValueError(f"expected even FFT sizes, got {odd[0]}: half a window lies before a frame's center")
     cut = sounds[:, :samples]
-    windows = [torch.hann_window(size, dtype=cut.dtype, device=cut.device) for size in fft_sizes]
-    tiny = torch.finfo(cut.dtype).tiny
     peak = float(cut.abs().max()) if cut.numel() else 0.0
-    floors = [max(_SILENT * peak**2 * float(window.square().sum()), tiny) for window in windows]
-    magnitudes = []
-    for fft_size, hop, window, floor in zip(fft_sizes, hops, windows, floors, strict=True):
-        frames = _padded(cut, fft_size).unfold(1, fft_size, hop)
-        target = torch.empty(*frames.shape[:2], fft_size // 2 + 1, dtype=cut.dtype, device=cut.device)
+    resolutions = []
+    for size, hop in zip(fft_sizes, hops, strict=True):
+        window = torch.hann_window(size, dtype=cut.dtype, device=cut.device)
+        floor = max(_SILENT * peak**2 * float(window.square().sum()), torch.finfo(cut.dtype).tiny)
+        frames = _padded(cut, size).unfold(1, size, hop)
+        magnitudes = torch.empty(*frames.shape[:2], size // 2 + 1, dtype=cut.dtype, device=cut.device)
         for chunk in _chunks(frames):
-            target[chunk] = _magnitude(torch.fft.rfft(frames[chunk] * window), floor)
-        magnitudes.append(target)
-    norms = tuple(each.sum((0, 2), dtype=torch.float64).cpu().numpy() for each in magnitudes)
-    return SpectralTarget(tuple(magnitudes), norms, tuple(hops), tuple(windows), tuple(floors), cut.shape[1])
+            magnitudes[chunk] = _magnitude(torch.fft.rfft(frames[chunk] * window), floor)
+        norms = magnitudes.sum((0, 2), dtype=torch.float64).cpu().numpy()
+        resolutions.append(Resolution(magnitudes, norms, window, hop, floor))
+    return SpectralTarget(tuple(resolutions), cut.shape[1])
 
 
 def spectral_loss(
@@ -85,7 +90,7 @@ def spectral_loss(
     `every` on is the loss of all frames, about, for an `every`th of the work each. Raises ValueError for other sounds
     than the target's, in number, or shorter ones.
     """
-    contacts = len(target.magnitudes[0])
+    contacts = len(target.resolutions[0].magnitudes)
     if len(sounds) != contacts or sounds.shape[1] < target.samples:
         raise ValueError(
             f"expected {contacts} sounds of {target.samples} samples or more, as the target's, got {len(sounds)} of "
@@ -102,29 +107,28 @@ class _SpectralL1(torch.autograd.Function):
     def forward(
         ctx: Any, sounds: Float[Tensor, "contacts samples"], target: SpectralTarget, first: int, every: int
     ) -> Float[Tensor, ""]:
-        widest = max(_fft_size(known) for known in target.magnitudes)
+        widest = max(len(each.window) for each in target.resolutions)
         padded = _padded(sounds, widest)
-        sought = ctx.needs_input_grad[0]
         slope = torch.zeros_like(padded)
         loss = sounds.new_zeros(())
-        resolutions = zip(target.magnitudes, target.norms, target.hops, target.windows, target.floors, strict=True)
-        for known, norms, hop, window, floor in resolutions:
-            fft_size = _fft_size(known)
+        for known in target.resolutions:
+            size = len(known.window)
             # Short sounds may have fewer frames than are skipped.
-            step = min(every, known.shape[1])
-            start = first % step
-            factor = 1 / max(float(norms[start::step].sum()), torch.finfo(sounds.dtype).tiny)
-            before = (widest - fft_size) // 2 + start * hop
-            frames = padded[:, before : padded.shape[1] - (widest - fft_size) // 2].unfold(1, fft_size, step * hop)
+            step = min(every, len(known.norms))
+            start, stride = first % step, step * known.hop
+            factor = 1 / max(float(known.norms[start::step].sum()), torch.finfo(sounds.dtype).tiny)
+            margin = (widest - size) // 2
+            before = margin + start * known.hop
+            frames = padded[:, before : padded.shape[1] - margin].unfold(1, size, stride)
             for rows, part in _chunks(frames):
-                spectra = torch.fft.rfft(frames[rows, part] * window)
+                spectra = torch.fft.rfft(frames[rows, part] * known.window)
                 place = start + step * part.start
-                loss.add_(_compare(spectra, known[rows], floor, first=place, every=step), alpha=factor)
-                if sought:
+                loss.add_(_compare(spectra, known.magnitudes[rows], known.floor, place, step), alpha=factor)
+                if ctx.needs_input_grad[0]:
                     # From here on the spectra are the slope's.
-                    slopes = torch.fft.irfft(spectra, fft_size, norm="forward")
-                    into = slope[rows, before + part.start * step * hop :]
-                    _overlap_add(into, slopes, window, step * hop, 0.5 * factor)
+                    slopes = torch.fft.irfft(spectra, size, norm="forward")
+                    into = slope[rows, before + part.start * stride :]
+                    _overlap_add(into, slopes, known.window, stride, 0.5 * factor)
         ctx.save_for_backward(slope[:, widest // 2 : widest // 2 + sounds.shape[1]])
         return loss
 
@@ -145,11 +149,11 @@ def _overlap_add(
     factor: float,
 ) -> None:
     """Add windowed frames times a factor, which begin at 0, hop, 2 hop, ..., to signals, in place."""
-    if frames.device.type == "cpu":
-        values = window.numpy()
-        _overlap_add_compiled(into.numpy(), frames.numpy(), values * values.dtype.type(factor), hop)
-    else:
+    if frames.device.type != "cpu":
         _overlap_add_torch(into, frames, window, hop, factor)
+        return
+    values = window.numpy()
+    _overlap_add_compiled(into.numpy(), frames.numpy(), values * values.dtype.type(factor), hop)
 
 
 def _overlap_add_torch(into: Tensor, frames: Tensor, window: Tensor, hop: int, factor: float) -> None:
@@ -189,10 +193,6 @@ def _chunks(frames: Float[Tensor, "contacts frames size"]) -> list[tuple[slice, 
     ]
 
 
-def _fft_size(magnitudes: Float[Tensor, "contacts frames bins"]) -> int:
-    return 2 * (magnitudes.shape[2] - 1)
-
-
 def _magnitude(spectra: Complex[Tensor, "contacts frames bins"], floor: float) -> Float[Tensor, "contacts frames bins"]:
     """Return magnitudes of spectra; a power below `floor` counts as `floor`."""
     return spectra.abs().clamp_min_(math.sqrt(floor))
@@ -202,7 +202,6 @@ def _compare(
     spectra: Complex[Tensor, "contacts frames bins"],
     target: Float[Tensor, "contacts _frames bins"],
     floor: float,
-    *,
     first: int,
     every: int,
 ) -> Float[Tensor, ""]:
@@ -211,19 +210,13 @@ def _compare(
     A power below `floor` counts as `floor`. The slope, by real and imaginary part, is doubled in the first and the last
     bin: a one-sided inverse transform counts those once and all others twice.
     """
-    if spectra.device.type == "cpu":
-        known = target.numpy()
-        return target.new_tensor(_compare_compiled(spectra.numpy(), known, known.dtype.type(floor), first, every))
-    return _compare_torch(spectra, target, floor, first, every)
+    if spectra.device.type != "cpu":
+        return _compare_torch(spectra, target, floor, first, every)
+    known = target.numpy()
+    return target.new_tensor(_compare_compiled(spectra.numpy(), known, known.dtype.type(floor), first, every))
 
 
-def _compare_torch(
-    spectra: Complex[Tensor, "contacts frames bins"],
-    target: Float[Tensor, "contacts _frames bins"],
-    floor: float,
-    first: int,
-    every: int,
-) -> Float[Tensor, ""]:
+def _compare_torch(spectra: Tensor, target: Tensor, floor: float, first: int, every: int) -> Float[Tensor, ""]:
     found = _magnitude(spectra, floor)
     difference = found - target[:, first : first + every * spectra.shape[1] : every]
     distance = torch.linalg.vector_norm(difference, 1)

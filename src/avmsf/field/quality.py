@@ -92,7 +92,7 @@ class PlaceErrors:
     def __init__(self, train: Impacts, places: Int[Tensor, " contacts"], config: FitConfig) -> None:
         sizes, hops, _ = config.resolutions(train.sample_rate)
         self.targets = [spectral_target(each[None], fft_sizes=sizes, hops=hops) for each in train.sounds.float()]
-        loud = torch.tensor([[float(norm.sum()) for norm in each.norms] for each in self.targets])
+        loud = torch.tensor([[float(at.norms.sum()) for at in each.resolutions] for each in self.targets])
         self.weight = (loud / loud.mean(0).clamp_min(torch.finfo(loud.dtype).tiny)).mean(1) / len(sizes)
         self.places, self.repeats = places, torch.bincount(places)
 

@@ -138,7 +138,7 @@ class _Validation:
         state = run.generator.get_state()
         with torch.no_grad():
             sounds = run.sounds(self.targets.rows)
-            spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.targets.whole.hops)
+            spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.config.fft_sizes)
             distance = float((envelope(sounds.cpu()) - self.envelope).square().mean(1).sqrt().mean())
         run.generator.set_state(state)
         if not self.config.patience or spectral < self.best["spectral"]:

@@ -41,10 +41,17 @@ class Targets:
         whole = spectral_target(sounds, fft_sizes=sizes, hops=hops)
         early = spectral_target(sounds, fft_sizes=sizes, hops=hops, samples=length)
         if config.spectral_norm == "common":
-            mean = sum(float(each.sum()) for each in whole.norms) / len(sizes)
-            norms = [tuple(np.full_like(each, mean / len(each)) for each in of.norms) for of in (whole, early)]
-            whole, early = replace(whole, norms=norms[0]), replace(early, norms=norms[1])
+            mean = sum(float(each.norms.sum()) for each in whole.resolutions) / len(sizes)
+            whole, early = (_with_norm(each, mean) for each in (whole, early))
         return cls(rows.to(device), data.gains.to(device), whole, early)
+
+
+def _with_norm(target: SpectralTarget, norm: float) -> SpectralTarget:
+    """Return a target whose resolutions all have this norm, divided evenly among their frames."""
+    frames = [(each, len(each.norms)) for each in target.resolutions]
+    return replace(
+        target, resolutions=tuple(replace(each, norms=np.full(count, norm / count)) for each, count in frames)
+    )
 
 
 @dataclass(frozen=True, eq=False)
