@@ -57,12 +57,11 @@ def test_every_tensor_of_a_training_step_is_on_the_device_of_the_gains(recipe: G
     torch.autograd.backward(loss)
     learned = [run.shift, run.decay, *run.network.parameters()]
     assert {each.device.type for each in (loss, *learned, *(each.grad for each in learned))} == {"meta"}
-    run.joint.step(0.5)
-    # As a checkpoint has them that was written elsewhere.
-    known = run.joint.moments
-    moved = [[[torch.zeros_like(one, device="cpu") for one in each] for each in group] for group in known]
-    run.joint.resume(moved)
-    run.joint.step(0.5)
+    for each in run.joint:
+        each.step(0.5)
+        # As a checkpoint has them that was written elsewhere.
+        each.resume([[torch.zeros_like(one, device="cpu") for one in known] for known in each.moments])
+        each.step(0.5)
 
 
 class Launches(TorchDispatchMode):

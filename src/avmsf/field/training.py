@@ -54,56 +54,35 @@ def _with_norm(target: SpectralTarget, norm: float) -> SpectralTarget:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Group:
-    """Parameters with the same settings."""
-
-    parameters: Sequence[nn.Parameter]
-    rate: float
-    """Length of a step at first."""
-    weight_decay: float = 0.0
-    """Part of the rate by which parameters shrink at each step."""
-
-
 class AdamW:
     """Steps of AdamW (Loshchilov and Hutter, ICLR 2019), by torch's function.
 
     Torch's class imports torch's compiler when it is first made, which takes two seconds, a sixth of a fit.
     """
 
-    def __init__(self, groups: Sequence[Group]) -> None:
-        self.groups = tuple(groups)
-        self.moments = [
-            [[torch.zeros_like(each, requires_grad=False) for each in group.parameters] for _ in range(2)]
-            + [[torch.zeros((), device=each.device) for each in group.parameters]]
-            for group in self.groups
-        ]
+    def __init__(self, parameters: Sequence[nn.Parameter], rate: float, weight_decay: float = 0.0) -> None:
+        """`rate` is the length of a step at first; at each, parameters shrink by `weight_decay` times the rate."""
+        self.parameters, self.rate, self.weight_decay = tuple(parameters), rate, weight_decay
+        self.moments = [[torch.zeros_like(each, requires_grad=False) for each in parameters] for _ in range(2)]
         """All that changes besides the parameters: means of the gradients and of their squares, and steps."""
-
-    def zero_grad(self) -> None:
-        """Take the parameters' gradients away."""
-        for parameter in (each for group in self.groups for each in group.parameters):
-            parameter.grad = None
+        self.moments.append([torch.zeros((), device=each.device) for each in parameters])
 
     @torch.no_grad()
     def step(self, factor: float) -> None:
-        """Move all parameters that have gradients, at `factor` times their groups' rates."""
-        for group, moments in zip(self.groups, self.moments, strict=True):
-            rows = [row for row, parameter in enumerate(group.parameters) if parameter.grad is not None]
-            means, squares, steps = ([each[row] for row in rows] for each in moments)
-            adamw(
-                [group.parameters[row] for row in rows],
-                [parameter.grad for parameter in group.parameters if parameter.grad is not None],
-                means, squares, [], steps, lr=factor * group.rate, weight_decay=group.weight_decay, beta1=0.9,
-                beta2=0.999, eps=1e-8, amsgrad=False, maximize=False, fused=True,
-            )  # fmt: skip
+        """Move all parameters that have gradients, at `factor` times the rate."""
+        rows = [row for row, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        means, squares, steps = ([each[row] for row in rows] for each in self.moments)
+        adamw(
+            [self.parameters[row] for row in rows],
+            [parameter.grad for parameter in self.parameters if parameter.grad is not None],
+            means, squares, [], steps, lr=factor * self.rate, weight_decay=self.weight_decay, beta1=0.9, beta2=0.999,
+            eps=1e-8, amsgrad=False, maximize=False, fused=True,
+        )  # fmt: skip
 
-    def resume(self, moments: list[list[list[Tensor]]]) -> None:
-        """Go back to `moments` of before."""
-        self.moments = [
-            [[to.to(at.device, copy=True) for to, at in zip(*each, strict=True)] for each in zip(*group, strict=True)]
-            for group in zip(moments, self.moments, strict=True)
-        ]
+    def resume(self, moments: Sequence[Sequence[Tensor]]) -> None:
+        """Go back to `moments` of before, from whichever device."""
+        for mine, others in zip(self.moments, moments, strict=True):
+            mine[:] = [to.to(at.device, copy=True) for to, at in zip(others, mine, strict=True)]
 
 
 class TrainableGains(nn.Module, ABC):
@@ -151,14 +130,13 @@ class TrainingRun(nn.Module):
         matrices = [parameter for parameter in network.parameters() if parameter.ndim == 2]
         vectors = [parameter for parameter in network.parameters() if parameter.ndim != 2]
 
-        def groups(rate: float) -> list[Group]:
-            return [Group(matrices, rate, config.weight_decay), Group(vectors, rate)]
+        def of_network(rate: float) -> list[AdamW]:
+            return [AdamW(matrices, rate, config.weight_decay), AdamW(vectors, rate)]
 
-        corrections = [Group([self.shift, self.decay], config.correction_rate)]
+        self.warmup, self.joint = of_network(config.warmup_rate), of_network(config.learning_rate)
+        self.joint.append(AdamW([self.shift, self.decay], config.correction_rate))
         if config.residual and config.noise_rate:
-            corrections.append(Group([self.noise], config.noise_rate))
-        self.warmup = AdamW(groups(config.warmup_rate))
-        self.joint = AdamW([*groups(config.learning_rate), *corrections])
+            self.joint.append(AdamW([self.noise], config.noise_rate))
         self.step = 0
         self.whole = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
@@ -178,8 +156,8 @@ class TrainingRun(nn.Module):
     @property
     def trained(self) -> ModalBank:
         """The modes as they stand, in this order, without gradients."""
-        bank, order = self.bank, self.order
-        return ModalBank(bank.frequency.detach()[order], bank.damping.detach()[order])
+        bank = self.bank
+        return ModalBank(bank.frequency.detach(), bank.damping.detach()).take(self.order)
 
     @property
     def finite(self) -> bool:
@@ -215,14 +193,15 @@ class TrainingRun(nn.Module):
         """Take one step on all contacts and return the loss before it, of the frames whose turn it is."""
         if self.step < self.config.warmup_steps:
             loss = self._warmup_loss(targets)
-            optimizer, done = self.warmup, self.step / self.config.warmup_steps
+            optimizers, done = self.warmup, self.step / self.config.warmup_steps
         else:
             loss = self.spectral_loss(targets)
-            optimizer, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
-        optimizer.zero_grad()
+            optimizers, done = self.joint, (self.step - self.config.warmup_steps) / self.config.steps
+        self.zero_grad()
         torch.autograd.backward(loss)
         self.whole = False
-        optimizer.step(0.55 + 0.45 * math.cos(math.pi * done))
+        for each in optimizers:
+            each.step(0.55 + 0.45 * math.cos(math.pi * done))
         self.step += 1
         self._chance = self.generator.get_state()
         self.whole = True
@@ -255,8 +234,7 @@ class TrainingRun(nn.Module):
         """
         return {
             "parameters": self.state_dict(),
-            "warmup": self.warmup.moments,
-            "joint": self.joint.moments,
+            "moments": [each.moments for each in (*self.warmup, *self.joint)],
             "generator": self._chance,
             "step": self.step,
         }
@@ -264,8 +242,8 @@ class TrainingRun(nn.Module):
     def resume(self, state: dict[str, Any]) -> None:
         """Go back to what `state` returned."""
         self.load_state_dict(state["parameters"])
-        self.warmup.resume(state["warmup"])
-        self.joint.resume(state["joint"])
+        for each, moments in zip((*self.warmup, *self.joint), state["moments"], strict=True):
+            each.resume(moments)
         self._chance = state["generator"]
         self.generator.set_state(self._chance)
         self.step = state["step"]
