@@ -11,7 +11,8 @@ from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField, outward_normals
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
+from avmsf.field.header import SUPPORTING
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.made_fields import BANK, FIELDS, elastic, places, plate, positional

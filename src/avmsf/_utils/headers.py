@@ -28,6 +28,8 @@ class FileKind:
     formats: tuple[int, ...] = ()
     """Numbers of the formats that are read, of which the last one is written. A number grows with every change that
     older versions could not read."""
+    remake: Callable[[dict[str, Any], Path], str] | None = None
+    """How the file of a record in an older format is made again."""
 
     def read_text(self, path: Path) -> str:
         """Return the text of a file. Raises `error` for one that is missing, damaged or of another kind."""
@@ -44,17 +46,17 @@ class FileKind:
             raise self.error.expected(wanted, sorted(metadata), got=got, file=path, name=self.key, advice=advice)
         return metadata[self.key]
 
+    def read_record(self, path: Path) -> dict[str, Any]:
+        """Return the record of a file. Raises as `read_text` and `parse`."""
+        return self.parse(self.read_text(path), path)
+
     def parse(
-        self,
-        text: str,
-        path: Path,
-        check: Callable[[dict[str, Any]], object] = lambda _: None,
-        remake: Callable[[dict[str, Any], Path], str] | None = None,
+        self, text: str, path: Path, check: Callable[[dict[str, Any]], object] = lambda _: None
     ) -> dict[str, Any]:
         """Return the record that a file's text is, JSON with a `format` and the `version` that wrote it.
 
-        `check` raises ValueError, TypeError or KeyError for a record whose entries are not those of the formats, and
-        `remake` says how to make a file of an older one again. Raises `error` for such records.
+        `check` raises ValueError, TypeError or KeyError for a record whose entries are not those of the formats.
+        Raises `error` for such records, and for those in another format.
         """
         try:
             record = parse_json(text)
@@ -65,8 +67,8 @@ class FileKind:
             advice = self.advice
             if isinstance(found, int) and found > max(self.formats):
                 advice = f"install avmsf {writer} or newer, or {advice}"
-            elif remake is not None:
-                advice = remake(record, path)
+            elif self.remake is not None:
+                advice = self.remake(record, path)
         except (ValueError, TypeError, KeyError) as error:
             raise self.damaged(path, error, name="header") from error
         wanted = f"{self.what} in format {' or '.join(map(str, self.formats))}"

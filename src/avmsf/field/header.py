@@ -1,25 +1,53 @@
-"""The header of a field's file, which tells whether this version reads it. Importing this loads no torch."""
+"""The record in the header of a field's file: its format, and what it may say. Importing this loads no torch."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from avmsf._utils.headers import FileKind
+from avmsf._utils.text import RecordError, like
 from avmsf.errors import FieldFileError
 
 FORMAT = 8
 """Number of this format; it grows with every change that older versions could not read. Later versions read it."""
-FIELD = FileKind("avmsf", "a sound field", "fit and save it again", FieldFileError, formats=(FORMAT,))
+SUPPORTING = "supporting_poles"
+"""What a report calls the rows of the bank's poles that are no modes of the object."""
+_RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer": "guided"}
+"""Kinds of edits that earlier versions wrote, and what they are called now."""
+_MATERIAL = {"name": "", **dict.fromkeys(("density", "young", "poisson", "alpha", "beta"), 1.0)}
+"""What the entry of a material has, by example."""
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """Return the record of a field's file. Raises FieldFileError for another file and for another format."""
-    return record_of_text(FIELD.read_text(path), path)
+def checked_report(report: dict[str, Any], modes: int) -> dict[str, Any]:
+    """Return the report on a field of so many modes, with its edits called as this version calls them.
+
+    Raises RecordError for what is no edit, and for supporting poles that are no rows of the bank.
+    """
+    for row, pole in enumerate(like(report.get(SUPPORTING, []), [], f"origin.report.{SUPPORTING}")):
+        name = f"origin.report.{SUPPORTING}.{row}"
+        if not 0 <= like(pole, 0, name) < modes:
+            raise RecordError.expected(f"a row from 0 to {modes - 1}", pole, name=name)
+    edits = like(report.get("edits", []), [], "origin.report.edits")
+    found = [_edit_of(entry, f"origin.report.edits.{row}", modes) for row, entry in enumerate(edits)]
+    return {**report, "edits": found} if found else report
 
 
-def record_of_text(text: str, path: Path) -> dict[str, Any]:
-    """Return the record that a file's text holds. Raises FieldFileError for another one and for another format."""
-    return FIELD.parse(text, path, remake=_remake)
+def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
+    known: dict[str, Any] = like(entry, {}, name)
+    written = like(known.get("edit"), "", f"{name}.edit")
+    kind = _RENAMED_EDITS.get(written, written)
+    if kind == "change_material":
+        material = like(known.get("to"), {}, f"{name}.to")
+        for key, example in _MATERIAL.items():
+            like(material.get(key), example, f"{name}.to.{key}")
+    if kind == "adjust_modes":
+        for key in ("pitch", "decay"):
+            factors = known.get(key)
+            for factor in factors if isinstance(factors, list) and len(factors) == modes else [factors]:
+                if not 0.0 < like(factor, 1.0, f"{name}.{key}") < math.inf:
+                    raise RecordError.expected("a number above 0", factor, name=f"{name}.{key}")
+    return {**known, "edit": kind}
 
 
 def _remake(record: Mapping[str, Any], path: Path) -> str:
@@ -28,3 +56,6 @@ def _remake(record: Mapping[str, Any], path: Path) -> str:
     material = f" --material {report['material']['name']}" if "guess" in report else ""
     capture = record["origin"]["capture"]
     return f"fit it again: avmsf fit FOLDER{material} --output {path}, where FOLDER is that of {capture!r}"
+
+
+FIELD = FileKind("avmsf", "a sound field", "fit and save it again", FieldFileError, (FORMAT,), _remake)

@@ -16,6 +16,7 @@ from avmsf.errors import PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.header import SUPPORTING
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
@@ -24,8 +25,6 @@ from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesize
 
-SUPPORTING = "supporting_poles"
-"""What a report calls the rows of the bank's poles that are no modes of the object."""
 _BATCH = 32
 """Contacts rendered at once, which bounds the memory."""
 

@@ -12,8 +12,8 @@ holds under the key `avmsf` a record:
 """
 
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -29,10 +29,10 @@ from avmsf.errors import AvmsfError, FieldFileError
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
-from avmsf.field.header import FIELD, record_of_text
+from avmsf.field.header import FIELD, checked_report
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
-from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -43,12 +43,6 @@ _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PE
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
 _KINDS: dict[str, type[GainModel]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
-_RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer": "guided"}
-"""Kinds of edits that earlier versions wrote, and what they are called now."""
-_MATERIAL = {"name": "", **dict.fromkeys(("density", "young", "poisson", "alpha", "beta"), 1.0)}
-"""What the entry of a material has, by example."""
-_UNREADABLE = (ValueError, TypeError, KeyError, RuntimeError, AvmsfError)
-"""What a record of another form raises; RuntimeError: torch, of sizes beyond 2^63 and of damaged values."""
 
 
 def save(field: SoundField, path: str | Path) -> None:
@@ -57,15 +51,11 @@ def save(field: SoundField, path: str | Path) -> None:
     A file that is there is replaced in one step and stays whole until then; folders that are missing are made. Raises
     `FieldFileError` where the file cannot be written, and for a field that could not be read back.
     """
-    path = Path(path)
-    record, tensors = _record(field), _tensors(field)
-    words = FIELD.to_text(record, path, name="origin.report")
-    try:
-        skeleton, _ = _checked(json.loads(words))
-    except _UNREADABLE as error:
-        raise FIELD.damaged(path, error) from error
-    _expect_tensors(tensors, skeleton, path)
-    write_tensors(path, tensors, words, FIELD)
+    path, tensors = Path(path), _tensors(field)
+    text = FIELD.to_text(_record(field), path, name="origin.report")
+    with _reporting_damage(path):
+        _checked(json.loads(text), tensors, path)
+    write_tensors(path, tensors, text, FIELD)
 
 
 def load(path: str | Path) -> SoundField:
@@ -75,16 +65,11 @@ def load(path: str | Path) -> SoundField:
     tensor is missing, unexpected, of another shape or dtype, or not finite.
     """
     path = Path(path)
-    words, tensors = read_tensors(path, FIELD)
-    record = record_of_text(words, path)
-    try:
-        skeleton, origin = _checked(record)
-        _expect_tensors(tensors, skeleton, path)
+    text, tensors = read_tensors(path, FIELD)
+    record = FIELD.parse(text, path)
+    with _reporting_damage(path):
+        origin = _checked(record, tensors, path)
         gains = _KINDS[record["gains"]["kind"]].restore(record["gains"], _named(_GAINS, tensors))
-    except FieldFileError:
-        raise
-    except _UNREADABLE as error:
-        raise FIELD.damaged(path, error) from error
     kept = record["alignment"]
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
@@ -98,18 +83,53 @@ def load(path: str | Path) -> SoundField:
     )
 
 
-def _checked(record: Mapping[str, Any]) -> tuple[dict[str, Tensor], Origin]:
-    """Return tensors as a field of this record has them, which take no memory, and the field's origin.
+@contextmanager
+def _reporting_damage(path: Path) -> Iterator[None]:
+    """Turn what a record or tensors of another form raise into FieldFileError."""
+    try:
+        yield
+    except FieldFileError:
+        raise
+    # RuntimeError: torch, of sizes beyond 2^63 and of damaged values.
+    except (ValueError, TypeError, KeyError, RuntimeError, AvmsfError) as error:
+        raise FIELD.damaged(path, error) from error
 
-    Raises one of `_UNREADABLE`, also for sounds that no recording has.
-    """
-    sizes, gains, origin = (dict(like(record[name], {}, name)) for name in ("sizes", "gains", "origin"))
+
+def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Path) -> Origin:
+    """Return the origin of the field that has this record and tensors, all of which is checked."""
     rate, samples = like(record["sample_rate"], 1.0, "sample_rate"), count_of(record["samples"], "samples")
     # Those of the recordings that a field is fitted to.
     if not LOWEST_RATE <= rate <= HIGHEST_RATE:
         raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
     if samples > MAX_SAMPLES:
         raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
+    skeleton = _skeleton(record)
+    origin = dict(like(record["origin"], {}, "origin"))
+    read = Origin(
+        capture=like(origin["capture"], "", "origin.capture"),
+        trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
+        per_newton=like(origin["per_newton"], True, "origin.per_newton"),
+        config=record_of(FitConfig(), record["config"], "config"),
+        report=checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
+        settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
+    )
+    if (quality := read.report.get("quality")) is not None:
+        FieldQuality.of(quality)
+    _ = ProbableBody.of(read.report)
+    expect_tensors(tensors, skeleton, path, FIELD)
+    for name, highest in _MAX.items():
+        low, high = (float(each) for each in tensors[name].aminmax()) if tensors[name].numel() else (1.0, 1.0)
+        positive = name in _POSITIVE
+        if low < 0.0 or (low == 0.0 and positive) or high > highest:
+            wanted = f"{name} {'above' if positive else 'of at least'} 0, and up to {highest:g}"
+            got = f"{low:.3g} to {high:.3g}"
+            raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=FIELD.advice)
+    return read
+
+
+def _skeleton(record: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return tensors as a field of this record has them, which take no memory."""
+    sizes, gains = (dict(like(record[name], {}, name)) for name in ("sizes", "gains"))
     modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
     kind = like(gains["kind"], "", "gains.kind")
     if kind not in _KINDS:
@@ -120,9 +140,8 @@ def _checked(record: Mapping[str, Any]) -> tuple[dict[str, Tensor], Origin]:
     if sizes["recordings"] is not None:
         contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
         if gains.get("contacts") != contacts:
-            raise RecordError.expected(
-                f"{gains.get('contacts')} contacts as in gains", contacts, name="sizes.recordings"
-            )
+            wanted = f"{gains.get('contacts')} contacts as in gains"
+            raise RecordError.expected(wanted, contacts, name="sizes.recordings")
         skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
     skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
     if (alignment := record["alignment"]) is not None:
@@ -133,49 +152,7 @@ def _checked(record: Mapping[str, Any]) -> tuple[dict[str, Tensor], Origin]:
         skeleton |= {_ALIGNMENT + name: each for name, each in aligned.items()}
     if gains["modes"] != modes:
         raise RecordError.expected(f"{modes}, the number of frequencies", gains["modes"], name="gains.modes")
-    read = Origin(
-        capture=like(origin["capture"], "", "origin.capture"),
-        trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
-        per_newton=like(origin["per_newton"], True, "origin.per_newton"),
-        config=record_of(FitConfig(), record["config"], "config"),
-        report=_checked_report(like(origin["report"], {}, "origin.report"), modes),
-        settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
-    )
-    if (quality := read.report.get("quality")) is not None:
-        FieldQuality.of(quality)
-    _ = ProbableBody.of(read.report)
-    return skeleton, read
-
-
-def _checked_report(report: dict[str, Any], modes: int) -> dict[str, Any]:
-    """Return a report whose edits are called as this version calls them.
-
-    Raises RecordError for what is no edit, and for supporting poles that are no rows of the bank.
-    """
-    for row, pole in enumerate(like(report.get(SUPPORTING, []), [], f"origin.report.{SUPPORTING}")):
-        name = f"origin.report.{SUPPORTING}.{row}"
-        if not 0 <= like(pole, 0, name) < modes:
-            raise RecordError.expected(f"a row from 0 to {modes - 1}", pole, name=name)
-    edits = like(report.get("edits", []), [], "origin.report.edits")
-    found = [_edit_of(entry, f"origin.report.edits.{row}", modes) for row, entry in enumerate(edits)]
-    return {**report, "edits": found} if found else report
-
-
-def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
-    known: dict[str, Any] = like(entry, {}, name)
-    written = like(known.get("edit"), "", f"{name}.edit")
-    kind = _RENAMED_EDITS.get(written, written)
-    if kind == "change_material":
-        material = like(known.get("to"), {}, f"{name}.to")
-        for key, example in _MATERIAL.items():
-            like(material.get(key), example, f"{name}.to.{key}")
-    if kind == "adjust_modes":
-        for key in ("pitch", "decay"):
-            factors = known.get(key)
-            for factor in factors if isinstance(factors, list) and len(factors) == modes else [factors]:
-                if not 0.0 < like(factor, 1.0, f"{name}.{key}") < math.inf:
-                    raise RecordError.expected("a number above 0", factor, name=f"{name}.{key}")
-    return {**known, "edit": kind}
+    return skeleton
 
 
 def _record(field: SoundField) -> dict[str, Any]:
@@ -199,34 +176,13 @@ def _record(field: SoundField) -> dict[str, Any]:
 
 
 def _tensors(field: SoundField) -> dict[str, Tensor]:
-    named = {
-        "bank.frequency": field.bank.frequency,
-        "bank.damping": field.bank.damping,
-        "phase": field.phase,
-        "residual.magnitude": field.residual.magnitude,
-    }
-    if field.residual.recordings is not None:
-        named["residual.recordings"] = field.residual.recordings
+    named = {f"bank.{name}": each for name, each in vars(field.bank).items()} | {"phase": field.phase}
+    named |= {f"residual.{name}": each for name, each in vars(field.residual).items() if each is not None}
     if field.alignment is not None:
         named |= {_ALIGNMENT + name: tensor for name, tensor in field.alignment.tensors().items()}
-    named |= {_GAINS + name: tensor for name, tensor in field.gain_field.tensors().items()}
-    return named
+    return named | {_GAINS + name: tensor for name, tensor in field.gain_field.tensors().items()}
 
 
 def _named(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors whose names begin with a prefix, without it."""
     return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}
-
-
-def _expect_tensors(tensors: dict[str, Tensor], skeleton: dict[str, Tensor], path: Path) -> None:
-    """Compare names, shapes and dtypes with those of the skeleton, and the values with what they mean."""
-    expect_tensors(tensors, skeleton, path, FIELD)
-    for name, highest in _MAX.items():
-        low, high = (float(each) for each in tensors[name].aminmax()) if tensors[name].numel() else (1.0, 1.0)
-        if low < 0.0 or (low == 0.0 and name in _POSITIVE):
-            wanted = f"{name} to be {'positive' if name in _POSITIVE else 'not negative'}"
-            got = f"{low:.3g} to {high:.3g}"
-            raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=FIELD.advice)
-        if high > highest:
-            wanted, got = f"{name} up to {highest:g}", f"{high:.3g}"
-            raise FieldFileError.expected(wanted, high, got=got, file=path, name=name, advice=FIELD.advice)

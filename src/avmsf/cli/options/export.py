@@ -13,7 +13,7 @@ from avmsf.cli.options.common import Flag, Printing, Unit, option_of
 from avmsf.cli.options.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
 from avmsf.errors import ExportError
 from avmsf.export.writing import SUFFIXES, Axis, Format, Precision, check_free
-from avmsf.field.header import read_record
+from avmsf.field.header import FIELD
 from avmsf.modal.config import PulseShape
 
 _CONTACTS = ("position", "contact_table", "unit")
@@ -127,7 +127,7 @@ class Options(Printing):
         # A web page is a file or, by a name without its suffix, a folder.
         suffixes = getattr(_OUTPUTS[self.to], "suffixes", ())
         check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
-        read_record(self.field)
+        FIELD.read_record(self.field)
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> "Options":

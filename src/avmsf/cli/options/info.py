@@ -9,7 +9,7 @@ import tyro
 from avmsf.cli.options.checks import expect_capture
 from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
-from avmsf.field.header import read_record
+from avmsf.field.header import FIELD
 from avmsf.gaussians.ply_header import read_header
 
 
@@ -48,6 +48,6 @@ class Options(Printing):
             if cloud is not None:
                 read_header(cloud)
         if suffix != ".ply" and kind_of(self.file) != "features":
-            read_record(self.file)
+            FIELD.read_record(self.file)
             if self.capture is not None:
                 expect_capture(self.capture, self.settings)

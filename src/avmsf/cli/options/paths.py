@@ -13,7 +13,7 @@ from avmsf._utils.headers import FEATURES_KEY, read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.cli.options.checks import OutputError, expect_writable, is_folder
 from avmsf.errors import AvmsfError
-from avmsf.field import header as field_header
+from avmsf.field.header import FIELD
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
 
 FileKind = Literal[
@@ -70,7 +70,7 @@ class ExistingField(Existing):
     def check(self, path: Path) -> None:
         """Raise `InputError` for no file or another kind, `FieldFileError` for a field that cannot be read."""
         super().check(path)
-        field_header.read_record(path)
+        FIELD.read_record(path)
 
 
 @dataclass(frozen=True)
@@ -163,4 +163,4 @@ def kind_of(path: Path) -> FileKind | None:
         return None
     if FEATURES_KEY in entries:
         return "features"
-    return "a sound field" if field_header.FIELD.key in entries else None
+    return "a sound field" if FIELD.key in entries else None
