@@ -19,7 +19,7 @@ from avmsf.cli.printing import next_step, print_result, say
 from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
-from avmsf.export.geometry import DisplayGeometry, holds_gaussians, read_display_geometry, read_object
+from avmsf.export.geometry import read_display_geometry, read_gaussians
 from avmsf.export.gltf import write_gltf
 from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField, spread_rows
@@ -30,8 +30,7 @@ from avmsf.export.writing import POINTS, SUFFIXES, Written, check_free, write_fi
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
-from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.ply import read_splats
+from avmsf.gaussians.ply import holds_gaussians
 from avmsf.mesh.surface import Surface
 from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.shape import SURFACE
@@ -136,7 +135,7 @@ def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None,
     length = field.gain_field.length
     if length == 1.0 or path is None:
         return path, meters
-    if path.suffix.lower() == ".ply" and path.is_file() and holds_gaussians(path):
+    if holds_gaussians(path):
         raise ExportError(
             f"{path}: expected a mesh for a field edited to {length:g} times its size, got Gaussians, which are not "
             "scaled; name a mesh of that size by --object, or leave --capture out",
@@ -177,14 +176,6 @@ def _reconstructed(options: Options) -> Path | None:
     return made
 
 
-def _gaussians(path: Path | Surface | None, meters: float, field: SampledField) -> GaussianCloud | None:
-    """Return the file's Gaussians, which are in meters; None for a mesh, whose coordinates count `meters`."""
-    if not isinstance(path, Path) or path.suffix.lower() != ".ply" or (path.is_file() and not holds_gaussians(path)):
-        return None
-    read_object(path, field.points, meters=meters)
-    return read_splats(path)
-
-
 def _web(field: SoundField, options: Options) -> Written:
     source, meters = _object(field, options)
     return write_webpage(
@@ -210,17 +201,17 @@ def _recordings(field: SoundField, capture: Path | None) -> Impacts | None:
 def _gltf(field: SoundField, options: Options) -> Written:
     sampled = _sampled(field, options)
     source, meters = _object(field, options)
-    cloud = _gaussians(source, meters, sampled)
-    if cloud is not None and isinstance(source, Path):
-        cloud_file, content = options.output.with_suffix(".gaussians.ply"), source.read_bytes()
-        check_free(cloud_file, overwrite=options.overwrite)
-        seen = DisplayGeometry.of_gaussians(cloud, sampled)
-        written = write_gltf(sampled, options.output, geometry=seen, up=options.up, overwrite=options.overwrite)
-        copied = write_file(cloud_file, content, overwrite=options.overwrite)
-        return replace(written, sizes={**written.sizes, **copied})
-    shown, remarks = (None, ()) if source is None else read_display_geometry(source, sampled, meters=meters)
+    copied: dict[Path, bytes] = {}
+    if isinstance(source, Path) and holds_gaussians(source):
+        copied = {options.output.with_suffix(".gaussians.ply"): source.read_bytes()}
+    for path in copied:
+        check_free(path, overwrite=options.overwrite)
+    shown, remarks = read_display_geometry(source, sampled, meters=meters)
     written = write_gltf(sampled, options.output, geometry=shown, up=options.up, overwrite=options.overwrite)
-    return replace(written, remarks=remarks + written.remarks)
+    sizes = {**written.sizes}
+    for path, content in copied.items():
+        sizes |= write_file(path, content, overwrite=options.overwrite)
+    return replace(written, sizes=sizes, remarks=remarks + written.remarks)
 
 
 def _faust(field: SoundField, options: Options) -> Written:
@@ -236,7 +227,7 @@ def _faust(field: SoundField, options: Options) -> Written:
 def _demo(field: SoundField, options: Options) -> Written:
     source, most = options.object, options.contacts or POINTS["avmsf-demo"]
     sampled = _sampled(field, options)
-    cloud = _gaussians(source, 1.0, sampled)
+    cloud = None if source is None else read_gaussians(source, sampled.points)
     if source is not None:
         _note_size(field, source)
     if cloud is None and source is not None:

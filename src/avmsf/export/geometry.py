@@ -17,7 +17,7 @@ from trimesh.visual import ColorVisuals
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.ply import read_splats
+from avmsf.gaussians.ply import holds_gaussians, read_splats
 from avmsf.mesh.io import MAX_BYTES, load_mesh
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
@@ -26,8 +26,6 @@ MAX_FACES = 200_000
 """Triangles that a browser displays and picks quickly; larger meshes are reduced."""
 _MAX_SIZE_RATIO = 3.0
 """Ratio of the sizes of object and field above which their units differ."""
-_SURFACE = "the surface"
-"""What messages call an object that was not read from a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,51 +50,53 @@ def read_object(
     """
     if source is None:
         return ObjectFile("points")
-    path = None if isinstance(source, Surface) else source
     if isinstance(source, Surface):
-        mesh = trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)
-        scene = trimesh.Scene([mesh])
+        scene = trimesh.Scene([trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)])
+    elif read_gaussians(source, points) is not None:
+        return ObjectFile("gaussians", "object.ply", source.read_bytes())
     else:
-        _check_readable(source)
-        if source.suffix.lower() == ".ply" and holds_gaussians(source):
-            _check_fits(read_splats(source).centers.numpy(), points, source)
-            return ObjectFile("gaussians", "object.ply", source.read_bytes())
         scene = load_mesh(source, raising=ExportError)
         scene.apply_scale(meters)  # type: ignore[no-untyped-call]
     meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not meshes:
-        return ObjectFile("points", remarks=(f"{path or _SURFACE} has no triangles: the field's points are shown",))
-    _check_fits(np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes]), points, path)
+        return ObjectFile("points", remarks=(f"{_named(source)} has no triangles: the field's points are shown",))
+    _check_fits(np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes]), points, source)
     remarks: tuple[str, ...] = ()
     faces = sum(len(mesh.faces) for mesh in meshes)
     if faces > most:
         scene = trimesh.Scene([_reduced(mesh, most / faces) for mesh in meshes])
         left = sum(len(mesh.faces) for mesh in scene.geometry.values())
-        remarks = (f"{_too_fine(path, faces, left)}, without its textures",)
+        remarks = (f"{_too_fine(source, faces, left)}, without its textures",)
     content = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
     assert isinstance(content, bytes)
     return ObjectFile("mesh", "object.glb", content, remarks)
 
 
-def _check_readable(path: Path) -> None:
-    """Raise `ExportError` where there is no such file, or one too large to be read: `load_mesh` bounds meshes alone."""
+def read_gaussians(path: Path, points: Float[Tensor, "points 3"]) -> GaussianCloud | None:
+    """Return the Gaussians of a `.ply`, in meters, for a field at `points`; None for another file.
+
+    Raises `ExportError` for a file that is missing or huge, and for Gaussians in another unit.
+    """
     if not path.is_file():
         raise ExportError.expected("a mesh or a .ply of Gaussians", file=path, advice="check the name")
     size = path.stat().st_size
     if size > MAX_BYTES:
         wanted = f"a mesh of at most {MAX_BYTES >> 20} MiB"
         raise ExportError.expected(wanted, size, got=f"{size >> 20}", file=path, name="size", advice="reduce it first")
+    if not holds_gaussians(path):
+        return None
+    cloud = read_splats(path)
+    _check_fits(cloud.centers.numpy(), points, path)
+    return cloud
 
 
-def holds_gaussians(path: Path) -> bool:
-    """Return whether a .ply's header has the properties of Gaussians."""
-    with path.open("rb") as file:
-        header, _, _ = file.read(1 << 16).partition(b"end_header")
-    return b"scale_0" in header and b"rot_0" in header
+def _named(source: Path | Surface) -> Path | str:
+    """Return what messages call an object."""
+    return source if isinstance(source, Path) else "the surface"
 
 
-def _too_fine(path: Path | None, faces: int, left: int) -> str:
-    return f"{path or _SURFACE} has {faces:,} triangles, too many for a browser: {left:,} are shown"
+def _too_fine(source: Path | Surface, faces: int, left: int) -> str:
+    return f"{_named(source)} has {faces:,} triangles, too many for a browser: {left:,} are shown"
 
 
 def _reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
@@ -115,9 +115,11 @@ def _reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
     return small
 
 
-def _check_fits(places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], path: Path | None) -> None:
-    """Raise `ExportError` for an object, read from `path`, of another size or position than the field."""
-    own, file = points.double().numpy(), path or _SURFACE
+def _check_fits(
+    places: Float[np.ndarray, "places 3"], points: Float[Tensor, "points 3"], source: Path | Surface
+) -> None:
+    """Raise `ExportError` for an object of another size or position than the field."""
+    own, file = points.double().numpy(), _named(source)
     size, expected = np.ptp(places, axis=0), np.ptp(own, axis=0)
     length = float(np.linalg.norm(expected))
     ratio = float(np.linalg.norm(size) / max(length, 1e-12))
@@ -161,27 +163,26 @@ class DisplayGeometry:
         kept = torch.from_numpy(table).float()
         return cls(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
 
-    @classmethod
-    def of_gaussians(cls, cloud: GaussianCloud, sampled: SampledField) -> "DisplayGeometry":
-        """Return the centers of Gaussians in their colors."""
-        normals = sampled.normals[sampled.nearest(cloud.centers)]
-        return cls(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, cloud.colors)
-
 
 def read_display_geometry(
-    source: Path | Surface, sampled: SampledField, *, meters: float = 1.0
+    source: Path | Surface | None, sampled: SampledField, *, meters: float = 1.0
 ) -> tuple[DisplayGeometry, tuple[str, ...]]:
     """Read a mesh whose coordinates count `meters` each, and notes on differences from the file.
 
-    A `Surface` is in meters. Meshes of more than `MAX_FACES` triangles are reduced. Raises `ExportError` for one that
+    A `Surface` is in meters, as are Gaussians, of which the centers are shown in their colors; without a source the
+    field's points are shown. Meshes of more than `MAX_FACES` triangles are reduced. Raises `ExportError` for one that
     is huge, or not in the field's unit, and `CaptureError` for a file that is not a mesh.
     """
+    if source is None:
+        return DisplayGeometry.of_points(sampled), ()
     if isinstance(source, Surface):
-        path, mesh = None, TexturedMesh.build(source.vertices, source.faces)
+        mesh = TexturedMesh.plain(source)
+    elif (cloud := read_gaussians(source, sampled.points)) is not None:
+        normals = sampled.normals[sampled.nearest(cloud.centers)]
+        return DisplayGeometry(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, cloud.colors), ()
     else:
-        _check_readable(source)
-        path, mesh = source, read_textured_mesh(source, meters=meters)
-    _check_fits(mesh.vertices.double().numpy(), sampled.points, path)
+        mesh = read_textured_mesh(source, meters=meters)
+    _check_fits(mesh.vertices.double().numpy(), sampled.points, source)
     faces = len(mesh.faces)
     if faces <= MAX_FACES:
         return DisplayGeometry.of_mesh(mesh), ()
@@ -194,7 +195,7 @@ def read_display_geometry(
     shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0
     vertices = torch.from_numpy(np.array(small.vertices)).float()
     geometry = DisplayGeometry.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows]))
-    return geometry, (_too_fine(path, faces, len(corner_rows)),)
+    return geometry, (_too_fine(source, faces, len(corner_rows)),)
 
 
 def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:

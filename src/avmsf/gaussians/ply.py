@@ -46,6 +46,15 @@ def splat_bytes(cloud: GaussianCloud) -> bytes:
     return "\n".join(header).encode("ascii") + table.tobytes()
 
 
+def holds_gaussians(path: Path) -> bool:
+    """Return whether there is a .ply whose header has the properties of Gaussians."""
+    if path.suffix.lower() != ".ply" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        header, _, _ = file.read(1 << 16).partition(b"end_header")
+    return b"scale_0" in header and b"rot_0" in header
+
+
 def read_splats(path: str | Path) -> GaussianCloud:
     """Read Gaussians from a 3DGS `.ply`, text or binary of either byte order; other properties are ignored.
 

@@ -24,10 +24,10 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.positions import points_on_object
 from avmsf.field.posterior import scale_of
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.ply import read_splats
+from avmsf.gaussians.ply import holds_gaussians, read_splats
 from avmsf.mesh.surface import Surface, read_surface
 from avmsf.studio.capture import CaptureEditor
-from avmsf.studio.opening import Opened, find_object, find_reconstructed, is_gaussians
+from avmsf.studio.opening import Opened, find_object, find_reconstructed
 from avmsf.studio.session import Revision
 
 _MAX_OBJECT_POINTS = 8_000
@@ -101,7 +101,7 @@ class Showcase:
         None if a mesh of the object's own is shown. Like the points, it has the size before all edits.
         """
         shown = find_object(self.opened)
-        if field is None or (shown is not None and not is_gaussians(shown)):
+        if field is None or (shown is not None and not holds_gaussians(shown)):
             return find_reconstructed(self.opened)
         return field.gain_field.fitted.surface or find_reconstructed(self.opened)
 
@@ -131,7 +131,7 @@ class Showcase:
     def _clickable(self) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
         """Return points of the object, and normals, for a field without points. Raises StudioError without geometry."""
         path = find_object(self.opened)
-        if path is not None and not is_gaussians(path):
+        if path is not None and not holds_gaussians(path):
             return _on_mesh(read_surface(path, meters=self.meters))
         if path is not None:
             points = read_splats(path).centers

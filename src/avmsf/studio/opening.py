@@ -11,7 +11,7 @@ from avmsf.capture.filenames import SPLATS, find_surface_file
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import TABLE
 from avmsf.errors import StudioError
-from avmsf.export.geometry import holds_gaussians
+from avmsf.gaussians.ply import holds_gaussians
 from avmsf.pipeline.config import CACHE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.pipeline.shape import FIELD, SURFACE
@@ -85,7 +85,7 @@ def find_reconstructed(opened: Opened) -> Path | None:
     """Return the mesh, in meters, that was made of the object's views; None without one, and where its own is shown."""
     made = None if opened.capture is None else opened.capture / CACHE / SURFACE
     shown = find_object(opened)
-    return None if made is None or not made.is_file() or (shown and not is_gaussians(shown)) else made
+    return None if made is None or not made.is_file() or (shown and not holds_gaussians(shown)) else made
 
 
 def shows_more(opened: Opened) -> bool:
@@ -93,11 +93,6 @@ def shows_more(opened: Opened) -> bool:
     if opened.capture is None or find_object(opened) is not None:
         return False
     return find_source(opened.capture, opened.settings) is not None
-
-
-def is_gaussians(path: Path) -> bool:
-    """Whether a file holds Gaussians and not a mesh: a .ply whose header names their scales."""
-    return path.suffix.lower() == ".ply" and holds_gaussians(path)
 
 
 def _open_folder(folder: Path, object: Path | None) -> Opened:
@@ -122,7 +117,7 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
     if folder.exists() and not folder.is_dir():
         wanted, advice = "a capture folder or none", "name a folder by --capture"
         raise StudioError.expected(wanted, got="a file", file=folder, name="capture", advice=advice)
-    surface = folder / (SPLATS[0] if is_gaussians(mesh) else f"surface{mesh.suffix.lower()}")
+    surface = folder / (SPLATS[0] if holds_gaussians(mesh) else f"surface{mesh.suffix.lower()}")
     names = (*(f"surface{suffix}" for suffix in MESHES), *SPLATS)
     others = [folder / name for name in names if (folder / name).is_file()]
     if others and not (surface in others and _same(surface, mesh)):
