@@ -3,7 +3,6 @@
 And one of warnings, `AvmsfWarning`: what goes on all the same, and the user should know.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -77,21 +76,7 @@ class AvmsfWarning(_Located, UserWarning):
 
 
 class FolderInUseError(AvmsfError):
-    """Another process writes into this folder; `holder` says which, where that is known."""
-
-    def __init__(self, folder: Path, holder: Mapping[str, object], advice: str = "") -> None:
-        self.folder, self.holder, self.advice = folder, holder, advice
-        names = ("command", "process", "since")
-        who = ", ".join(f"{name} {holder[name]}" for name in names if name in holder) or "it does not say which"
-        super().__init__(
-            f"{folder}: another process writes there ({who}): wait until it has ended{advice}",
-            file=folder,
-            value=holder,
-        )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by the arguments: an exception pickles its message alone."""
-        return type(self), (self.folder, self.holder, self.advice)
+    """Another process writes into this folder; `value` says which, a dict that is empty where that is not known."""
 
 
 class ArrayError(AvmsfError):

@@ -39,9 +39,9 @@ def test_a_second_process_is_refused_and_hears_of_the_first(tmp_path: Path) -> N
     with hold(tmp_path) as other:
         with pytest.raises(FolderInUseError) as refused, write_lock(tmp_path, "stages", command="me", wait=0.1):
             pytest.fail("two processes hold the lock")
-        assert refused.value.holder["command"] == "avmsf splat mug"
-        assert refused.value.holder["process"] == other.pid
-        assert "since" in refused.value.holder
+        assert refused.value.value["command"] == "avmsf splat mug"
+        assert refused.value.value["process"] == other.pid
+        assert "since" in refused.value.value
         # Another lock of the folder is free.
         with write_lock(tmp_path, "capture", command="me", wait=0.0):
             pass
@@ -83,7 +83,7 @@ def test_a_thread_takes_its_lock_again_and_another_one_does_not(tmp_path: Path) 
         thread = threading.Thread(target=intrude)
         thread.start()
         thread.join()
-    assert [each.holder["command"] for each in refused] == ["me"]
+    assert [each.value["command"] for each in refused] == ["me"]
 
 
 @pytest.mark.parametrize("missing", ["file/inside", "nowhere/inside"])
@@ -132,6 +132,6 @@ def test_a_disk_without_locks_gets_no_file_that_outlives_its_process(
 
 
 def test_a_refusal_can_be_sent_between_processes() -> None:
-    error = FolderInUseError(Path("mug"), {"command": "avmsf splat"}, ", or copy it")
+    error = FolderInUseError.expected("a free folder", {"command": "avmsf splat"}, file=Path("mug"))
     again = pickle.loads(pickle.dumps(error))
-    assert (str(again), again.folder, again.holder) == (str(error), error.folder, error.holder)
+    assert (str(again), again.attributes) == (str(error), error.attributes)

@@ -69,5 +69,5 @@ def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path
     capture = read_capture(fill_plate(tmp_path / "plate"))
     with held(tmp_path / "cache"), pytest.raises(FolderInUseError) as refused:
         fit_in_stages(capture, PipelineConfig("smooth", modes=4), StageFolder(tmp_path / "cache"))
-    assert refused.value.holder["command"] == "avmsf fit mug"
+    assert refused.value.value["command"] == "avmsf fit mug"
     assert sorted(each.name for each in (tmp_path / "cache").iterdir()) == ["stages.lock"]

@@ -55,7 +55,10 @@ def write_lock(
         lock = FileLock(path, is_singleton=True, fallback_to_soft=False)
         lock.acquire(timeout=wait)
     except Timeout as error:
-        raise FolderInUseError(folder, _read_holder(path), advice) from error
+        holder, wanted = _read_holder(path), "a folder that no other process writes to"
+        got = ", ".join(f"{name} {value}" for name, value in holder.items()) or "one that does not say its name"
+        advice = f"wait until it has ended{advice}"
+        raise FolderInUseError.expected(wanted, holder, got=got, file=folder, advice=advice) from error
     except OSError as error:
         _expect_excused(error, path)
         yield
