@@ -89,7 +89,7 @@ def test_a_file_that_can_be_kept_is_kept_without_a_word(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         caching.keep_if_possible(
-            lambda: write_whole(tmp_path / "kept", lambda place: place.write_text("a"), raising=FieldFileError),
+            lambda: write_whole(tmp_path / "kept", "a", raising=FieldFileError),
             tmp_path / "kept",
         )
     assert (tmp_path / "kept").read_text() == "a"

@@ -26,7 +26,7 @@ def test_the_advice_fits_the_systems_error(tmp_path: Path, monkeypatch: pytest.M
     for name in ("open", "mkdir"):
         monkeypatch.setattr(os, name, refuse)
     with raises(ExportError, file=tmp_path / "file", value=os.strerror(number)) as refused:
-        write_whole(tmp_path / "file", lambda place: None, raising=ExportError)
+        write_whole(tmp_path / "file", b"", raising=ExportError)
     advice = way_out(OSError(number, ""))
     assert str(refused.value).endswith(advice)
     with pytest.raises(ExportError) as refused:
@@ -39,7 +39,7 @@ def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_pa
     (tmp_path / "folder").mkdir()
     for name, number in (("file/new", errno.EEXIST), ("file/deep/new", errno.ENOTDIR), ("folder", errno.EISDIR)):
         with raises(ExportError, file=tmp_path / name, value=os.strerror(number)) as refused:
-            write_whole(tmp_path / name, lambda place: None, raising=ExportError)
+            write_whole(tmp_path / name, b"", raising=ExportError)
         assert str(refused.value).endswith(way_out(OSError(number, "")))
     advice = [way_out(OSError(number, "")) for number in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EIO)]
     assert advice[0] == advice[1]
@@ -55,7 +55,7 @@ def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(
         with monkeypatch.context() as patched:
             # Another thread that makes a file meanwhile would see the change.
             patched.setattr(os, "umask", lambda mask: changed.append(mask) or 0o027)
-            write_whole(tmp_path / "file", lambda place: place.write_text("words"))
+            write_whole(tmp_path / "file", "words")
             write_folder(tmp_path / "folder", {"inside": b""}, {})
     finally:
         os.umask(before)

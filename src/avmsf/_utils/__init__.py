@@ -11,6 +11,7 @@ What enters:
 What is written:
 
 - `files`: files and folders that are whole or as they were (a temporary name, then a rename).
+- `checkpoint`: the state of work that may be interrupted.
 - `caching`: files that only save time, and digests of the sources that a cached result depends on.
 - `processes`: one writer at a time in a folder (`flock`), and child processes that end with their parent.
 

@@ -43,7 +43,7 @@ class Checkpoint:
         content = io.BytesIO()
         torch.save({"identity": self.identity, "state": dict(state)}, content)
         try:
-            write_whole(self.path, lambda place: place.write_bytes(content.getvalue()), raising=self.raising)
+            write_whole(self.path, content.getvalue(), raising=self.raising)
         except AvmsfError as error:
             message = f"{error}; {self.what} continues without a new checkpoint"
             warnings.warn(AvmsfWarning(message, **error.attributes), stacklevel=3)

@@ -65,11 +65,14 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 
-def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[AvmsfError] = FieldFileError) -> None:
-    """Let `write` fill a temporary file beside `path`, then move it there in one step; missing folders are made.
+def write_whole(
+    path: Path, content: bytes | str | Callable[[Path], object], *, raising: type[AvmsfError] = FieldFileError
+) -> None:
+    """Write a temporary file beside `path`, then move it there in one step; missing folders are made.
 
-    What was there stays whole until then: a full disk or a kill leaves the old file, a kill perhaps a hidden
-    `.NAME.….part` beside it, which nothing reads. Raises `raising`.
+    `content` is the file's, or a function that fills the file at a path; text becomes UTF-8. What was there stays whole
+    until then: a full disk or a kill leaves the old file, a kill perhaps a hidden `.NAME.….part` beside it, which
+    nothing reads. Raises `raising`.
     """
     temporary = None
     try:
@@ -77,7 +80,10 @@ def write_whole(path: Path, write: Callable[[Path], object], *, raising: type[Av
         temporary = temporary_path(path)
         # Unlike tempfile.mkstemp, this lets the system apply the umask, as for any file that is to be shared.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-        write(temporary)
+        if callable(content):
+            content(temporary)
+        else:
+            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)

@@ -93,7 +93,7 @@ def _write_holder(path: Path, command: str) -> None:
     words = json.dumps({"command": command, "process": os.getpid(), "since": since})
     # The lock holds without it, as where the disk is full.
     with suppress(AvmsfError):
-        write_whole(_holder_of(path), lambda place: place.write_text(words, encoding="utf-8"))
+        write_whole(_holder_of(path), words)
 
 
 def _read_holder(path: Path) -> dict[str, object]:

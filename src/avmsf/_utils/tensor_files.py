@@ -33,7 +33,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: str, kind: Fi
     # Safetensors refuses tensors that share memory.
     copies = {name: each.detach().cpu().clone(memory_format=torch.contiguous_format) for name, each in tensors.items()}
     content = save(copies, {kind.key: text})
-    write_whole(path, lambda place: place.write_bytes(content), raising=kind.error)
+    write_whole(path, content, raising=kind.error)
 
 
 def expect_tensors(tensors: Mapping[str, Tensor], skeleton: Mapping[str, Tensor], path: Path, kind: FileKind) -> None:

@@ -243,7 +243,7 @@ class ClapCurve:
             self._score(0, self.field.render(progress.place[None])[0])
         self._score(progress.step, progress.preview)
         text = json.dumps({"digest": self.clap.digest, "scores": list(self.scores.items())})
-        write_whole(self.kept, lambda path: path.write_text(text, encoding="utf-8"), raising=EditError)
+        write_whole(self.kept, text, raising=EditError)
 
     def record(self) -> dict[str, Any]:
         """Return the steps and scores as plain values."""

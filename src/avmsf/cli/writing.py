@@ -69,9 +69,9 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
     # Rounded here: libsndfile rounds down.
     samples = np.rint(scaled * 2**15).astype(np.int16) if coding == "int16" else scaled
     soundfile.write(memory, samples, rate, subtype=SUBTYPES[coding], format="WAV")
-    write_whole(path, lambda place: place.write_bytes(memory.getvalue()))
+    write_whole(path, memory.getvalue())
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
-    write_whole(path, lambda place: place.write_bytes(text.encode()))
+    write_whole(path, text)

@@ -182,4 +182,4 @@ def _write_maps(record: ObjectRecord, folder: Path) -> list[Path]:
 
 
 def _write_text(path: Path, text: str) -> None:
-    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"), raising=EvaluationError)
+    write_whole(path, text, raising=EvaluationError)

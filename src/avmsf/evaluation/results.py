@@ -185,7 +185,7 @@ class ResultsFolder:
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write plain values whole. Raises EvaluationError where that cannot be."""
     text = json.dumps(_finite(values), indent=1, ensure_ascii=False, allow_nan=False)
-    write_whole(path, lambda part: part.write_text(text + "\n", encoding="utf-8"), raising=EvaluationError)
+    write_whole(path, text + "\n", raising=EvaluationError)
 
 
 def failure_of(error: Exception) -> str:

@@ -53,7 +53,7 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
         samples = samples * (_FULL / peak)
     memory = io.BytesIO()
     soundfile.write(memory, samples, round(sample_rate * factor), subtype="PCM_16", format="FLAC")
-    write_whole(path, lambda part: part.write_bytes(memory.getvalue()), raising=EvaluationError)
+    write_whole(path, memory.getvalue(), raising=EvaluationError)
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,7 +89,7 @@ def pack(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[s
 def write_file(path: Path, content: bytes, *, overwrite: bool = False) -> dict[Path, int]:
     """Write one file atomically and return its size. Raises `ExportError` if it exists, unless `overwrite` is set."""
     check_free(path, overwrite=overwrite)
-    write_whole(path, lambda place: place.write_bytes(content), raising=ExportError)
+    write_whole(path, content, raising=ExportError)
     return {path: len(content)}
 
 

@@ -91,7 +91,7 @@ def _stored(mesh: Trimesh, detail: float, timeout: float) -> tuple[np.ndarray, n
         return _arrays(path.read_bytes())
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         content = _tetrahedralize(given, faces, detail, timeout)
-    keep_if_possible(lambda: write_whole(path, lambda place: place.write_bytes(content)), path)
+    keep_if_possible(lambda: write_whole(path, content), path)
     with suppress(OSError):
         for old in sorted(folder.glob("*.npz"), key=lambda each: each.stat().st_mtime)[:-_MAX_STORED]:
             discard(old)

@@ -30,8 +30,7 @@ from avmsf.gaussians.ply_header import (
 
 def write_splats(cloud: GaussianCloud, path: str | Path) -> None:
     """Write the Gaussians as 3DGS does: float32, binary, little endian. Raises `SceneError` where that cannot be."""
-    content = splat_bytes(cloud)
-    write_whole(Path(path), lambda place: place.write_bytes(content), raising=SceneError)
+    write_whole(Path(path), splat_bytes(cloud), raising=SceneError)
 
 
 def splat_bytes(cloud: GaussianCloud) -> bytes:

@@ -145,7 +145,7 @@ def digest_files(paths: Iterable[Path], *, root: Path) -> str:
 
 def _write(record: Path, values: Mapping[str, Any]) -> None:
     words = json.dumps(values, indent=1)
-    write_whole(record, lambda place: place.write_text(words, encoding="utf-8"), raising=CaptureError)
+    write_whole(record, words, raising=CaptureError)
 
 
 def _read(record: Path) -> dict[str, Any]:

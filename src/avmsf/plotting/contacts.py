@@ -93,7 +93,7 @@ def write_contact_cloud(contact: ContactMap, path: Path) -> None:
     header += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds.items()]
     header += ["end_header", ""]
     content = "\n".join(header).encode("ascii") + table.tobytes()
-    write_whole(path, lambda place: place.write_bytes(content), raising=EvaluationError)
+    write_whole(path, content, raising=EvaluationError)
 
 
 def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:

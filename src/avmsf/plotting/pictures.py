@@ -28,7 +28,7 @@ def save_picture(figure: Figure, path: Path) -> None:
         raise EvaluationError.expected("a name that ends in .png, .pdf or .svg", path.suffix, got=got, file=path)
     memory = io.BytesIO()
     FigureCanvasAgg(figure).print_figure(memory, format=ending, dpi=150)
-    write_whole(path, lambda place: place.write_bytes(memory.getvalue()))
+    write_whole(path, memory.getvalue())
 
 
 @styled

@@ -331,7 +331,7 @@ def _digest(content: bytes) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    write_whole(path, lambda temporary: temporary.write_bytes(content), raising=CaptureError)
+    write_whole(path, content, raising=CaptureError)
 
 
 def _as_wav(content: bytes, recording: Recording) -> bytes:

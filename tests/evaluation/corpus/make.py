@@ -88,7 +88,7 @@ def main() -> None:
             figures = scores_of(truth, predicted, rate, cdpam)
             expected[f"{name} {what}"] = {key: float(f"{value:.6g}") for key, value in figures.items()}
     text = json.dumps(expected, indent=1) + "\n"
-    write_whole(FOLDER / "expected.json", lambda place: place.write_text(text, encoding="utf-8"))
+    write_whole(FOLDER / "expected.json", text)
 
 
 if __name__ == "__main__":
