@@ -21,7 +21,8 @@ from avmsf.fem.supports import supports_of
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.estimator import FAMILIES, POSITIONAL, MixtureEstimator
+from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
+from avmsf.field.gains.kernels import Smooth, ThinPlate
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.modal.extraction.extract import Extraction
@@ -115,7 +116,7 @@ def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
         if (kind != Symmetric.kind or case.symmetries) and (kind != Elastic.kind or case.bodies):
             alone = MixtureEstimator((kind,), bodies=case.bodies, symmetries=case.symmetries)
             yield label, case.error(case.fit(alone, quick=True))
-    yield "positions alone", case.error(case.fit(MixtureEstimator(tuple(POSITIONAL)), quick=False))
+    yield "positions alone", case.error(case.fit(MixtureEstimator((Smooth.kind, ThinPlate.kind)), quick=False))
     yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries), quick=False))
     if case.surface is not None:
         rough = bodies_of(roughened(case.surface, ROUGH, seed=0), options)

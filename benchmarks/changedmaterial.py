@@ -127,12 +127,12 @@ def _solved(solid: Solid, material: Material, size: float, count: int) -> tuple[
 def _gain_model(places: Tensor, values: Tensor) -> MixtureGains:
     """Return gains of one kernel: linear in the values alike for all modes, so that the model adds no error."""
     sites = Sites(places, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(places), 3))
-    smooth = Smooth(sites, float((places.amax(0) - places.amin(0)).norm()))
+    smooth = Smooth(sites, float((places.amax(0) - places.amin(0)).norm())).take(torch.tensor([0]))
     series = series_of(values.to(torch.complex128))
     weights = torch.zeros(1, len(NOISE_SHARES), series.shape[1], dtype=torch.float64)
     weights[:, 0] = 1.0
-    mixture = KernelMixture(smooth.kernels()[:1], series, torch.zeros(series.shape[1], dtype=torch.float64), weights)
-    return MixtureGains(places.float(), sites, (smooth,), (torch.tensor([0]),), mixture, directional=False)
+    mixture = KernelMixture(smooth.kernels(), series, torch.zeros(series.shape[1], dtype=torch.float64), weights)
+    return MixtureGains(places.float(), sites, (smooth,), mixture, directional=False)
 
 
 def _response(body: ElasticModes, material: Material, places: Tensor) -> Tensor:

@@ -79,7 +79,7 @@ def rows_of(perturbation: float = PERTURBATION, remainder: float = REMAINDER) ->
 def drawn_gains(contacts: Tensor, *, seed: int, noise: float = NOISE) -> Tensor:
     """Return gains of contacts that are drawn from one hypothesis of the elastic family, [contacts, modes, 2]."""
     sites = impacts(contacts)
-    covariance = Elastic(sites, SIZE, bar()).between(sites, sites, rows_of())
+    covariance = Elastic(sites, SIZE, bar()).take(rows_of()).kernels()
     factor = torch.linalg.cholesky(covariance + 1e-9 * torch.eye(len(contacts), dtype=torch.float64))
     generator = torch.Generator().manual_seed(seed)
     smooth = factor @ torch.randn(4, len(contacts), 2, generator=generator, dtype=torch.float64)
@@ -116,10 +116,10 @@ def one_hypothesis(
 ) -> MixtureGains:
     """Return the model of a single hypothesis for each mode: that of `drawn_gains`, unless another is named."""
     sites, rows = impacts(contacts), rows_of(perturbation, remainder)
-    family = Elastic(sites, SIZE, bar())
+    family = Elastic(sites, SIZE, bar()).take(rows)
     weights = torch.zeros(len(rows), len(NOISE_SHARES), 2 * len(rows), dtype=torch.float64)
     for row in range(len(rows)):
         weights[row, NOISE_SHARES.index(noise), [row, row + len(rows)]] = 1.0
     series = values.transpose(1, 2).flatten(1)
-    mixture = KernelMixture(family.kernels()[rows], series, torch.zeros(series.shape[1]).double(), weights)
-    return MixtureGains(bar_points(), sites, (family,), (rows,), mixture, True)
+    mixture = KernelMixture(family.kernels(), series, torch.zeros(series.shape[1]).double(), weights)
+    return MixtureGains(bar_points(), sites, (family,), mixture, True)

@@ -32,8 +32,7 @@ def joint_kernels(given: MixtureGains) -> torch.Tensor:
     """Return all kept kernels among the training impacts and the asked ones."""
     training = given.training
     both = Sites(torch.cat([training.points, ASKED.points]), torch.cat([training.directions, ASKED.directions]))
-    kept = zip(given.families, given.kept, strict=True)
-    return torch.cat([family.between(both, both, rows) for family, rows in kept])
+    return torch.cat([family.between(both, both) for family in given.families])
 
 
 def dense(given: MixtureGains, kernel: torch.Tensor, share: int, series: int) -> tuple[torch.Tensor, ...]:
@@ -81,11 +80,11 @@ def test_mean_and_deviation_are_those_of_all_hypotheses(elastic):
 def undecided() -> MixtureGains:
     """Return the model in which every kernel of all families has a weight."""
     given = model()
-    kept = tuple(torch.arange(len(family.shares)) for family in given.families)
-    kernels = torch.cat([family.kernels() for family in given.families])
+    whole = tuple(families(given.training))
+    kernels = torch.cat([family.kernels() for family in whole])
     weights = 0.5 + draw(len(kernels), len(NOISE_SHARES), 2 * MODES, seed=8)
     mixture = replace(given.mixture, kernels=kernels, weights=weights / weights.sum((0, 1)))
-    return replace(given, kept=kept, mixture=mixture)
+    return replace(given, families=whole, mixture=mixture)
 
 
 def test_the_deviation_does_not_depend_on_how_it_is_computed(monkeypatch):

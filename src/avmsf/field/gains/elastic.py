@@ -101,26 +101,28 @@ class Elastic(KernelFamily):
         """Return the squared components of each shape, and ones."""
         return torch.cat([self._along(sites).square().T, torch.ones(1, len(sites), dtype=torch.float64)])
 
-    def between(self, sites: Sites, others: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites others"]:
-        """Return some kernels between two sets of impacts."""
+    def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
+        """Return the kernels between two sets of impacts."""
         one, other = self._along(sites), self._along(others)
-        shares, size = self.shares[kept], len(sites) * len(others)
-        found = self._residual_kernel(sites, others) * shares[:, -1, None, None]
+        found = self._residual_kernel(sites, others) * self.shares[:, -1, None, None]
         # As one product where few impacts make it small, else kernel by kernel: the basis would be far larger.
-        if size * one.shape[1] <= _MEMORY:
+        if found[0].numel() * one.shape[1] <= _MEMORY:
             pairs = (one.T[:, :, None] * other.T[:, None]).flatten(1)
-            return found + (shares[:, :-1] @ pairs).reshape(len(kept), len(sites), len(others))
-        for row, share in enumerate(shares[:, :-1]):
+            return found + (self.shares[:, :-1] @ pairs).reshape(found.shape)
+        for row, share in enumerate(self.shares[:, :-1]):
             found[row] += (one * share) @ other.T
         return found
 
     def factors(self, sites: Sites, known: Sites) -> Float64[Tensor, "sites factors"]:
-        """Return the components of each shape, and the remainder's kernel with each known impact."""
+        """Return vectors z of impacts, for which each kernel's covariances with the known ones are `loadings` times z.
+
+        They are the components of each shape, and the remainder's kernel with each known impact.
+        """
         return torch.cat([self._along(sites), self._residual_kernel(sites, known)], dim=1)
 
-    def loadings(self, known: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept known factors"]:
-        """Return the components of each shape at the known impacts, and one for each of these, times their shares."""
-        shares, one = self.shares[kept][:, None], torch.eye(len(known), dtype=torch.float64)
+    def loadings(self, known: Sites, rows: Int[Tensor, " rows"]) -> Float64[Tensor, "rows known factors"]:
+        """Return the matrix of each of some kernels that gives covariances with known impacts from `factors`."""
+        shares, one = self.shares[rows][:, None], torch.eye(len(known), dtype=torch.float64)
         return torch.cat([shares[..., :-1] * self._along(known), shares[..., -1:] * one], dim=2)
 
     def mean(

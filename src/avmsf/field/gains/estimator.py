@@ -13,7 +13,6 @@ from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.capture.placement import expect_placed
-from avmsf.capture.table import TABLE
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, body_name
@@ -27,11 +26,11 @@ from avmsf.field.gains.attention import SHARED, Attention
 from avmsf.field.gains.data import GainData, along_phase, gain_variance
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
-from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
-from avmsf.field.gains.labels import better_order, two_levels
+from avmsf.field.gains.kernels import POSITIONAL, KernelFamily, Sites, Unstructured, Visual
+from avmsf.field.gains.labels import level_advice, order_advice
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, predicts_better
+from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, others, predicts_better
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.trainer import FittedGains, GainEstimator, Trainer
@@ -40,20 +39,16 @@ from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.symmetry.characters import Group, groups_of
 from avmsf.symmetry.symmetries import Symmetries
 
-POSITIONAL: dict[str, type[KernelFamily]] = {Smooth.kind: Smooth, ThinPlate.kind: ThinPlate}
-"""Families that need nothing but the contacts, by name."""
-FAMILIES = (*POSITIONAL, Symmetric.kind, Elastic.kind)
+FAMILIES = (*(kind for kind in POSITIONAL if kind != Unstructured.kind), Symmetric.kind, Elastic.kind)
 """What the model is made of besides the unstructured family, which is always there."""
 KNOWN = (*FAMILIES, Visual.kind)
 """All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
 errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing with one."""
-_UPDATED = 64
+_MAX_SPREAD = 64
 """Contacts that a body is updated from, or orders and levels are compared at, at most."""
 _PREDICTS = 1.4
 """Nats per mode that a free body has to add, below which supports are tried. A plate clamped at an edge and taken for
 free adds .5, a free one 2.3; mugs add 1.1 (held at the base) and 1.5, an aircraft .8 to 1.3."""
-_SHOWN = 4
-"""Changes that a message lists, at most."""
 _PLACES = 500
 """Points of the surface where the contacts that contradict the others may have been."""
 
@@ -129,31 +124,23 @@ class MixtureEstimator(GainEstimator):
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         self._expect_inputs(data, groups)
-        candidates, thickness, supported = self.bodies, None, False
-        searched = candidates is not None and candidates.searches_thickness
+        searched = bool(bodies) and self.bodies is not None and self.bodies.searches_thickness
         # Of a wall that is too thin, shapes of high modes may fit as well as those of the right one.
         largest = largest_factor(searched=True) if searched else math.inf
         fit = _Fit(data, self.kinds, _sites(data, bodies), directional, groups, largest)
-        if candidates is not None and searched and bodies:
-            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), candidates.with_thickness)
-        found = fit(every, bodies)
-        while True:
-            best = found.best
-            fine = best if best is None or candidates is None or best.fine else candidates.refined(best)
-            if fine is not None and fine is not best:
-                found = fit(every, [fine if each is best else each for each in found.bodies])
-                continue
-            judgment = fit.assess(found)
-            if best is None or candidates is None or supported or not self._may_be_held(judgment):
-                break
-            supported = True
-            held = fit.more_probable(_without(every, judgment), candidates.supported(best))
-            if held is None:
-                break
-            # All modes have the support in common, so free bodies are no hypotheses any more.
-            found = fit(every, [held])
+        thickness = None
+        if searched and self.bodies is not None:
+            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.with_thickness)
+        found = self._refined(fit, bodies)
+        judgment = fit.assess(found)
+        if found.best is not None and self.bodies is not None and self._may_be_held(judgment):
+            held = fit.more_probable(others(fit.sites, judgment.rows), self.bodies.supported(found.best))
+            if held is not None:
+                # All modes have the support in common, so free bodies are no hypotheses any more.
+                found = self._refined(fit, [held])
+                judgment = fit.assess(found)
         if judgment.outliers:
-            rows = _without(every, judgment)
+            rows = others(fit.sites, judgment.rows)
             fewer = fit(rows, found.bodies)
             if predicts_better(fewer.model.leave_one_out(), found.model.leave_one_out()[rows], fit.measured.take(rows)):
                 found = fewer
@@ -167,6 +154,16 @@ class MixtureEstimator(GainEstimator):
         report["thickness"] = None if thickness is None else asdict(thickness)
         report["advice"] = None if judgment.informative else fit.advice(found.bodies)
         return replace(found.model, report=report), found.rows
+
+    def _refined(self, fit: "_Fit", bodies: Sequence[CandidateBody]) -> "_Solution":
+        """Return the gain model of all contacts with the most probable body as fine as it can be had."""
+        found = fit(torch.arange(len(fit.sites)), bodies)
+        while (best := found.best) is not None and not best.fine and self.bodies is not None:
+            fine = self.bodies.refined(best)
+            if fine is best:
+                break
+            found = fit(found.rows, [fine if each is best else each for each in found.bodies])
+        return found
 
     def _expect_inputs(self, data: GainData, groups: Sequence[Group]) -> None:
         """Raise FitError where one family alone was asked for and the symmetries or features that it needs are none."""
@@ -197,11 +194,8 @@ class MixtureEstimator(GainEstimator):
 
     def _may_be_held(self, judgment: Judgment) -> bool:
         """Return whether supports are tried: where they are asked for, or the free body predicts little."""
-        if self.bodies is None or self.bodies.supports == "free":
-            return False
-        found = judgment.credibility
-        little = found is not None and found.with_body - found.without_body < _PREDICTS
-        return self.bodies.supports == "try" or little
+        tried, found = "free" if self.bodies is None else self.bodies.supports, judgment.credibility
+        return tried == "try" or (tried == "auto" and found is not None and found.gained < _PREDICTS)
 
 
 def estimator_for(
@@ -240,8 +234,8 @@ class _Solution:
     model: MixtureGains
     rows: Int[Tensor, " rows"]
     bodies: Sequence[CandidateBody]
-    elastic: Sequence[Elastic]
-    """The family of each body."""
+    factors: Sequence[float]
+    """On the nominal frequencies of each body."""
     weights: Sequence[float]
     """Each body's posterior probability, mean over modes by their energy."""
 
@@ -260,9 +254,9 @@ class _Solution:
                 "updating_nats": body.updated,
                 "refined": body.fine,
                 "weight": weight,
-                "frequency_factor": family.factor,
+                "frequency_factor": factor,
             }
-            for body, family, weight in zip(self.bodies, self.elastic, self.weights, strict=True)
+            for body, factor, weight in zip(self.bodies, self.factors, self.weights, strict=True)
         ]
         return {"bodies": sorted(found, key=lambda each: -each["weight"])}
 
@@ -291,8 +285,8 @@ class _Fit:
     def families(self, rows: Int[Tensor, " rows"]) -> list[KernelFamily]:
         """Return the families of these contacts that know of no body."""
         sites, size, features = self.sites.take(rows), self._size, self.data.features
-        found: list[KernelFamily] = [Unstructured(sites, size)]
-        found += [POSITIONAL[kind](sites, size) for kind in POSITIONAL if kind in self.kinds]
+        kinds = [kind for name, kind in POSITIONAL.items() if name in (Unstructured.kind, *self.kinds)]
+        found: list[KernelFamily] = [kind(sites, size) for kind in kinds]
         if self.groups and Symmetric.kind in self.kinds:
             found.append(Symmetric(sites, size, self.groups, directional=self.directional))
         if Visual.kind in self.kinds and features.encoder != GEOMETRY:
@@ -310,15 +304,16 @@ class _Fit:
         noise_shares: tuple[float, ...] = NOISE_SHARES,
     ) -> _Solution:
         """Return the gain model of these contacts."""
-        families = self.families(rows)
-        elastic = [self.elastic(rows, body.elastic) for body in bodies]
-        points, directional = self.data.features.points, self.directional
+        elastic, measured = [self.elastic(rows, body.elastic) for body in bodies], self.measured
         model = fit_mixture(
-            [*families, *elastic], self.measured.take(rows), points, directional=directional, noise_shares=noise_shares
-        )
-        share = self.measured.energy / self.measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
-        weights = dict(zip(map(id, model.families), (model.shares() @ share).tolist(), strict=True))
-        return _Solution(model, rows, bodies, elastic, [weights.get(id(each), 0.0) for each in elastic])
+            [*self.families(rows), *elastic], measured.take(rows), self.data.features.points,
+            directional=self.directional, noise_shares=noise_shares,
+        )  # fmt: skip
+        share = measured.energy / measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
+        parts = zip(model.families, (model.shares() @ share).tolist(), strict=True)
+        weights = {id(family.modes): part for family, part in parts if isinstance(family, Elastic)}
+        found = [weights.get(id(each.modes), 0.0) for each in elastic]
+        return _Solution(model, rows, bodies, [each.factor for each in elastic], found)
 
     def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[float]:
         """Return the log evidence of the gains of some contacts with each body by itself."""
@@ -346,8 +341,8 @@ class _Fit:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
         if body.elastic.perturbations is None:
             return None
-        # Spread contacts say enough of a few dozen coefficients, and the cost goes with the cube of their number.
-        rows = rows[farthest_points(self.sites.points[rows], min(_UPDATED, len(rows))).sort().values]
+        # The cost goes with the cube of the number of contacts.
+        rows = rows[self._spread_out(rows)]
         sites, measured = self.sites.take(rows), self.measured.take(rows)
         others = [WeighedFamily.of(family, measured) for family in self.families(rows)]
         found = update(
@@ -368,28 +363,18 @@ class _Fit:
 
     def advice(self, bodies: Sequence[CandidateBody]) -> str | None:
         """Return what makes the recordings agree with the contacts far better: one level, or another order."""
-        names = self.data.train.names
-        rows = farthest_points(self.sites.points, min(_UPDATED, len(self.sites))).sort().values
-        kinds: tuple[type[KernelFamily], ...] = (Unstructured, *POSITIONAL.values())
-        found = two_levels([kind(self.sites.take(rows), self._size) for kind in kinds], self.measured.take(rows))
-        if found is not None:
-            first, level = found
-            return (
-                f"the recordings from {names[int(rows[first])]} on are {abs(level):.0f} dB "
-                f"{'louder' if level > 0 else 'weaker'} than those before let expect, as if the gain, the microphone's "
-                "place or the force's scale had changed: bring all to one level, or fit each group by itself"
-            )
+        names, rows = self.data.train.names, self._spread_out(torch.arange(len(self.sites)))
+        positional = [kind(self.sites.take(rows), self._size) for kind in POSITIONAL.values()]
+        level = level_advice([names[row] for row in rows.tolist()], positional, self.measured.take(rows))
+        if level is not None:
+            return level
         families = [*self.families(rows), *(self.elastic(rows, body.elastic) for body in bodies)]
-        better = better_order(
-            names, families, rows, self.measured, self.data.features.points, directional=self.directional
-        )
-        if better is None:
-            return None
-        changed = [f"{names[new]} for {names[row]}" for row, new in enumerate(better[1].tolist()) if new != row]
-        return (
-            f"the recordings do not agree with the contacts, but would far better in another order, {better[0]}: in "
-            f"{TABLE} write {', '.join(changed[:_SHOWN])}{', ...' * (len(changed) > _SHOWN)} and fit again"
-        )
+        points, directional = self.data.features.points, self.directional
+        return order_advice(names, families, rows, self.measured, points, directional=directional)
+
+    def _spread_out(self, rows: Int[Tensor, " rows"]) -> Int[Tensor, " some"]:
+        """Return which of some rows are far from each other, sorted: they say enough of what all have in common."""
+        return farthest_points(self.sites.points[rows], min(_MAX_SPREAD, len(rows))).sort().values
 
     @property
     def _size(self) -> float:
@@ -413,8 +398,3 @@ def _sites(data: GainData, bodies: Sequence[CandidateBody]) -> Sites:
         return torch.nn.functional.normalize(given[known][nearest].double(), dim=1)
 
     return Sites.along(points, given, otherwise)
-
-
-def _without(rows: Int[Tensor, " rows"], judgment: Judgment) -> Int[Tensor, " kept"]:
-    """Return the rows that are no outliers."""
-    return torch.tensor([row for row in rows.tolist() if row not in {each.row for each in judgment.outliers}])

@@ -70,18 +70,15 @@ class MeasuredGains:
         return torch.where(total > 0, logs.exp(), own).flatten()
 
     @property
-    def substantial(self) -> Bool[Tensor, " series"]:
-        """Which parts have a thousandth of their mode's energy: smaller ones are what the common phase leaves of noise.
+    def informative(self) -> Bool[Tensor, " series"]:
+        """Which series the prior is learned from, in which every one counts alike.
 
-        They have no part in learning the prior, in which every series counts alike.
+        Not those of silent and doubled modes, nor parts below a thousandth of their mode's energy, which are what the
+        common phase leaves of noise.
         """
         power = torch.stack([self.values.real.square().sum(0), self.values.imag.square().sum(0)])
-        return (power >= _SUBSTANTIAL * power.sum(0)).flatten()
-
-    @property
-    def informative(self) -> Bool[Tensor, " series"]:
-        """Which series the prior is learned from: those that are substantial and not of a silent or doubled mode."""
-        return active_series(series_of(self.values)) & self.substantial & self.distinct.repeat(2)
+        substantial = (power >= _SUBSTANTIAL * power.sum(0)) & self.distinct
+        return active_series(series_of(self.values)) & substantial.flatten()
 
     @property
     def distinct(self) -> Bool[Tensor, " modes"]:
@@ -145,14 +142,11 @@ def fit_mixture(
     weigh_factors(weighed, measured)
     hypotheses, evidence = hypotheses_of(weighed, measured), torch.cat([each.evidence for each in weighed])
     weights = posterior_weights(evidence, hypotheses, measured.informative)
-    used = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
+    used = weights.sum((1, 2)) > 0
     mixture = KernelMixture(hypotheses.kernels[used], values, floor, weights[used], noise_shares)
-    ends = torch.tensor([len(family.shares) for family in families]).cumsum(0).tolist()
-    starts = [0, *ends[:-1]]
-    rows = [used[(used >= start) & (used < end)] - start for start, end in zip(starts, ends, strict=True)]
-    some = [(family, each) for family, each in zip(families, rows, strict=True) if len(each)]
-    kept_families, kept = zip(*some, strict=True)
-    return MixtureGains(points, families[0].reference, kept_families, kept, mixture, directional)
+    rows = torch.split(used, [len(family) for family in families])
+    kept = tuple(family.take(torch.nonzero(each).flatten()) for family, each in zip(families, rows, strict=True))
+    return MixtureGains(points, families[0].reference, tuple(filter(len, kept)), mixture, directional)
 
 
 def hypotheses_of(families: Sequence[WeighedFamily], measured: MeasuredGains) -> Hypotheses:

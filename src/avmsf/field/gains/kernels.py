@@ -6,6 +6,7 @@ impacts, each times the cosine between their directions.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, TypeVar
@@ -95,6 +96,9 @@ class Sites:
         return rows, torch.where(cosine.gather(1, rows) < -_PERPENDICULAR, -1.0, 1.0).double()
 
 
+Family = TypeVar("Family", bound="KernelFamily")
+
+
 class KernelFamily(ABC):
     """Kernels of one assumption about how gains vary over an object.
 
@@ -113,9 +117,24 @@ class KernelFamily(ABC):
     """Diagonal of the box around the object, meters."""
     shares: Float64[Tensor, "kernels basis"]
     """Scaled."""
+    _rows: Int[Tensor, " kernels"] | None = None
 
     def __init__(self, reference: Sites, size: float) -> None:
         self.reference, self.size = reference, size
+
+    def __len__(self) -> int:
+        return len(self.shares)
+
+    def take(self: Family, rows: Int[Tensor, " rows"]) -> Family:
+        """Return the family of some of the kernels, which have no prior of their own any more."""
+        found = copy(self)
+        found.shares, found._rows = self.shares[rows], self.kept[rows]
+        return found
+
+    @property
+    def kept(self) -> Int[Tensor, " kernels"]:
+        """Which of all kernels of the family these are, as `take` chose them."""
+        return torch.arange(len(self)) if self._rows is None else self._rows
 
     @abstractmethod
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
@@ -127,7 +146,7 @@ class KernelFamily(ABC):
 
     def categories(self) -> Int[Tensor, " kernels"]:
         """Return the category of each kernel, from 0 on; each kernel is one, unless a family says otherwise."""
-        return torch.arange(len(self.shares))
+        return torch.arange(len(self))
 
     def category_prior(self) -> Float64[Tensor, " categories"]:
         """Return the probability of each category within the family; equal ones, unless a family says otherwise."""
@@ -136,53 +155,38 @@ class KernelFamily(ABC):
 
     def visibility(self) -> Float64[Tensor, " kernels"]:
         """Return the mean square of gains at the reference impacts over that of a typical kernel of the family."""
-        return torch.ones(len(self.shares), dtype=torch.float64)
+        return torch.ones(len(self), dtype=torch.float64)
 
     def log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "kernels modes"]:
         """Return the log probability of each kernel within its category for modes of these log frequencies (Hz).
 
         It may be relative to the density of a measured log frequency under families that know nothing of it.
         """
-        return torch.zeros(len(self.shares), len(log_frequency), dtype=torch.float64)
+        return torch.zeros(len(self), len(log_frequency), dtype=torch.float64)
 
     def kernels(self) -> Float64[Tensor, "kernels contacts contacts"]:
-        """Return all kernels among the reference impacts."""
-        return self.between(self.reference, self.reference, torch.arange(len(self.shares)))
+        """Return the kernels among the reference impacts."""
+        return self.between(self.reference, self.reference)
 
-    def between(self, sites: Sites, others: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites others"]:
-        """Return some kernels between two sets of impacts."""
-        return torch.einsum("hb,bso->hso", self.shares[kept], self.basis(sites, others))
+    def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
+        """Return the kernels between two sets of impacts."""
+        return torch.einsum("hb,bso->hso", self.shares, self.basis(sites, others))
 
-    def factors(self, sites: Sites, known: Sites) -> Float64[Tensor, "sites factors"]:
-        """Return vectors z of impacts for which each kernel's covariances with the known ones are `loadings` times z.
-
-        Here the basis with each known impact.
-        """
-        return self.basis(sites, known).permute(1, 2, 0).flatten(1)
-
-    def loadings(self, known: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept known factors"]:
-        """Return the matrix of each of some kernels that gives covariances with known impacts from `factors`."""
-        one = torch.eye(len(known), dtype=torch.float64)
-        return (one[:, :, None] * self.shares[kept][:, None, None]).flatten(2)
-
-    def own(self, sites: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites"]:
-        """Return some kernels of each impact with itself."""
-        return self.shares[kept] @ self.diagonal(sites)
+    def own(self, sites: Sites) -> Float64[Tensor, "kernels sites"]:
+        """Return the kernels of each impact with itself."""
+        return self.shares @ self.diagonal(sites)
 
     def coefficients(
-        self, kept: Int[Tensor, " kept"], solved: Float64[Tensor, "kept contacts series"]
+        self, solved: Float64[Tensor, "kernels contacts series"]
     ) -> Float64[Tensor, "basis contacts series"]:
         """Return the coefficients of the basis in the means, from those of the kernels (`KernelMixture.solve`)."""
-        return torch.einsum("hb,hcs->bcs", self.shares[kept], solved)
+        return torch.einsum("hb,hcs->bcs", self.shares, solved)
 
     def mean(
         self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
     ) -> Float64[Tensor, "sites series"]:
         """Return the family's part of the means at impacts, whose coefficients are those of the known impacts."""
         return torch.einsum("bpc,bcs->ps", self.basis(sites, known), coefficients)
-
-
-Family = TypeVar("Family", bound=KernelFamily)
 
 
 def scaled(
@@ -307,6 +311,10 @@ class ThinPlate(KernelFamily):
     def _drift(self, along: Float64[Tensor, "sites dim"]) -> Float64[Tensor, "sites terms"]:
         constant = torch.ones(len(along), 1, dtype=torch.float64)
         return torch.cat([constant, along], dim=1) if self._bending else constant
+
+
+POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
+"""Families that need nothing but the contacts, by name."""
 
 
 class Axes:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from avmsf._utils.text import counted
 from avmsf.capture.filenames import number_key
+from avmsf.capture.table import TABLE
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
 from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.outliers import CHANCE, WIDE_NOISE_SHARES, PredictiveRatios
@@ -38,6 +39,8 @@ _SURE = 0.5
 """Nats for each series by which the evidence has to rise, beside the logarithm of how many steps are tried."""
 _SHIFTS = 5
 """Rows by which recordings may be off: takes left out or repeated before the first."""
+_SHOWN = 4
+"""Changes that a message lists, at most."""
 
 
 def candidate_orders(names: Sequence[str]) -> dict[str, Int[Tensor, " rows"]]:
@@ -59,6 +62,26 @@ def candidate_orders(names: Sequence[str]) -> dict[str, Int[Tensor, " rows"]]:
     return {words: torch.tensor(order) for order, words in reversed(distinct.items())}
 
 
+def order_advice(
+    names: Sequence[str],
+    families: Sequence[KernelFamily],
+    rows: Int[Tensor, " rows"],
+    measured: MeasuredGains,
+    points: Float32[Tensor, "points 3"],
+    *,
+    directional: bool,
+) -> str | None:
+    """Return the changes of the table by which the recordings agree with the contacts far better; None without any."""
+    found = better_order(names, families, rows, measured, points, directional=directional)
+    if found is None:
+        return None
+    changed = [f"{names[new]} for {names[row]}" for row, new in enumerate(found[1].tolist()) if new != row]
+    return (
+        f"the recordings do not agree with the contacts, but would far better in another order, {found[0]}: in "
+        f"{TABLE} write {', '.join(changed[:_SHOWN])}{', ...' * (len(changed) > _SHOWN)} and fit again"
+    )
+
+
 def better_order(
     names: Sequence[str],
     families: Sequence[KernelFamily],
@@ -74,23 +97,32 @@ def better_order(
     of the contacts `rows`; `names` and `measured` are all recordings', `points` the object's.
     """
 
-    def evidence(words: str) -> float:
-        moved = measured.take(orders[words][rows])
-        return total_evidence([WeighedFamily.of(each, moved) for each in families], moved)
-
     def ratios(order: Int[Tensor, " contacts"]) -> Float64[Tensor, " rows"]:
         moved = measured.take(order[rows])
         model = fit_mixture(families, moved, points, directional=directional, noise_shares=WIDE_NOISE_SHARES)
         return PredictiveRatios(model, families[0].reference, moved).without(frozenset())[0]
 
     orders = candidate_orders(names)
-    best = max(orders, key=evidence, default=None)
+    best = max(orders, key=lambda words: _evidence(families, measured.take(orders[words][rows])), default=None)
     if best is None:
         return None
     more = ratios(orders[best]) - ratios(torch.arange(len(names)))
     mean, error = float(more.mean()), float(more.std()) / math.sqrt(len(more))
     chance = float(scipy.special.stdtr(len(more) - 1, -mean / max(error, torch.finfo(torch.float64).tiny)))
     return (best, orders[best]) if chance < CHANCE / len(orders) else None
+
+
+def level_advice(names: Sequence[str], families: Sequence[KernelFamily], measured: MeasuredGains) -> str | None:
+    """Return from which recording on the level is another, and what to do; None where all have one level."""
+    found = two_levels(families, measured)
+    if found is None:
+        return None
+    first, level = found
+    return (
+        f"the recordings from {names[first]} on are {abs(level):.0f} dB {'louder' if level > 0 else 'weaker'} than "
+        "those before let expect, as if the gain, the microphone's place or the force's scale had changed: bring all "
+        "to one level, or fit each group by itself"
+    )
 
 
 def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tuple[int, float] | None:
@@ -104,9 +136,8 @@ def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tup
     def evidence(first: int, level: float) -> float:
         values = measured.values.clone()
         values[first:] *= 10 ** (-level / 20)
-        moved = replace(measured, values=values)
         jacobian = series * (count - first) * level / 20 * math.log(10)
-        return total_evidence([WeighedFamily.of(each, moved) for each in families], moved) - jacobian
+        return _evidence(families, replace(measured, values=values)) - jacobian
 
     tried = {
         (first, level): evidence(first, level) for first in range(_FEWEST, count - _FEWEST + 1) for level in _COARSE
@@ -118,3 +149,7 @@ def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tup
     best = max(near, key=near.__getitem__)
     rise = near[best] - evidence(0, 0.0)
     return best if rise > _SURE * series + math.log(len(tried)) else None
+
+
+def _evidence(families: Sequence[KernelFamily], measured: MeasuredGains) -> float:
+    return total_evidence([WeighedFamily.of(each, measured) for each in families], measured)

@@ -33,7 +33,7 @@ to series. So a series whose few values say little borrows from the others (MacK
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -146,11 +146,6 @@ class KernelMixture:
         """The values along the eigenvectors, z = U' y."""
         return self.eigen[1].mT @ self.values
 
-    @cached_property
-    def quadratic(self) -> Float64[Tensor, "kernels noises series"]:
-        """Q = y' C^-1 y; over the number of contacts it is s^2."""
-        return torch.stack([(self.projected.square() * inverse).sum(1) for inverse in self._inverses()], dim=1)
-
     def solve(self) -> Float64[Tensor, "kernels contacts series"]:
         """Return the sum over noise shares of weight times C^-1 y: a mean at a place is k' times it, over kernels."""
         pairs = self._pairs
@@ -164,14 +159,12 @@ class KernelMixture:
 
     def smoother(self) -> Float64[Tensor, "series contacts contacts"]:
         """Return the matrix of each series by which the mean at the contacts is linear in the values there."""
-        values, vectors = self.eigen
-        shrunk = torch.zeros_like(self.projected)
-        for row, inverse in enumerate(self._inverses()):
-            shrunk += self.weights[:, row, None] * values[..., None] * inverse
-        found = [
-            torch.einsum("hcn,hn,hdn->cd", vectors, shrunk[..., series], vectors)
-            for series in range(self.values.shape[1])
-        ]
+        found = []
+        for series in range(self.values.shape[1]):
+            pairs = self._pairs.take(torch.nonzero(self._pairs.series == series).flatten())
+            values, vectors = (each[pairs.kernel] for each in self.eigen)
+            shrunk = pairs.weight[:, None] * values * pairs.inverse
+            found.append(torch.einsum("pcn,pdn->cd", vectors * shrunk[:, None], vectors))
         return torch.stack(found)
 
     def leave_out(self, groups: Int[Tensor, " contacts"]) -> Predictions:
@@ -331,11 +324,6 @@ class KernelMixture:
             each = (pad_sequence([getattr(pair, name) for pair in pairs], batch_first=True) for name in parts)
             found.append((rows, tuple(each)))
         return found
-
-    def _inverses(self) -> Iterator[Float64[Tensor, "kernels contacts series"]]:
-        """Yield 1 / (lambda + v) for each noise share."""
-        for noise in self.noise_variance:
-            yield 1.0 / (self.eigen[0][..., None] + noise)
 
 
 def log_evidence(

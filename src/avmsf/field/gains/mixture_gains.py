@@ -17,9 +17,9 @@ from avmsf.capture.impacts import places_of
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.kernels import Family, KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
+from avmsf.field.gains.kernels import POSITIONAL, Family, KernelFamily, Sites, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
-from avmsf.field.gains.model import Directions, GainModel, Gains, Points, series_of
+from avmsf.field.gains.model import Directions, GainModel, Gains, Points, complex_of, series_of
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import Group
 
@@ -31,7 +31,6 @@ _FORM_ENTRIES = 16_000_000
 """Largest number of entries of one family's matrices for the variance, which are kept: 128 MB."""
 _PRODUCTS = 64
 """Sites whose products of factors are held at once."""
-_POSITIONAL: dict[str, type[KernelFamily]] = {each.kind: each for each in (Unstructured, Smooth, ThinPlate)}
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
 """Families that know something of the object, and the entry of the record with its size."""
 
@@ -47,11 +46,9 @@ class MixtureGains(GainModel):
     training: Sites
     """The impacts that the gains are known at."""
     families: tuple[KernelFamily, ...]
-    """At least one."""
-    kept: tuple[Int[Tensor, " _kept"], ...]
-    """Rows of each family's kernels that have a weight."""
+    """At least one, each with the kernels that have a weight."""
     mixture: KernelMixture
-    """Of the kept kernels in this order; its series are the real parts of all modes' gains, then the imaginary ones."""
+    """Of these kernels in this order; its series are the real parts of all modes' gains, then the imaginary ones."""
     directional: bool
     """Whether directions of impacts are known, or a body says which way its surface faces."""
     spread_share: float = 0.0
@@ -71,7 +68,7 @@ class MixtureGains(GainModel):
     @property
     def values(self) -> Complex128[Tensor, "contacts modes"]:
         """The gains there."""
-        return torch.complex(*self.mixture.values.chunk(2, dim=1))
+        return complex_of(self.mixture.values)
 
     @property
     def place_count(self) -> int:
@@ -134,7 +131,7 @@ class MixtureGains(GainModel):
 
     def leave_one_out(self) -> Complex128[Tensor, "contacts modes"]:
         """Return the gains at each contact as the measured ones at all other places predict them."""
-        return torch.complex(*self._left_out.mean.chunk(2, dim=1))
+        return complex_of(self._left_out.mean)
 
     def left_out_estimate(self, share: float) -> Gains:
         """Return `point_estimate` at each contact from the measured gains at all other places, for a spread share."""
@@ -158,34 +155,30 @@ class MixtureGains(GainModel):
 
         By the mode's most probable hypothesis; both are sums over the two parts of the gains.
         """
-        sites, count = self.sites(contacts, directions), len(self.contacts)
-        energy, weights = self.mixture.values.square().sum(0), self.mixture.weights
-        best = _both_parts(weights * energy).flatten(0, 1).argmax(0)
-        scale = _both_parts(self.mixture.quadratic) / count
+        sites, weights, values = self.sites(contacts, directions), self.mixture.weights, self.mixture.values
+        best = (weights * values.square().sum(0)).reshape(*weights.shape[:2], 2, -1).sum(2).flatten(0, 1).argmax(0)
         rows, shares = best // weights.shape[1], best % weights.shape[1]
         used, place = torch.unique(rows, return_inverse=True)
         own, cross = (
-            torch.cat([family.between(sites, others, kept) for family, kept in self.families_of(used)])
+            torch.cat([family.between(sites, others) for family in self.families_of(used)])
             for others in (sites, self.training)
         )
         for mode, (row, share) in enumerate(zip(rows.tolist(), shares.tolist(), strict=True)):
             noise = float(self.mixture.noise_variance[share, mode])
-            known = self.mixture.kernels[row] + noise * torch.eye(count, dtype=torch.float64)
-            half = torch.linalg.solve_triangular(torch.linalg.cholesky(known), cross[place[mode]].T, upper=False)
-            size = float(scale[row, share, mode])
+            root = torch.linalg.cholesky(self.mixture.kernels[row] + noise * torch.eye(len(values)).double())
+            half, parts = (
+                torch.linalg.solve_triangular(root, each, upper=False)
+                for each in (cross[place[mode]].T, values[:, [mode, mode + len(best)]])
+            )
+            size = float(parts.square().sum()) / len(values)
             yield size * (own[place[mode]] - half.T @ half), size * noise
 
-    def families_of(self, rows: Int[Tensor, " rows"]) -> Iterator[tuple[KernelFamily, Int[Tensor, " own"]]]:
-        """Yield the families of some of the mixture's kernels, given by their sorted rows, with the families' own rows.
-
-        In the order of the rows.
-        """
-        first = 0
-        for family, kept in zip(self.families, self.kept, strict=True):
-            own = rows[(rows >= first) & (rows < first + len(kept))] - first
-            first += len(kept)
+    def families_of(self, rows: Int[Tensor, " rows"]) -> Iterator[KernelFamily]:
+        """Yield the families of some of the mixture's kernels, given by their sorted rows, with these kernels alone."""
+        for family, first in zip(self.families, accumulate(map(len, self.families), initial=0), strict=False):
+            own = rows[(rows >= first) & (rows < first + len(family))] - first
             if len(own):
-                yield family, kept[own]
+                yield family.take(own)
 
     def with_values(self, values: Complex128[Tensor, "contacts modes"]) -> "MixtureGains":
         """Return the model of other gains at the same contacts, its hypotheses weighed as before."""
@@ -207,7 +200,7 @@ class MixtureGains(GainModel):
     def shares(self) -> Float64[Tensor, "families modes"]:
         """Return the posterior probability of each family: mean over both parts of each mode, by their energy."""
         power = self.mixture.values.square().sum(0).reshape(2, -1).clamp_min(torch.finfo(torch.float64).tiny)
-        rows = torch.split(self.mixture.weights.sum(1), [len(each) for each in self.kept])
+        rows = torch.split(self.mixture.weights.sum(1), list(map(len, self.families)))
         return torch.stack([(each.sum(0).reshape(2, -1) * power / power.sum(0)).sum(0) for each in rows])
 
     def record(self) -> dict[str, Any]:
@@ -220,7 +213,7 @@ class MixtureGains(GainModel):
             "directional": self.directional,
             "spread_share": self.spread_share,
             "families": [family.kind for family in self.families],
-            "kernels": [len(each) for each in self.kept],
+            "kernels": list(map(len, self.families)),
             "bodies": [mode_sizes(family.modes) for family in self._of(Elastic)],
             "symmetries": [[list(group.characters.shape) for group in family.groups] for family in self._of(Symmetric)],
             "features": [family.features.shape[1] for family in self._of(Visual)],
@@ -236,7 +229,7 @@ class MixtureGains(GainModel):
             "values": torch.view_as_real(self.values),
             "measured": torch.view_as_real(self.values if self.measured is None else self.measured),
             "noise_floor": self.mixture.floor,
-            "kernels": torch.cat(self.kept),
+            "kernels": torch.cat([family.kept for family in self.families]),
             "weights": self.mixture.weights,
         }
         for family in self._of(Visual):
@@ -253,11 +246,9 @@ class MixtureGains(GainModel):
         points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
         families, bodies = (like(record[name], [], name) for name in ("families", "bodies"))
         kept = [count_of(each, "kernels") for each in like(record["kernels"], [], "kernels")]
-        unknown = sorted(set(families) - {*_POSITIONAL, *_OF_OBJECT})
-        if unknown or len(families) != len(kept):
-            raise RecordError.expected(
-                f"{len(kept)} of {', '.join((*_POSITIONAL, *_OF_OBJECT))}", families, name="families"
-            )
+        known = (*POSITIONAL, *_OF_OBJECT)
+        if not set(families) <= set(known) or len(families) != len(kept):
+            raise RecordError.expected(f"{len(kept)} of {', '.join(known)}", families, name="families")
         for kind, name in _OF_OBJECT.items():
             given = len(like(record[name], [], name))
             if given != families.count(kind) or (kind != Elastic.kind and given > 1):
@@ -309,22 +300,22 @@ class MixtureGains(GainModel):
                 return Symmetric(training, size, groups, directional=record["directional"])
             if kind == Visual.kind:
                 return Visual(training, size, tensors["points"], tensors["features"])
-            return _POSITIONAL[kind](training, size)
+            return POSITIONAL[kind](training, size)
 
-        sizes = tensors["object_size"].tolist()
-        families = tuple(family_of(kind, size) for kind, size in zip(record["families"], sizes, strict=True))
         kept = torch.split(tensors["kernels"], record["kernels"])
-        for family, rows in zip(families, kept, strict=True):
-            count = len(family.shares)
-            if not 0 <= int(rows.min()) <= int(rows.max()) < count:
-                found = (int(rows.min()), int(rows.max()))
-                raise RecordError.expected(f"0 to {count - 1}", found, name=f"kept {family.kind} kernels")
-        kernels = torch.cat([family.kernels()[rows] for family, rows in zip(families, kept, strict=True)])
+        families, kernels = [], []
+        for kind, size, rows in zip(record["families"], tensors["object_size"].tolist(), kept, strict=True):
+            family, ends = family_of(kind, size), (int(rows.min()), int(rows.max()))
+            if not 0 <= ends[0] <= ends[1] < len(family):
+                raise RecordError.expected(f"0 to {len(family) - 1}", ends, name=f"kept {kind} kernels")
+            families.append(family.take(rows))
+            # Of all of them, as in the fit: of some the rounding differs.
+            kernels.append(family.kernels()[rows])
         values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
-        mixture = KernelMixture(kernels, series_of(values), tensors["noise_floor"], tensors["weights"])
+        mixture = KernelMixture(torch.cat(kernels), series_of(values), tensors["noise_floor"], tensors["weights"])
         # Files of earlier versions have none: their fields were chosen with each hypothesis's mean alone.
         share = record.get("spread_share", 0.0)
-        return cls(tensors["points"], training, families, tuple(kept), mixture, record["directional"], share, measured)
+        return cls(tensors["points"], training, tuple(families), mixture, record["directional"], share, measured)
 
     def _of(self, kind: type[Family]) -> list[Family]:
         """Return the families of a kind."""
@@ -340,9 +331,8 @@ class MixtureGains(GainModel):
 
     @cached_property
     def _coefficients(self) -> list[Float64[Tensor, "_basis contacts series"]]:
-        solved = torch.split(self.mixture.solve(), [len(each) for each in self.kept])
-        rows = zip(self.families, self.kept, solved, strict=True)
-        return [family.coefficients(kept, each) for family, kept, each in rows]
+        solved = torch.split(self.mixture.solve(), list(map(len, self.families)))
+        return [family.coefficients(each) for family, each in zip(self.families, solved, strict=True)]
 
     @cached_property
     def _left_out(self) -> Predictions:
@@ -350,51 +340,51 @@ class MixtureGains(GainModel):
         mixture = self.mixture if self.measured is None else replace(self.mixture, values=series_of(self.measured))
         return mixture.leave_out(self.places)
 
-    def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        own, first, explained = [], 0, torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
-        for family, kept, forms in zip(self.families, self.kept, self._forms, strict=True):
-            own.append(family.own(sites, kept))
-            if forms is None:
-                explained += self.mixture.explained(family.between(sites, self.training, kept), first)
-            else:
-                factors = family.factors(sites, self.training)
-                # Products of two factors, each pair once: half of what the matrices times the factors would take.
-                first_of, second_of = torch.triu_indices(factors.shape[1], factors.shape[1])
-                parts = torch.split(factors, _PRODUCTS)
-                explained += torch.cat([(part[:, first_of] * part[:, second_of]) @ forms for part in parts])
-            first += len(kept)
-        return self.mixture.spread(torch.cat(own), self._mean(sites), explained)
-
-    @cached_property
-    def _forms(self) -> list[Float64[Tensor, "_pairs series"] | None]:
-        """`KernelMixture.explained_forms` of each family: by pairs of factors, those of two different ones doubled.
-
-        None for a family that has fewer kernels than factors, or whose matrices would exceed `_FORM_ENTRIES`: its
-        covariances with the training impacts, kernel by kernel, are cheaper.
-        """
-
-        def form(family: KernelFamily, kept: Int[Tensor, " kept"], first: int) -> Tensor | None:
-            count = family.loadings(self.training, kept[:1]).shape[2]
-            if count >= len(kept) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
-                return None
-            kernels = range(first, first + len(kept))
-            forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, kept[rows]))
-            row, column = torch.triu_indices(count, count)
-            return (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
-
-        firsts = accumulate(map(len, self.kept), initial=0)
-        return [form(*each) for each in zip(self.families, self.kept, firsts, strict=False)]
-
     def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
         pairs = zip(self.families, self._coefficients, strict=True)
         means = [family.mean(sites, self.training, coefficients) for family, coefficients in pairs]
         return torch.stack(means).sum(0)
 
     def _magnitude(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        pairs = list(zip(self.families, self.kept, strict=True))
-        cross = torch.cat([family.between(sites, self.training, kept) for family, kept in pairs])
-        own = torch.cat([family.own(sites, kept) for family, kept in pairs])
+        cross = torch.cat([family.between(sites, self.training) for family in self.families])
+        own = torch.cat([family.own(sites) for family in self.families])
         return self.mixture.mean_magnitude(cross, own, self.spread_share)
+
+    def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
+        own, first, explained = [], 0, torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
+        for family, forms in zip(self.families, self._forms, strict=True):
+            own.append(family.own(sites))
+            if forms is None or not isinstance(family, Elastic):
+                explained += self.mixture.explained(family.between(sites, self.training), first)
+            else:
+                factors = family.factors(sites, self.training)
+                # Products of two factors, each pair once: half of what the matrices times the factors would take.
+                first_of, second_of = torch.triu_indices(factors.shape[1], factors.shape[1])
+                parts = torch.split(factors, _PRODUCTS)
+                explained += torch.cat([(part[:, first_of] * part[:, second_of]) @ forms for part in parts])
+            first += len(family)
+        return self.mixture.spread(torch.cat(own), self._mean(sites), explained)
+
+    @cached_property
+    def _forms(self) -> list[Float64[Tensor, "_pairs series"] | None]:
+        """`KernelMixture.explained_forms` of elastic families: by pairs of factors, those of two different ones twice.
+
+        None for other families, and for one that has fewer kernels than factors or whose matrices would exceed
+        `_FORM_ENTRIES`: its covariances with the training impacts, kernel by kernel, are cheaper.
+        """
+
+        def form(family: KernelFamily, first: int) -> Tensor | None:
+            count = family.shares.shape[1] - 1 + len(self.training)
+            cheap = count < len(family) and self.mixture.values.shape[1] * count**2 <= _FORM_ENTRIES
+            if not isinstance(family, Elastic) or not cheap:
+                return None
+            kernels = range(first, first + len(family))
+            forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, rows))
+            row, column = torch.triu_indices(count, count)
+            return (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
+
+        firsts = accumulate(map(len, self.families), initial=0)
+        return [form(*each) for each in zip(self.families, firsts, strict=False)]
 
     def _batched(self, compute: Callable[[Sites], Tensor], sites: Sites) -> Float64[Tensor, "sites series"]:
         """Return what is computed of sites, in batches whose covariances fit the memory."""
@@ -402,9 +392,5 @@ class MixtureGains(GainModel):
         return torch.cat([compute(sites.take(rows)) for rows in torch.split(torch.arange(len(sites)), size)])
 
 
-def _both_parts(values: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "kernels noises modes"]:
-    return values.reshape(*values.shape[:2], 2, -1).sum(2)
-
-
 def _parts(series: Float64[Tensor, "contacts series"]) -> Float64[Tensor, "contacts modes 2"]:
-    return torch.stack(series.chunk(2, dim=1), dim=2)
+    return torch.view_as_real(complex_of(series))

@@ -6,7 +6,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Complex128, Float, Float64, Inexact
+from jaxtyping import Complex, Complex128, Float, Float64, Inexact
 from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
@@ -34,7 +34,7 @@ class Gains:
     @classmethod
     def of(cls, series: Float64[Tensor, "contacts series"]) -> "Gains":
         """Return gains of series as `series_of` has them, in float32."""
-        return cls(torch.complex(*series.float().chunk(2, dim=1)))
+        return cls(complex_of(series.float()))
 
     @property
     def parts(self) -> Float64[Tensor, "contacts modes 2"]:
@@ -54,6 +54,11 @@ class Gains:
 def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
     """Return the series of complex gains: the real parts of all modes, then the imaginary parts."""
     return torch.cat([values.real, values.imag], dim=1)
+
+
+def complex_of(series: Float[Tensor, "contacts series"]) -> Complex[Tensor, "contacts modes"]:
+    """Return the complex gains whose `series_of` these are."""
+    return torch.complex(*series.chunk(2, dim=1))
 
 
 class GainModel(ABC):

@@ -113,22 +113,21 @@ class PredictiveRatios:
         self, aside: frozenset[int]
     ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, "contacts contacts"]]:
         """Return L_i(S), and L_i(S and j) [i, j]; NaN for contacts in S and for i = j."""
-        rows = self._rest(aside)
+        rows = others(self.sites, aside)
         values, inverse, solved, quadratic = self._solved(rows)
         own, power = torch.diagonal(inverse, dim1=1, dim2=2), values.square().sum(1)
         known = _log_student(solved / own, 1.0 / own, quadratic[:, None], len(rows))
-        single = self.weight @ (known - _log_student(values, torch.ones(()), power[:, None], len(rows)))
+        single, pairs = torch.full((2, len(self.sites), len(self.sites)), torch.nan, dtype=torch.float64)
+        single[rows, 0] = self.weight @ (known - _log_student(values, torch.ones(()), power[:, None], len(rows)))
         shared = inverse / own[:, None]
         variance = 1.0 / (own[..., None] - shared * inverse).clamp_min(_TINY)
         error = (solved[..., None] - shared * solved[:, None]) * variance
         known = _log_student(error, variance, (quadratic[:, None] - solved.square() / own)[:, None], len(rows) - 1)
         less = (power[:, None] - values.square())[:, None]
         unknown = _log_student(values[..., None], torch.ones(()), less, len(rows) - 1)
-        pairs = torch.einsum("s,scd->cd", self.weight, known - unknown).fill_diagonal_(torch.nan)
-        found = torch.full((len(self.values), len(self.values) + 1), torch.nan, dtype=torch.float64)
-        found[rows, -1] = single
-        found[rows[:, None], rows] = pairs
-        return found[:, -1], found[:, :-1]
+        both = torch.einsum("s,scd->cd", self.weight, known - unknown).fill_diagonal_(torch.nan)
+        pairs[rows[:, None], rows] = both
+        return single[:, 0], pairs
 
     def elsewhere(
         self, row: int, aside: frozenset[int], places: Sites, factors: Sequence[float] = (1.0, -1.0)
@@ -137,7 +136,7 @@ class PredictiveRatios:
 
         A factor of -1 is the opposite direction. Without places the recording has the best of the factors, too.
         """
-        rows = self._rest(aside | {row})
+        rows = others(self.sites, aside | {row})
         values, inverse, solved, quadratic = self._solved(rows)
         cross, gain = self._kernels(places, self.sites.take(rows)), self.values[row][:, None]
         mean = (cross @ solved[..., None])[..., 0]
@@ -152,9 +151,6 @@ class PredictiveRatios:
             unplaced = _log_student(scaled, torch.ones(()), power + scaled.square(), len(rows) + 1)
             nowhere.append(self.weight @ unplaced - jacobian)
         return torch.stack(found) - torch.stack(nowhere).amax(0)
-
-    def _rest(self, aside: frozenset[int]) -> Int[Tensor, " rows"]:
-        return torch.tensor([row for row in range(len(self.sites)) if row not in aside])
 
     def _solved(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return y [series, rows], P [series, rows, rows], P y [series, rows] and y' P y [series] of some contacts."""
@@ -173,15 +169,15 @@ class PredictiveRatios:
         return variance.gather(0, (self._best % len(variance))[None])[0]
 
     def _kernels(self, sites: Sites, others: Sites) -> Float64[Tensor, "series sites others"]:
-        return self._each(lambda family, rows: family.between(sites, others, rows))
+        return self._each(lambda family: family.between(sites, others))
 
     def _own(self, sites: Sites) -> Float64[Tensor, "series sites"]:
-        return self._each(lambda family, rows: family.own(sites, rows))
+        return self._each(lambda family: family.own(sites))
 
-    def _each(self, kernels: Callable[[KernelFamily, Int[Tensor, " rows"]], Tensor]) -> Tensor:
+    def _each(self, kernels: Callable[[KernelFamily], Tensor]) -> Tensor:
         """Return what each series's most probable kernel gives."""
         used, series = torch.unique(self._best // len(self.model.mixture.noise_shares), return_inverse=True)
-        return torch.cat([kernels(*each) for each in self.model.families_of(used)])[series]
+        return torch.cat([kernels(each) for each in self.model.families_of(used)])[series]
 
 
 def _log_student(error: Tensor, variance: Tensor, whole: Tensor, count: int) -> Tensor:
@@ -202,9 +198,14 @@ class Credibility:
     without_body: float
 
     @property
+    def gained(self) -> float:
+        """What the body adds."""
+        return self.with_body - self.without_body
+
+    @property
     def credible(self) -> bool:
         """Whether a body may be named: its mode shapes predict what the distances between contacts do not."""
-        return self.with_body >= _INFORMATIVE and self.with_body - self.without_body >= _BODY_GAIN
+        return self.with_body >= _INFORMATIVE and self.gained >= _BODY_GAIN
 
 
 @dataclass(frozen=True)
@@ -260,16 +261,21 @@ class Judgment:
     informative: bool
     """Whether places say enough of the gains to accuse a contact; else all labels may be wrong, or places too far."""
 
+    @property
+    def rows(self) -> frozenset[int]:
+        """Of the outliers."""
+        return frozenset(each.row for each in self.outliers)
+
     def report(self, train: Impacts) -> dict[str, Any]:
         """Return it as plain values, with the possible causes; of the recordings' names, contacts and directions."""
         names, body = train.names, self.credibility
         with_body = body is not None and body.credible
-        figures = {names[each.row]: asdict(each) | {"place": list(each.place)} for each in self.outliers}
-        for each in figures.values():
-            del each["row"]
+        figures = {names[each.row]: asdict(each) for each in self.outliers}
         return {
             "outliers": {names[each.row]: each.describe(train, with_body=with_body) for each in self.outliers},
-            "outlier_figures": figures,
+            "outlier_figures": {
+                name: {key: value for key, value in each.items() if key != "row"} for name, each in figures.items()
+            },
             "excluded": [],
             "credibility": None if body is None else asdict(body) | {"credible": body.credible},
         }
@@ -284,7 +290,7 @@ def assess_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites
     credibility = None
     if elastic is not None:
         used = _search(elastic, sites, measured)
-        model = plain(_others(sites, used.aside), WIDE_NOISE_SHARES)
+        model = plain(others(sites, used.aside), WIDE_NOISE_SHARES)
         credibility = Credibility(used.mean(), replace(used, model=model).mean())
     if credibility is None or not credibility.credible:
         used = _search(plain, sites, measured)
@@ -342,7 +348,7 @@ def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> PredictiveRatios
     aside: frozenset[int] = frozenset()
     enough = len(torch.unique(places_of(sites.points))) >= _MIN_PLACES
     for _ in range(_ROUNDS):
-        ratios = PredictiveRatios(fit(_others(sites, aside), WIDE_NOISE_SHARES), sites, measured)
+        ratios = PredictiveRatios(fit(others(sites, aside), WIDE_NOISE_SHARES), sites, measured)
         before, aside = aside, set_aside(ratios, aside) if enough else aside
         if aside == before:
             break
@@ -371,7 +377,8 @@ def _located(search: PredictiveRatios, row: int, places: Sites, mean: float) -> 
     return Outlier(row, own, (x, y, z), ratio, distance, float(ratios[1, row]) >= needed, level_db if better else 0.0)
 
 
-def _others(sites: Sites, aside: frozenset[int]) -> Int[Tensor, " rows"]:
+def others(sites: Sites, aside: frozenset[int]) -> Int[Tensor, " rows"]:
+    """Return the rows of the contacts that are not set aside."""
     return torch.tensor([row for row in range(len(sites)) if row not in aside])
 
 

@@ -41,7 +41,7 @@ class Symmetric(KernelFamily):
         super().__init__(reference, size)
         self.groups, self._directional = tuple(groups), directional
         self._bases = [ThinPlate(self._orbit(group), size) for group in groups]
-        kernels = len(self._bases[0].shares)
+        kernels = len(self._bases[0])
         one = torch.eye(kernels, dtype=torch.float64)
         characters = [group.characters for group in groups]
         shares = [each / each.shape[1] for each in characters]
@@ -64,10 +64,10 @@ class Symmetric(KernelFamily):
         """Return the kernels between the impacts and each image of the others, group by group."""
         return torch.cat(list(self._moved(sites, others)))
 
-    def between(self, sites: Sites, others: Sites, kept: Int[Tensor, " kept"]) -> Float64[Tensor, "kept sites others"]:
-        """Return some kernels between two sets of impacts, motion by motion: all images at once take much memory."""
-        found = torch.zeros(len(kept), len(sites), len(others), dtype=torch.float64)
-        shares = torch.split(self.shares[kept], len(self._bases[0].shares), dim=1)
+    def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
+        """Return the kernels between two sets of impacts, motion by motion: all images at once take much memory."""
+        found = torch.zeros(len(self), len(sites), len(others), dtype=torch.float64)
+        shares = torch.split(self.shares, len(self._bases[0]), dim=1)
         for share, moved in zip(shares, self._moved(sites, others), strict=True):
             found += torch.einsum("hb,bso->hso", share, moved)
         return found
@@ -99,7 +99,7 @@ class Symmetric(KernelFamily):
     def _moved(self, sites: Sites, others: Sites) -> Iterator[Float64[Tensor, "kernels sites others"]]:
         for group, base in zip(self.groups, self._bases, strict=True):
             for image in _images(group, others, directional=self._directional):
-                yield base.between(sites, image, torch.arange(len(base.shares)))
+                yield base.between(sites, image)
 
     def _orbit(self, group: Group) -> Sites:
         images = list(_images(group, self.reference, directional=self._directional))
