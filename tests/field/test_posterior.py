@@ -11,7 +11,7 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import FitError
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.next_contacts import unedited_mixture
+from avmsf.field.next_contacts import suggest
 from avmsf.field.posterior import (
     coverage,
     fitted_mixture,
@@ -256,7 +256,7 @@ def test_what_cannot_be_said_is_refused() -> None:
     with raises(FitError, name="level", value=1.0):
         spectrum_band(field, contacts[0], level=1.0)
     with raises(FitError, name="field", value="edited"):
-        unedited_mixture(adjust_modes(field))
+        suggest(adjust_modes(field))
     with raises(FitError, name="gains", value=[6, 3]):
         coverage(field, contacts, torch.view_as_complex(values[:, :3].contiguous()))
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf.errors import ArrayError
+from avmsf.errors import ArrayError, AvmsfError
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """A tensor, a numpy array, or nested lists of numbers."""
@@ -42,11 +42,15 @@ def as_directions(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, 
     return torch.where(kept, vectors, vectors / length)
 
 
-def as_count(value: SupportsIndex, name: str) -> int:
-    """Return a whole number of 1 or more. Raises ArrayError for another."""
-    count = operator.index(value) if hasattr(value, "__index__") and not isinstance(value, bool) else 0
+def as_count(value: SupportsIndex, name: str, *, raising: type[AvmsfError] = ArrayError) -> int:
+    """Return a whole number of 1 or more. Raises `raising` for another."""
+    try:
+        count = 0 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        # Arrays have __index__, but only those of one whole number give one.
+        count = 0
     if count < 1:
-        raise ArrayError.expected("a whole number of 1 or more", value, name=name)
+        raise raising.expected("a whole number of 1 or more", value, name=name)
     return count
 
 

@@ -13,7 +13,7 @@ from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.suggest import PICTURE, TABLE, Options
 from avmsf.cli.printing import console, next_step, print_json, say, table
 from avmsf.cli.writing import write_text
-from avmsf.field.next_contacts import Suggestions, suggest, unedited_mixture
+from avmsf.field.next_contacts import Suggestions, suggest
 from avmsf.field.posterior import relative_gain_std
 from avmsf.field.store import load
 from avmsf.plotting.pictures import save_picture
@@ -26,7 +26,7 @@ def run(options: Options) -> int:
     """Suggest, print and draw."""
     paths = {} if options.output is None else {name: options.output / name for name in (TABLE, PICTURE)}
     field = load(options.field)
-    gains = unedited_mixture(field)
+    gains = field.gain_field
     names: tuple[str, ...] | None = None
     given = False
     doing("choosing the contacts")

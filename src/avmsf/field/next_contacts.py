@@ -1,7 +1,6 @@
 """Where to strike next: the places whose recordings would reduce the expected error of the whole field most."""
 
 import math
-import operator
 from dataclasses import dataclass
 from typing import SupportsIndex
 
@@ -10,7 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_vectors, short_repr
+from avmsf._utils.arrays import ArrayLike, as_count, as_vectors, short_repr
 from avmsf._utils.progress import working
 from avmsf.errors import FitError
 from avmsf.field.gains.kernels import Sites
@@ -78,8 +77,12 @@ def suggest(
     Raises FitError for gains without a posterior, unfit arguments, fewer candidates than contacts asked for, places
     none of which a hammer gets to, and `unseen` without a body.
     """
-    count, given = _whole(count), None if candidates is None else as_vectors(candidates, "candidates").double()
-    gains = unedited_mixture(field)
+    count = as_count(count, "count", raising=FitError)
+    given = None if candidates is None else as_vectors(candidates, "candidates").double()
+    if isinstance(field.gain_field, ScaledGains):
+        wanted, advice = "a field as fitted", "give the unedited field"
+        raise FitError.expected(wanted, "edited", got="an edited one", name="field", advice=advice)
+    gains = fitted_mixture(field)
     if unseen and gains.body is None:
         wanted, advice = "a field with the object's surface", "leave unseen out, or give candidates"
         raise FitError.expected(wanted, True, got="one without", name="unseen", advice=advice)
@@ -104,7 +107,7 @@ def suggest(
             kept = kept[farthest_points(pool[kept], min(most, len(kept)))].sort().values
         sites = gains.sites(pool[kept], None if directions is None else directions[kept])
         error = _ExpectedError(field, gains, points, sites)
-        before = float(error.map().square().mean().sqrt())
+        before = error.total()
         rows, after = _chosen(error, sites, allowed[kept], count, same)
     return Suggestions(
         sites.points[rows],
@@ -117,57 +120,47 @@ def suggest(
     )
 
 
-def unedited_mixture(field: SoundField) -> MixtureGains:
-    """Return the field's gain model, to plan measurements for. Raises as `fitted_mixture`, and for an edited field."""
-    if isinstance(field.gain_field, ScaledGains):
-        wanted, advice = "a field as fitted", "give the unedited field"
-        raise FitError.expected(wanted, "edited", got="an edited one", name="field", advice=advice)
-    return fitted_mixture(field)
-
-
 class _ExpectedError:
     """Posterior variances and covariances, mode by mode, while contacts are added that have not been measured."""
 
     def __init__(
         self, field: SoundField, gains: MixtureGains, points: Float64[Tensor, "points 3"], candidates: Sites
     ) -> None:
-        self.points, self.candidates = len(points), len(candidates)
-        self.noise: list[float] = []
-        self.shared: list[Float64[Tensor, "places candidates"]] = []
-        """Covariances between all places and the candidates, which are the last of the places."""
+        self.points = len(points)
+        self.modes: list[tuple[Float64[Tensor, "places candidates"], float]] = []
+        """Of each mode the covariances between all places and the candidates, the last of these, and the noise."""
         self.variance = torch.zeros(len(points), dtype=torch.float64)
         """At the points, all modes together."""
         places = torch.cat([points, candidates.points])
         directions = torch.cat([gains.sites(points).directions, candidates.directions])
-        weights = (1.0 / (4.0 * field.bank.damping.double())).tolist()
+        weights = (1.0 / (4.0 * field.bank.damping)).tolist()
         for weight, (covariance, noise) in zip(weights, gains.covariances(places, directions), strict=True):
-            self.variance = self.variance + weight * torch.diagonal(covariance)[: self.points].clamp_min(0.0)
-            self.shared.append(weight * covariance[:, -self.candidates :])
-            self.noise.append(weight * noise)
-        expected = float(energy_of(field, gains.predict(points.float()).parts).mean())
-        self.energy = expected + float(self.variance.mean())
+            self.variance += weight * torch.diagonal(covariance)[: self.points].clamp_min(0.0)
+            self.modes.append((weight * covariance[:, self.points :], weight * noise))
+        self.energy = float(energy_of(field, gains.predict(points.float()).parts).mean() + self.variance.mean())
 
-    def map(self) -> Float64[Tensor, " points"]:
-        """Return the expected relative error at each of the points."""
-        return (self.variance / self.energy).sqrt()
+    def total(self) -> float:
+        """Return the expected relative error over all points."""
+        return math.sqrt(float(self.variance.mean()) / self.energy)
 
     def reductions(self) -> Float64[Tensor, " candidates"]:
         """Return by how much each candidate would lower the variance, summed over the points."""
-        total = torch.zeros(self.candidates, dtype=torch.float64)
-        for shared, noise in zip(self.shared, self.noise, strict=True):
-            total += shared[: self.points].square().sum(0) / self._measured(shared, noise)
-        return total
+        reduced = (
+            shared[: self.points].square().sum(0) / self._measured(shared, noise) for shared, noise in self.modes
+        )
+        return torch.stack(list(reduced)).sum(0)
 
     def add(self, row: int) -> None:
         """Take a candidate as measured."""
-        for shared, noise in zip(self.shared, self.noise, strict=True):
+        for shared, noise in self.modes:
             column = shared[:, row].clone()
             measured = self._measured(shared, noise)[row]
             self.variance = (self.variance - column[: self.points].square() / measured).clamp_min(0.0)
-            shared -= torch.outer(column, column[-self.candidates :]) / measured
+            shared -= torch.outer(column, column[self.points :]) / measured
 
     def _measured(self, shared: Tensor, noise: float) -> Float64[Tensor, " candidates"]:
-        own = torch.diagonal(shared[-self.candidates :]).clamp_min(0.0)
+        """Return the variance of a measured gain at each candidate."""
+        own = torch.diagonal(shared[self.points :]).clamp_min(0.0)
         return (own + noise).clamp_min(torch.finfo(torch.float64).tiny)
 
 
@@ -183,11 +176,10 @@ def _chosen(
         rows.append(int(torch.where(allowed, error.reductions(), -math.inf).argmax()))
         error.add(rows[-1])
         allowed = allowed & ((sites.points - sites.points[rows[-1]]).norm(dim=1) > same)
-        after.append(float(error.map().square().mean().sqrt()))
+        after.append(error.total())
     if len(rows) < count:
-        raise FitError.expected(
-            f"{count} different positions or more", len(rows), name="candidates", advice="ask for fewer"
-        )
+        wanted = f"{count} different positions or more"
+        raise FitError.expected(wanted, len(rows), name="candidates", advice="ask for fewer")
     return rows, after
 
 
@@ -213,40 +205,22 @@ def _reachable(
     return torch.from_numpy(places[reached]), None if axes is None else -torch.from_numpy(axes[reached])
 
 
-def _whole(count: SupportsIndex) -> int:
-    """Return a number of contacts. Raises FitError for what is no whole number above 0."""
-    try:
-        found = 0 if isinstance(count, bool) else operator.index(count)
-    except TypeError:
-        # Arrays have __index__, but only those of one whole number give one.
-        found = 0
-    if found < 1:
-        raise FitError.expected("a whole number of 1 or more", count, name="count")
-    return found
-
-
 def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates: Tensor | None) -> None:
     if directions is None:
         return
-    if candidates is None:
-        raise FitError("directions: expected candidates with them, got none; give candidates", name="directions")
-    if len(directions) != len(candidates):
-        raise FitError.expected(f"one for each of the {len(candidates)} candidates", len(directions), name="directions")
+    if candidates is None or len(directions) != len(candidates):
+        count = None if candidates is None else len(directions)
+        wanted = "candidates with them" if candidates is None else f"one for each of the {len(candidates)} candidates"
+        raise FitError.expected(wanted, count, name="directions", advice="give both")
     zero = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
     if zero:
-        advice = "give the direction in which the hammer moves"
-        raise FitError.expected(
-            "a length above 0", directions[zero[0]].tolist(), row=zero[0], name="directions", advice=advice
-        )
+        found, advice = directions[zero[0]].tolist(), "give the direction in which the hammer moves"
+        raise FitError.expected("a length above 0", found, row=zero[0], name="directions", advice=advice)
 
 
 def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Float64[Tensor, "points 3"]) -> None:
     if not len(candidates):
         raise FitError.expected("1 position or more", 0, got="none", name="candidates", advice="leave it out")
-    if not bool(torch.isfinite(candidates).all()):
-        row = int(torch.nonzero(~torch.isfinite(candidates).all(1))[0])
-        found = candidates[row].tolist()
-        raise FitError.expected("finite coordinates in meters", found, row=row, name="candidates")
     distance = torch.from_numpy(cKDTree(surface.numpy()).query(candidates.numpy())[0])
     worst = int(distance.argmax())
     if float(distance[worst]) > _OFF * float((surface.amax(0) - surface.amin(0)).norm()):

@@ -14,10 +14,11 @@ from torch import Tensor
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import FitError
 from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import Gains
 from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.modes import turned_like
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.residual_noise import interpolated
 
 LEVEL = 0.9
 """Default probability of credible intervals."""
@@ -27,8 +28,6 @@ _DRAWS = 200
 """Sounds that a band is drawn from."""
 _BANDS = 400
 """Bands of a spectrum, evenly spaced up to half the sample rate."""
-_BATCH = 16
-"""Modes whose spectra are made at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +130,11 @@ def spectrum_band(
     that is not between 0 and 1.
     """
     _expect_level(level)
-    contacts, along = contact[None], None if direction is None else direction[None]
-    mean, spread = (each[0] for each in posterior(field, contacts, along))
+    mean, spread = (each[0] for each in posterior(field, contact[None], None if direction is None else direction[None]))
     generator = generator_of(seed)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
-    spectra = torch.zeros(_DRAWS, field.samples // 2 + 1, dtype=torch.complex128)
-    for modes in torch.split(torch.nonzero(field.audible).flatten(), _BATCH):
-        spectra += torch.einsum("amd,mdf->af", drawn[:, modes].to(spectra), _spectra(field, modes))
-    place = torch.linspace(0, len(field.residual.magnitude) - 1, spectra.shape[1])
-    left = place.floor().long().clamp_max(len(field.residual.magnitude) - 2)
-    noise = torch.lerp(field.residual.magnitude[left], field.residual.magnitude[left + 1], place - left)
-    power = spectra.abs().square() + field.samples * noise.double().square()
+    power = torch.fft.rfft(field.modal_sounds(Gains(torch.view_as_complex(drawn)), field.samples)).abs().square()
+    power += field.samples * interpolated(field.residual.magnitude, power.shape[1]).double().square()
     edges = torch.linspace(0, power.shape[1], min(_BANDS, power.shape[1]) + 1).round().long()
     bands = torch.stack([power[:, first:last].mean(1) for first, last in pairwise(edges.tolist())], dim=1)
     tail = (1.0 - level) / 2.0
@@ -176,23 +169,9 @@ def coverage(
     spread = (deviation.square() + scale * model.noise().square()).sqrt()
     parts = torch.view_as_real(turned_like(gains, torch.view_as_complex(predicted.contiguous())))
     within = (parts - predicted).abs() <= NormalDist().inv_cdf(0.5 + level / 2.0) * spread
-    energy = (
-        scale * torch.view_as_real(model.values).square().mean(0) / (4.0 * field.bank.damping.double())[:, None]
-    ).expand_as(parts)
+    power = scale * torch.view_as_real(model.values).square().mean(0)
+    energy = (power / (4.0 * field.bank.damping[:, None])).expand_as(parts)
     return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
-
-
-def _spectra(field: SoundField, modes: Tensor) -> Tensor:
-    """Return the spectrum of each mode by itself, [modes, 2, frequencies], of a gain of one in either part."""
-    one = torch.eye(len(modes), dtype=torch.complex128)
-    sounds = [
-        synthesize(
-            gains, field.bank.frequency[modes], field.bank.damping[modes], field.phase[modes],
-            samples=field.samples, sample_rate=field.sample_rate,
-        )
-        for gains in (one, 1j * one)
-    ]  # fmt: skip
-    return torch.fft.rfft(torch.stack(sounds, dim=1))
 
 
 def _expect_level(level: float) -> None:

@@ -79,7 +79,7 @@ def shape_noise(
     frequencies = length // 2 + 1
     options: dict[str, Any] = {"dtype": torch.complex64, "device": generator.device}
     white = torch.randn(contacts, frequencies, generator=generator, **options).to(magnitude.device)
-    return torch.fft.irfft(white * _interpolated(magnitude, frequencies), n=length, norm="ortho")[:, :samples]
+    return torch.fft.irfft(white * interpolated(magnitude, frequencies), n=length, norm="ortho")[:, :samples]
 
 
 def low_fluctuation_noise(magnitude: Float[Tensor, " bins"], *, samples: int) -> Float[Tensor, " samples"]:
@@ -90,12 +90,12 @@ def low_fluctuation_noise(magnitude: Float[Tensor, " bins"], *, samples: int) ->
     shorter one. Differentiable in `magnitude`.
     """
     sequence = white_sequence().to(magnitude)
-    spectrum = torch.fft.rfft(sequence) * _interpolated(magnitude, len(sequence) // 2 + 1)
+    spectrum = torch.fft.rfft(sequence) * interpolated(magnitude, len(sequence) // 2 + 1)
     period = torch.fft.irfft(spectrum, n=len(sequence))
     return period.repeat(math.ceil(samples / len(sequence)))[:samples]
 
 
-def _interpolated(magnitude: Float[Tensor, " bins"], frequencies: int) -> Float[Tensor, " frequencies"]:
+def interpolated(magnitude: Float[Tensor, " bins"], frequencies: int) -> Float[Tensor, " frequencies"]:
     """Return the magnitude at evenly spaced frequencies from 0 Hz to half the sample rate, linear between bins."""
     place = torch.linspace(0, len(magnitude) - 1, frequencies, device=magnitude.device)
     left = place.long().clamp_max(len(magnitude) - 2)
