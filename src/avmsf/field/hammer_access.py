@@ -17,6 +17,7 @@ from avmsf.mesh.rays import RayCaster
 
 HAMMER_DIAMETER = 0.01
 """Meters. A pencil has 7 mm, the head of the usual modal hammer (PCB 086C03) 16 mm and its tip 6 mm."""
+_RADIUS = 0.5 * HAMMER_DIAMETER
 MAX_TILT_DEGREES = 45.0
 """Angle between the hammer and the normal beyond which more of the force goes along the surface than into it."""
 MAX_DISTANCE = 0.02
@@ -36,15 +37,12 @@ class MeshAccess:
     """Judges places by the triangles of a closed surface, or of an open one that is seen from outside."""
 
     def __init__(self, vertices: Float64[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-        self._middle, self._size = (low + high) / 2, float(np.linalg.norm(high - low))
-        self._triangles = ((vertices - self._middle) / self._size)[faces]
-        crosses = np.cross(self._triangles[:, 1] - self._triangles[:, 0], self._triangles[:, 2] - self._triangles[:, 0])
+        self._size, triangles = float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices[faces]
+        crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         areas = np.linalg.norm(crosses, axis=1)
         solid = areas > 0
-        self._triangles, self._normals = self._triangles[solid], crosses[solid] / areas[solid, None]
+        self._triangles, self._normals = triangles[solid], crosses[solid] / areas[solid, None]
         self._closest, self._rays = ClosestPoints(self._triangles), RayCaster(self._triangles)
-        self._radius = 0.5 * HAMMER_DIAMETER / self._size
 
     def __call__(
         self, places: Float64[np.ndarray, "places 3"]
@@ -53,17 +51,17 @@ class MeshAccess:
 
         The axis is a unit vector away from the surface: of those that lie clear the one nearest to the normal.
         """
-        found = self._closest((places - self._middle) / self._size)
+        found, gap = self._closest(places), _GAP * self._size
         feet = (self._triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)
         normals = self._normals[found.rows]
-        tips = feet + (self._radius + _GAP) * normals
-        open_to = (found.distances <= MAX_DISTANCE) & (self._free(feet + _GAP * normals, normals) > self._radius)
+        tips, near = feet + (_RADIUS + gap) * normals, found.distances <= MAX_DISTANCE * self._size
+        open_to = near & (self._free(feet + gap * normals, normals) > _RADIUS)
         reached, used = np.zeros(len(places), dtype=bool), normals.copy()
         for axes in _axes(normals):
             left = np.flatnonzero(open_to & ~reached)
             reached[left] = self._clear(tips[left], axes[left])
             used[left] = axes[left]
-        return reached, feet * self._size + self._middle, used
+        return reached, feet, used
 
     def _clear(
         self, tips: Float64[np.ndarray, "rods 3"], axes: Float64[np.ndarray, "rods 3"]
@@ -74,8 +72,8 @@ class MeshAccess:
         for turn in range(_SIDES):
             angle = 2 * math.pi * turn / _SIDES
             outward = math.cos(angle) * one + math.sin(angle) * other
-            clear &= self._free(tips, outward) > self._radius
-            clear &= np.isinf(self._free(tips + self._radius * outward, axes))
+            clear &= self._free(tips, outward) > _RADIUS
+            clear &= np.isinf(self._free(tips + _RADIUS * outward, axes))
         return clear
 
     def _free(
@@ -97,7 +95,7 @@ class PointAccess:
         self._tree = cKDTree(self._points)
         self._count = min(_NEIGHBORS + 1, len(self._points))
         apart = self._tree.query(self._points, k=self._count)[0].reshape(len(self._points), -1)[:, -1]
-        self._radius = max(0.5 * HAMMER_DIAMETER, float(np.median(apart)))
+        self._radius = max(_RADIUS, float(np.median(apart)))
 
     def __call__(
         self, places: Float64[np.ndarray, "places 3"]
