@@ -10,12 +10,12 @@ from pathlib import Path
 
 import torch
 
+from avmsf.baselines.diffsound.body_family import BodyFamily, body_family
 from avmsf.baselines.diffsound.material_fit import MODES, DampingCurve, clip_spectra, fit_material
 from avmsf.capture import Capture, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.cli.heartbeat import beating
 from avmsf.errors import EvaluationError
-from avmsf.fem.body_family import BodyFamily, body_family
 from avmsf.fem.material import Material, material_named
 from avmsf.mesh import Surface
 from avmsf.modal.modes import ModalBank

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from avmsf.baselines.diffsound import material_fit
+from avmsf.baselines.diffsound.body_family import BodyFamily, body_family
 from avmsf.baselines.diffsound.losses import ClipSpectra, divergence
 from avmsf.baselines.diffsound.material_fit import (
     DampingCurve,
@@ -21,7 +22,6 @@ from avmsf.baselines.diffsound.material_fit import (
 from avmsf.baselines.diffsound.renderer import DiffSound, leveled
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError, SimulationError
-from avmsf.fem.body_family import BodyFamily, body_family
 from avmsf.fem.isotropic import isotropic_modes
 from avmsf.fem.material import GLASS
 from avmsf.mesh.surface import Surface

@@ -11,6 +11,7 @@ import pytest
 import soundfile
 import torch
 
+from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError, SceneError
@@ -21,7 +22,6 @@ from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Renderer, Task, report_of
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.isotropic import isotropic_modes

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import torch
 
+from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.capture import Capture, write_capture
 from avmsf.errors import SceneError, SimulationError
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.mesh import Surface

@@ -12,7 +12,8 @@ from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
 from avmsf.fem import tetrahedra, walls
-from avmsf.fem.remeshing import boundary_edges, coarsened, remeshed, weld
+from avmsf.fem.meshing import weld
+from avmsf.fem.remeshing import boundary_edges, coarsened, remeshed
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import shell

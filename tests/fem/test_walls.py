@@ -11,8 +11,7 @@ from avmsf.fem.body_meshes import count_dofs, filled_solid
 from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
-from avmsf.fem.mesh_check import checked
-from avmsf.fem.remeshing import weld
+from avmsf.fem.meshing import checked, weld
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 from avmsf.simulate.shapes import make_shape

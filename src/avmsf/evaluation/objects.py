@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf._utils.processes import NO_LIMIT
+from avmsf.baselines.diffsound.body_family import BodyFamily, body_family
 from avmsf.baselines.diffsound.material_fit import MODES as DIFFSOUND_MODES
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
@@ -23,7 +24,6 @@ from avmsf.evaluation.registry import Protocol
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features
-from avmsf.fem.body_family import BodyFamily, body_family
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction

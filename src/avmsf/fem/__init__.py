@@ -6,7 +6,7 @@ undamped natural frequencies, and mass-normalized shapes on the surface, of whic
 Core types: `Solid`, `Material`, `ElasticModes`, `CandidateBodies`, of which each body is a hypothesis of what lies
 behind a surface, `Vibration`, damped modes.
 
-- Meshes: `mesh_check` repairs a surface (generalized cross-validation against noise, quadric decimation), `remeshing`
+- Meshes: `meshing` repairs a surface (generalized cross-validation against noise, quadric decimation), `remeshing`
   splits and collapses edges, `tetrahedra` fills by fTetWild (Hu et al. 2020), `walls` makes layers of prisms along thin
   walls, where tetrahedra lock; `body_meshes` does so with a wanted number of degrees of freedom.
 - Modes: quadratic tetrahedra (`elements`), block Lanczos (`eigen`) beside the motions of a rigid body. `isotropic` has
@@ -14,7 +14,6 @@ behind a surface, `Vibration`, damped modes.
 - An object that is partly known: `candidate_bodies` computes bodies by thickness and by where they are held
   (`supports`), `thickness` searches the wall's by evidence, `perturbation` has first-order changes of stiffness and
   mass over Karhunen-Loeve fields, and `updating` finds those that measured gains ask for (Fox and Kapoor 1968).
-  `body_family` interpolates frequencies in the thickness.
 - Sound: `damping` (Rayleigh's, or any symmetric matrix) and `radiation` (simple sources with dipoles).
 
 Start reading with `elastic_modes`, then `candidate_bodies`.

@@ -11,22 +11,32 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
+from threading import Lock
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from avmsf._utils.caching import key_of, once, source_digest
 from avmsf._utils.compiled import lane_count
 from avmsf.errors import SimulationError
-from avmsf.fem.body_meshes import MIN_DOFS, BodyMeshes, HollowShape, count_dofs, expect_memory, millimeters
+from avmsf.fem.body_meshes import (
+    MIN_DOFS,
+    HollowShape,
+    count_dofs,
+    expect_memory,
+    filled_solid,
+    shape_solid,
+    wall_solids,
+)  # fmt: skip
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import MAX_FREQUENCY_ERROR, NOMINAL, Material
+from avmsf.fem.meshing import CheckedSurface, checked, millimeters
 from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Support, supports_of
 from avmsf.mesh.surface import Surface
@@ -48,6 +58,7 @@ _SHAPE_THICKNESSES = 5
 """Thicknesses that are computed at first of a shape whose wall is not known."""
 _MEANS = frozenset({"memory", "timeout", "pytetwild"})
 """Names of errors that are no fault of a surface or its wall."""
+_Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,13 +167,15 @@ class SurfaceBodies(CandidateBodies):
             if each is not None and not 0 < each < float("inf"):
                 wanted = "more than 0 m, or None for a solid body"
                 raise SimulationError.expected(wanted, each, row=row, name="thicknesses")
-        self._log = log or (lambda message: None)
-        self._meshes = BodyMeshes(surface, log=self._log)
+        self.shape = None if isinstance(surface, Surface) else surface
+        """The shape, where it is no surface."""
         self.supports, self.dofs = supports, dofs
+        self._surface, self._digest, self._log = surface, surface.digest(), log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
-        self._coarse_dofs = min(dofs, COARSE_DOFS if self._meshes.shape is None else COARSE_WALL_DOFS)
+        self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)
         self._coarse_only = set[tuple[float | None, Support | None]]()
-        self._solid, self._solved = once(self._make_solid), once(self._solve)
+        self._solved, self.solid = once(self._solve), once(self._make_solid)
+        self._walls, self._remeshing = once(lambda dofs: wall_solids(self.checked, dofs)), Lock()
 
     @cached_property
     def bodies(self) -> tuple[CandidateBody, ...]:  # type: ignore[override]
@@ -178,6 +191,12 @@ class SurfaceBodies(CandidateBodies):
     def searches_thickness(self) -> bool:  # type: ignore[override]
         """Whether there are several walls of no stated thickness."""
         return self._thicknesses is None and sum(body.thickness is not None for body in self.bodies) > 1
+
+    @cached_property
+    def checked(self) -> CheckedSurface:
+        """What was seen of the object, repaired. Raises SimulationError as `meshing.checked`."""
+        seen = self._surface if isinstance(self._surface, Surface) else self._surface.as_seen()
+        return checked(seen, log=self._log)
 
     def modes(
         self,
@@ -221,7 +240,7 @@ class SurfaceBodies(CandidateBodies):
         """
         few, fine = self._coarse_dofs, self.dofs <= self._coarse_dofs
         try:
-            supports = supports_of(SecondOrder.of(self._solid(body.thickness, few)))
+            supports = supports_of(SecondOrder.of(self.solid(body.thickness, few)))
             free = self.modes(body.thickness, dofs=few, perturbed=fine)
         except SimulationError as error:
             self._log(f"{body.name}: no supports tested: {error}")
@@ -232,7 +251,7 @@ class SurfaceBodies(CandidateBodies):
                 held = self.modes(body.thickness, dofs=few, support=support, perturbed=fine)
                 bodies.append(CandidateBody(body.thickness, held, fine, support))
             except SimulationError as error:
-                self._log(_without(f"{body.name}, {support.name}: {error}"))
+                self._log_refused(f"{body.name}, {support.name}: {error}")
         return bodies
 
     def with_thickness(self, thickness: float) -> CandidateBody | None:
@@ -243,53 +262,57 @@ class SurfaceBodies(CandidateBodies):
         try:
             return self._body(thickness, fine=False)
         except SimulationError as error:
-            self._log(_without(f"{body_name(thickness)}: {error}"))
+            self._log_refused(f"{body_name(thickness)}: {error}")
             return None
 
     @cached_property
     def _found(self) -> tuple[tuple[CandidateBody, ...], Mapping[float | None, str]]:
         """The bodies, and why others cannot be had."""
-        guessed = self._thicknesses is None
-        refused: dict[float | None, SimulationError] = {}
-        possible: list[float | None] = []
-        for thickness in dict.fromkeys(self._guesses() if self._thicknesses is None else self._thicknesses):
-            try:
-                self._meshes.expect_possible(thickness, guessed=guessed)
-                possible.append(thickness)
-            except SimulationError as error:
-                refused[thickness] = error
+        errors: dict[float | None, SimulationError] = {}
 
-        def attempt(thickness: float | None) -> CandidateBody | SimulationError:
+        def attempt(make: Callable[[float | None], _Made], thickness: float | None) -> _Made | None:
             try:
-                return self._body(thickness, fine=len(possible) == 1)
+                return make(thickness)
             except SimulationError as error:
-                return error
+                errors[thickness] = error
+                return None
 
+        wanted = list(dict.fromkeys(self._guesses() if self._thicknesses is None else self._thicknesses))
+        for thickness in wanted:
+            attempt(self._expect_possible, thickness)
+        possible = [each for each in wanted if each not in errors]
+        make = partial(attempt, partial(self._body, fine=len(possible) == 1))
         # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
         with ThreadPoolExecutor(lane_count()) as pool:
-            found = dict(zip(possible, pool.map(attempt, possible), strict=True))
-        bodies = [each for each in found.values() if isinstance(each, CandidateBody)]
-        refused |= {thickness: each for thickness, each in found.items() if isinstance(each, SimulationError)}
+            bodies = [body for body in pool.map(make, possible) if body is not None]
+        refused = {each: errors[each] for each in wanted if each in errors}
         reasons = _grouped(refused)
         if not bodies:
             causes = {str(error.name) for error in refused.values()}
-            other = "give the wall thickness in meters" if guessed else "give another wall thickness, or none"
             name = min(causes) if causes <= _MEANS else "surface"
-            wanted, got = "a surface with a finite-element model", f"none ({'; '.join(reasons)})"
-            advice = f"repair the mesh, or {other}"
-            raise SimulationError.expected(wanted, reasons, got=got, name=name, advice=advice)
+            other = "another wall thickness, or none" if self._thicknesses else "the wall thickness in meters"
+            wanted_body, got = "a surface with a finite-element model", f"none ({'; '.join(reasons)})"
+            advice = f"repair the mesh, or give {other}"
+            raise SimulationError.expected(wanted_body, reasons, got=got, name=name, advice=advice)
         for reason in reasons:
-            self._log(_without(reason))
+            self._log_refused(reason)
         if len(bodies) == 1:
             bodies = [self.refined(bodies[0])]
         return tuple(bodies), MappingProxyType({thickness: str(error) for thickness, error in refused.items()})
 
     def _guesses(self) -> list[float | None]:
         """Return the thicknesses to try; None for what the surface encloses."""
-        if self._meshes.shape is None:
-            return [None, *(ratio * self._meshes.checked.mesh.scale for ratio in THICKNESS_RATIOS)]
-        between = self._meshes.shape.thickness_range
+        if self.shape is None:
+            return [None, *(ratio * self.checked.mesh.scale for ratio in THICKNESS_RATIOS)]
+        between = self.shape.thickness_range
         return [None] if between is None else [None, *np.geomspace(*between, _SHAPE_THICKNESSES).tolist()]
+
+    def _expect_possible(self, thickness: float | None) -> None:
+        """Raise SimulationError where a body is out of the question before tetrahedra are made."""
+        if thickness is None:
+            self.checked.expect_filling()
+        else:
+            self.checked.expect_wall(thickness, guessed=self._thicknesses is None and self.shape is None)
 
     def _body(self, thickness: float | None, *, fine: bool) -> CandidateBody:
         """Return a free body with all degrees of freedom, or with few of them where it need not be fine."""
@@ -299,7 +322,7 @@ class SurfaceBodies(CandidateBodies):
                 return CandidateBody(thickness, modes, fine=False)
             except SimulationError as error:
                 # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
-                if self._meshes.shape is not None:
+                if self.shape is not None:
                     raise
                 self._log(f"retrying with more tetrahedra ({error})")
         return CandidateBody(thickness, self._converged(thickness))
@@ -308,7 +331,7 @@ class SurfaceBodies(CandidateBodies):
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
         modes = self.modes(thickness)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
-        if self.dofs <= COARSE_DOFS or (self._meshes.shape is not None and thickness is not None):
+        if self.dofs <= COARSE_DOFS or (self.shape is not None and thickness is not None):
             return modes
         name = body_name(thickness)
         try:
@@ -333,7 +356,7 @@ class SurfaceBodies(CandidateBodies):
         """Return the modes of one body, read from the cache where they are there."""
 
         def compute() -> ElasticModes:
-            solid = self._solid(thickness, dofs)
+            solid = self.solid(thickness, dofs)
             size = count_dofs(solid)
             self._log(f"{self._count} elastic modes of {size} degrees of freedom")
             fixed = None if support is None else support.nodes(SecondOrder.of(solid))
@@ -344,22 +367,31 @@ class SurfaceBodies(CandidateBodies):
                 advice = f"use {max(dofs // 2, MIN_DOFS)} (--set body.dofs=N), or close other programs"
                 raise SimulationError.expected(wanted, size, got="too little", name="dofs", advice=advice) from error
 
-        values: dict[str, Any] = {"wall": thickness, "dofs": dofs, "perturbed": perturbed}
-        values["support"] = None if support is None else asdict(support)
-        return modes_once(self._file(values), compute, log=self._log)
+        if self._cache is None:
+            return compute()
+        values = {
+            "wall": thickness, "dofs": dofs, "perturbed": perturbed, "count": self._count, "format": _FORMAT,
+            "support": None if support is None else asdict(support), "material": asdict(self._material),
+            "surface": self._digest, "version": version("avmsf"), "source": source_digest(__name__),
+        }  # fmt: skip
+        return modes_once(self._cache / f"nominal-{key_of(values)}.safetensors", compute, log=self._log)
 
     def _make_solid(self, thickness: float | None, dofs: int) -> Solid:
+        """Return about so many degrees of freedom of a wall of a thickness, meters, or of all that is enclosed."""
         expect_memory(dofs)
         self._log(f"dividing the {body_name(thickness)} into tetrahedra")
-        return self._meshes.solid(thickness, dofs)
+        if thickness is None:
+            return filled_solid(self.checked, dofs)
+        if self.shape is None:
+            # Threads that make several walls wait for the sheet that all of them follow.
+            with self._remeshing:
+                make = self._walls(dofs)
+            return make(thickness)
+        return shape_solid(self.shape, thickness, dofs, log=self._log)
 
-    def _file(self, values: dict[str, Any]) -> Path | None:
-        """Return the file of the modes that these values, the surface, the settings and the code decide."""
-        if self._cache is None:
-            return None
-        values |= {"format": _FORMAT, "version": version("avmsf"), "source": source_digest(__name__)}
-        values |= {"surface": self._meshes.digest, "count": self._count, "material": asdict(self._material)}
-        return self._cache / f"nominal-{key_of(values)}.safetensors"
+    def _log_refused(self, reason: str) -> None:
+        """Log why a body cannot be had, where there are others; without an error's advice."""
+        self._log(f"not a candidate body: {reason.partition('; ')[0].replace(': wall: expected', ': expected')}")
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
@@ -380,8 +412,3 @@ def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
         names.setdefault(str(error), []).append(body_name(thickness))
     shown = {reason: f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(each) for reason, each in names.items()}
     return [f"{each}: {reason}" for reason, each in shown.items()]
-
-
-def _without(reason: str) -> str:
-    """Return the note of a body that cannot be had, where there are others; without an error's advice."""
-    return f"not a candidate body: {reason.partition('; ')[0].replace(': wall: expected', ': expected')}"

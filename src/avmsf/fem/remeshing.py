@@ -1,28 +1,22 @@
-"""Triangle meshes made fit for elements: welded, facing alike, and as coarse or as fine as the elements shall be."""
+"""Triangle meshes as coarse or as fine as elements shall be: edges are halved, and collapsed by their length."""
 
 import heapq
 
 import numpy as np
 import scipy.sparse
-import trimesh
+import torch
 from jaxtyping import Float64, Int
-from scipy.spatial import cKDTree
 from trimesh import Trimesh
 
-from avmsf.errors import SimulationError
 from avmsf.mesh.surface import Surface
 
-_CREASE = 0.9
-"""Cosine of the angle by which a triangle may turn when a mesh is made coarser: creases stay."""
-_WELD_RATIO = 2e-6
-"""Distance over the body's size up to which vertices are one: text files round, and STL repeats each corner."""
-_MAX_LOST_AREA = 0.05
-"""Part of the area that may face against its neighbors."""
-_FACING = 0.4
-"""Least cosine of the angle between a triangle and the surface's normals at its corners; a box's corner has .58."""
-_SLIVER = 0.1
+_MIN_CREASE_COSINE = 0.9
+"""Of the angle by which a triangle may turn when a mesh is made coarser: creases stay."""
+_MIN_FACING_COSINE = 0.4
+"""Of the angle between a triangle and the surface's normals at its corners; a box's corner has .58."""
+_MAX_SLIVER_RATIO = 0.1
 """Doubled area of a triangle over the square of its longest side, below which it may turn as it likes."""
-_FLAT = 1e-3
+_MIN_AREA_RATIO = 1e-3
 """The same, below which no triangle may come to lie: its prism would have no volume."""
 
 
@@ -32,58 +26,9 @@ def mesh_of(points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "fac
     return Trimesh(points[used], rows.reshape(-1, 3), process=False)
 
 
-def weld(surface: Surface) -> Trimesh:
-    """Return a surface's triangles with vertices in one place made one, without those that have no area.
-
-    Raises SimulationError for points without triangles, coordinates that are not finite, triangles that name vertices
-    which are not there, and where no triangle has an area.
-    """
-    points, faces = surface.vertices.double().numpy(), surface.faces.numpy()
-    if not len(faces):
-        advice = "make a mesh of the points"
-        got = f"{len(points)} points without triangles"
-        raise SimulationError.expected("a mesh", 0, got=got, name="faces", advice=advice)
-    if int(faces.min()) < 0 or int(faces.max()) >= len(points):
-        found = int(faces.max()) if int(faces.min()) >= 0 else int(faces.min())
-        wanted = f"corners of triangles from 0 to {len(points) - 1}"
-        raise SimulationError.expected(wanted, found, name="faces", advice="export the mesh again")
-    if not np.isfinite(points).all():
-        row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise SimulationError.expected("finite coordinates in meters", points[row].tolist(), row=row, name="vertices")
-    places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
-    size = float(np.linalg.norm(np.ptp(places, axis=0)))
-    pairs = cKDTree(places).query_pairs(_WELD_RATIO * size, output_type="ndarray")
-    if len(pairs):
-        label = components(pairs, len(places))
-        places, rows = places[np.unique(label, return_index=True)[1]], label[rows]
-    welded = rows.reshape(-1, 3)
-    wide = np.linalg.norm(trimesh.triangles.cross(places[welded]), axis=1) > 1e-12 * size**2
-    if not wide.any():
-        got, advice = f"{len(faces)} without", "scan the object again"
-        raise SimulationError.expected("triangles with an area", 0.0, got=got, name="areas", advice=advice)
-    return mesh_of(places, welded[wide])
-
-
-def oriented(mesh: Trimesh) -> Trimesh:
-    """Return a mesh without triangles that share an edge with two others or face against their neighbors.
-
-    The widest are kept. Raises SimulationError where more than a twentieth of the area would be lost.
-    """
-    areas = mesh.area_faces
-    used: set[tuple[int, int]] = set()
-    kept = np.zeros(len(mesh.faces), dtype=bool)
-    for row in np.argsort(-areas, kind="stable"):
-        a, b, c = mesh.faces[row].tolist()
-        sides = ((a, b), (b, c), (c, a))
-        if used.isdisjoint(sides):
-            used.update(sides)
-            kept[row] = True
-    lost = float(areas[~kept].sum() / areas.sum())
-    if lost > _MAX_LOST_AREA:
-        wanted = "triangles counter-clockwise from outside and at most two per edge"
-        got, advice = f"others on {lost:.0%} of the surface", "make the normals of the mesh consistent"
-        raise SimulationError.expected(wanted, lost, got=got, name="normals", advice=advice)
-    return mesh_of(mesh.vertices, mesh.faces[kept])
+def surface_of(mesh: Trimesh) -> Surface:
+    """Return a mesh as a surface, whose vertices are float32."""
+    return Surface(torch.from_numpy(np.array(mesh.vertices)).float(), torch.from_numpy(np.array(mesh.faces)))
 
 
 def boundary_edges(mesh: Trimesh) -> Int[np.ndarray, "edges 2"]:
@@ -97,20 +42,20 @@ def adjacency(mesh: Trimesh) -> scipy.sparse.csr_array:
     return joined + joined.T
 
 
+def components(pairs: Int[np.ndarray, "pairs 2"], count: int) -> Int[np.ndarray, " items"]:
+    """Return the number of the connected component of each of `count` items, given pairs that are connected."""
+    links = scipy.sparse.csr_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    return scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+
+
 def even_points(mesh: Trimesh, count: int = 2000) -> Float64[np.ndarray, "samples 3"]:
-    """Return places of even density on a mesh, always the same."""
+    """Return points of even density on a mesh, always the same."""
     reached = np.cumsum(mesh.area_faces)
     rows = np.searchsorted(reached, (np.arange(count) + 0.5) / count * reached[-1])
     # In a triangle, places from a sequence that fills the square evenly (Roberts' R2).
     u, v = (np.arange(1, count + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1.0).T
     weights = np.stack([1.0 - np.sqrt(u), np.sqrt(u) * (1.0 - v), np.sqrt(u) * v], axis=1)
     return np.einsum("pc,pcd->pd", weights, mesh.triangles[rows])
-
-
-def components(pairs: Int[np.ndarray, "pairs 2"], count: int) -> Int[np.ndarray, " items"]:
-    """Return the number of the connected component of each of `count` items, given pairs that are connected."""
-    links = scipy.sparse.csr_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    return scipy.sparse.csgraph.connected_components(links, directed=False)[1]
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -123,7 +68,7 @@ def remeshed(mesh: Trimesh, length: float) -> Trimesh:
     """Return a mesh with edges of about `length` meters, shorter ones only where the surface bends sharply."""
     # In this order, for what is coarsened next to long edges would keep them. A right-angled triangle with sides of
     # 1.2 and .75 lengths has none longer than the 1.5 lengths that coarsening allows, so short edges can go.
-    return coarsened(_refined(mesh, 1.2 * length), 0.75 * length, turn=_CREASE)
+    return coarsened(_refined(mesh, 1.2 * length), 0.75 * length, turn=_MIN_CREASE_COSINE)
 
 
 def _refined(mesh: Trimesh, longest: float) -> Trimesh:
@@ -224,12 +169,13 @@ class _EdgeCollapse:
             product = sum(p * q for p, q in zip(before, after, strict=True))
             area, later = sum(p * p for p in before) ** 0.5, sum(q * q for q in after) ** 0.5
             # A sliver's normal says little of the form, and slivers shall go.
-            sliver = area < _SLIVER * self._longest(face) ** 2
-            flat = later < _FLAT * self._longest(moved) ** 2
+            sliver = area < _MAX_SLIVER_RATIO * self._longest(face) ** 2
+            flat = later < _MIN_AREA_RATIO * self._longest(moved) ** 2
             if flat or (product < self._turn * area * later and not sliver):
                 return False
             # Small turns add up; the normals of the surface as it was do not.
-            if self._facing(after, moved) < min(_FACING * later, self._facing(before, face) * later / (area or 1.0)):
+            least = min(_MIN_FACING_COSINE * later, self._facing(before, face) * later / (area or 1.0))
+            if self._facing(after, moved) < least:
                 return False
         return len(self._around[gone]) > len(shared)
 

@@ -19,35 +19,42 @@ from jaxtyping import Bool, Float64, Int
 from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem.remeshing import (
-    adjacency,
-    boundary_edges,
-    components,
-    even_points,
-    mesh_of,
-    oriented,
-    remeshed,
-    unit,
-    weld,
-)  # fmt: skip
+from avmsf.fem.meshing import oriented, weld
+from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of, remeshed, unit
 from avmsf.fem.solid import Solid, prism_cells
 from avmsf.fem.tetrahedra import expect_detail, fill
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
 
-_STEPS = 30
-"""Most times that the wall is turned and thinned where prisms are folded."""
-_TILT = 0.1
-"""How far a folded triangle turns the wall towards its own inside, each time."""
-_THINNING = 0.85
-"""Factor on the wall's thickness at folded prisms, each time."""
-_SLOPE = 0.3
-"""Most that the thickness grows along an edge over the edge's length, where it was thinned."""
-_SPARED = 0.1
-"""Part of the surface at which the wall may be folded, or thinner than half of what was asked for."""
-_FLATTEST = 0.05
-"""Volume of a tetrahedron over that of a third of a straight prism, below which the prism is folded."""
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What a wall may be, and what a closed mesh is taken to be a wall by."""
+
+    max_turns: int = 30  # times that the wall is turned and thinned where prisms are folded
+    tilt: float = 0.1  # how far a folded triangle turns the wall towards its own inside, each time
+    thinning: float = 0.85  # factor on the wall's thickness at folded prisms, each time
+    max_slope: float = 0.3  # that the thickness grows along an edge over the edge's length, where it was thinned
+    max_spared_area: float = 0.1  # part at which the wall may be folded, or thinner than half of what was asked for
+    min_prism_volume: float = 0.05  # of a tetrahedron over a third of a straight prism, below which that is folded
+    max_opposite_cosine: float = -0.8  # between the normals of the two sides
+    min_smooth_cosine: float = 0.7  # of the angle between neighboring triangles of one side
+    max_reach: float = 2.5  # distance to the other side over twice the volume by area; beyond is a rim or a lump
+    min_covered_area: float = 0.85  # part of one side's area that faces the other side
+    max_held_error: float = 0.25  # relative, of the volume behind one side: a handle or a foot is more
+    max_volume_error: float = 0.03  # relative, of the prisms' volume: frequencies go with the thickness
+    # The same where the thickness is known: facets that cut across a curved wall leave out area, but no thickness. A
+    # tube with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high.
+    max_even_volume_error: float = 0.05
+    max_distant_part: float = 0.02  # of either surface, farther from the other than half an unknown thickness
+    ray_lead: float = 1e-5  # how far behind a triangle rays start, in diagonals of the box around the mesh
+    triangle_ratio: float = 1.2  # squared sides over the sheet's area for each vertex, by trial; 1.15 if regular
+    max_layers: int = 50
+    max_rounds: int = 100  # of averaging, which fills in the thickness where no ray finds the other side
+
+
+TOLERANCES = Tolerances()
 
 
 def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
@@ -72,10 +79,10 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
         advice = f"use a solid body (0 m), or a wall of {middle:.1g} m"
         raise SimulationError.expected(wanted, thickness, got=got, name="thickness", advice=advice)
     coarse = remeshed(mesh, detail * mesh.scale)
-    if _folded_part(coarse, thickness) > _SPARED:
-        fitting = (thickness * 0.5**step for step in range(1, 8))
-        suggested = next((each for each in fitting if _folded_part(coarse, each) <= _SPARED), None)
-        hint = "smooth the mesh" if suggested is None else f"try thickness={suggested:.2g}, or smooth the mesh"
+    tried = (thickness * 0.5**step for step in range(8))
+    fitting = next((each for each in tried if _folded_part(coarse, each) <= TOLERANCES.max_spared_area), None)
+    if fitting != thickness:
+        hint = "smooth the mesh" if fitting is None else f"try thickness={fitting:.2g}, or smooth the mesh"
         wanted, got = "less than the surface's radius of curvature", f"{thickness:g} m"
         raise SimulationError.expected(wanted, thickness, got=got, name="thickness", advice=hint)
     solid = prisms(coarse, np.full(len(coarse.vertices), thickness))
@@ -98,16 +105,16 @@ def _offsets(mesh: Trimesh, thickness: Float64[np.ndarray, " points"]) -> Float6
     faces = np.asarray(mesh.faces)
     directions, lengths = -mesh.vertex_normals, thickness.copy()
     ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
-    tolerance = _SLOPE * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
-    for _ in range(_STEPS):
+    tolerance = TOLERANCES.max_slope * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
+    for _ in range(TOLERANCES.max_turns):
         folded = _folded(mesh, lengths[:, None] * directions)
         if not folded.any():
-            thin = lengths[faces].mean(axis=1) < 0.5 * thickness[faces].mean(axis=1)
-            return lengths[:, None] * directions if thin @ mesh.area_faces <= _SPARED * mesh.area else None
+            thin = (lengths[faces].mean(axis=1) < 0.5 * thickness[faces].mean(axis=1)) @ mesh.area_faces
+            return lengths[:, None] * directions if thin <= TOLERANCES.max_spared_area * mesh.area else None
         # Where there is a direction that all triangles around a vertex see from outside, this finds one in the end.
-        np.add.at(directions, faces[folded], -_TILT * mesh.face_normals[folded][:, None])
+        np.add.at(directions, faces[folded], -TOLERANCES.tilt * mesh.face_normals[folded][:, None])
         directions = unit(directions)
-        lengths[np.unique(faces[folded])] *= _THINNING
+        lengths[np.unique(faces[folded])] *= TOLERANCES.thinning
         # A wall that thins within one triangle would fold the next.
         np.minimum.at(lengths, ends[:, 0], lengths[ends[:, 1]] + tolerance)
     return None
@@ -134,7 +141,7 @@ def _folded(mesh: Trimesh, offsets: np.ndarray) -> np.ndarray:
     corners = points[_prisms(mesh)]
     volumes = np.linalg.det(corners[:, :, 1:] - corners[:, :, :1]) / 6.0
     straight = mesh.area_faces * np.linalg.norm(offsets, axis=1)[mesh.faces].mean(axis=1) / 3.0
-    return (volumes <= _FLATTEST * straight[:, None]).any(axis=1)
+    return (volumes <= TOLERANCES.min_prism_volume * straight[:, None]).any(axis=1)
 
 
 def _prisms(mesh: Trimesh) -> Int[np.ndarray, "triangles 3 4"]:
@@ -142,33 +149,6 @@ def _prisms(mesh: Trimesh) -> Int[np.ndarray, "triangles 3 4"]:
     outer = np.arange(len(mesh.vertices))
     # Counter-clockwise seen from inside.
     return prism_cells(mesh.faces[:, ::-1], outer, outer, outer + len(outer))
-
-
-_OPPOSITE = -0.8
-"""Largest cosine between the normals of the two sides."""
-_CREASE = 0.7
-"""Cosine of the angle between neighboring triangles that ends a side."""
-_THICKER = 2.5
-"""Distance to the other side over twice the volume by area, from which on a triangle is on a rim or a lump."""
-_COVERED = 0.85
-"""Least part of one side's area that faces the other side."""
-_HELD = 0.25
-"""Largest relative difference of the volume behind one side from the mesh's: a handle or a foot is more."""
-_VOLUME = 0.03
-"""Largest relative difference between the volumes of prisms and mesh. Frequencies go with the thickness."""
-_EVEN_VOLUME = 0.05
-"""The same where the thickness is known: facets that cut across a curved wall leave out area, but no thickness. A tube
-with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high."""
-_MAX_DISTANT_PART = 0.02
-"""Part of either surface that may be farther from the other than half the wall's thickness; than all of a known one."""
-_INSIDE = 1e-5
-"""How far behind a triangle rays start, in diagonals of the box around the mesh."""
-_TRIANGLE = 1.2
-"""Squared length of the sides over the sheet's area for each vertex, by trial; 1.15 for regular triangles."""
-_MAX_LAYERS = 50
-"""Layers at most."""
-_MAX_ROUNDS = 100
-"""Most rounds of averaging that fill in the thickness where no ray finds the other side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,10 +169,10 @@ class Wall:
 
         # Each vertex of the sheet has 4 nodes on each of 2 layers + 1 levels, and two triangles.
         def needed(layers: int) -> float:
-            return math.sqrt(_TRIANGLE * 12.0 * (2 * layers + 1) * self.sheet.area / dofs)
+            return math.sqrt(TOLERANCES.triangle_ratio * 12.0 * (2 * layers + 1) * self.sheet.area / dofs)
 
         layers = 1
-        while layers < _MAX_LAYERS - 1 and self._layers(needed(layers)) > layers:
+        while layers < TOLERANCES.max_layers - 1 and self._layers(needed(layers)) > layers:
             layers += 1
         return needed(layers)
 
@@ -231,10 +211,10 @@ class Wall:
     def _thickness_at(self, sheet: Trimesh) -> Float64[np.ndarray, " points"] | None:
         """Return the distance to the other side behind each vertex of a sheet, filled in from neighbors at rims."""
         reach, cosine, _ = _behind(self.mesh, sheet.vertices, sheet.vertex_normals)
-        known = (cosine < _OPPOSITE) & (reach < _THICKER * self.thickness)
+        known = (cosine < TOLERANCES.max_opposite_cosine) & (reach < TOLERANCES.max_reach * self.thickness)
         joined = adjacency(sheet)
         values = np.where(known, reach, 0.0)
-        for _ in range(_MAX_ROUNDS):
+        for _ in range(TOLERANCES.max_rounds):
             if known.all():
                 return values
             near = joined @ known.astype(float)
@@ -245,7 +225,7 @@ class Wall:
 
     def _fills(self, solid: Solid) -> bool:
         """Return whether prisms have the mesh's volume, and their surface is the mesh."""
-        volume, away = (_EVEN_VOLUME, 1.0) if self.even else (_VOLUME, 0.5)
+        volume, away = (TOLERANCES.max_even_volume_error, 1.0) if self.even else (TOLERANCES.max_volume_error, 0.5)
         if abs(solid.volume / self.mesh.volume - 1.0) > volume:
             return False
         outside = Trimesh(solid.points.numpy(), solid.boundary.numpy(), process=False)
@@ -253,7 +233,7 @@ class Wall:
             ClosestPoints(one.triangles)(even_points(other)).distances
             for one, other in ((outside, self.mesh), (self.mesh, outside))
         )
-        return all(float((each > away * self.thickness).mean()) <= _MAX_DISTANT_PART for each in distances)
+        return all(float((each > away * self.thickness).mean()) <= TOLERANCES.max_distant_part for each in distances)
 
 
 def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
@@ -266,14 +246,15 @@ def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
         return None
     areas = mesh.area_faces
     reach, cosine, behind = _behind(mesh, mesh.triangles_center, mesh.face_normals)
-    facing = (cosine < _OPPOSITE) & (reach < _THICKER * 2.0 * mesh.volume / mesh.area)
+    facing = (cosine < TOLERANCES.max_opposite_cosine) & (reach < TOLERANCES.max_reach * 2.0 * mesh.volume / mesh.area)
     if not facing.any():
         return None
     label = _sides(mesh, facing)
     side = label == np.bincount(label[facing], weights=areas[facing]).argmax()
     covered = side & ~side[behind]
-    held = float(areas[covered] @ reach[covered])
-    if areas[covered].sum() < _COVERED * areas[side].sum() or abs(held / mesh.volume - 1.0) > _HELD:
+    held_error = abs(float(areas[covered] @ reach[covered]) / mesh.volume - 1.0)
+    least = TOLERANCES.min_covered_area * areas[side].sum()
+    if areas[covered].sum() < least or held_error > TOLERANCES.max_held_error:
         return None
     sheet = mesh_of(mesh.vertices, mesh.faces[side])
     if thickness is not None:
@@ -284,8 +265,9 @@ def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
 def _sides(mesh: Trimesh, facing: Bool[np.ndarray, " faces"]) -> Int[np.ndarray, " faces"]:
     """Return the number of the smooth connected part of the triangles `facing` that each is in; -1 for the others."""
     pairs = mesh.face_adjacency
-    smooth = (mesh.face_normals[pairs[:, 0]] * mesh.face_normals[pairs[:, 1]]).sum(axis=1) > _CREASE
-    return np.where(facing, components(pairs[smooth & facing[pairs].all(axis=1)], len(mesh.faces)), -1)
+    cosine = (mesh.face_normals[pairs[:, 0]] * mesh.face_normals[pairs[:, 1]]).sum(axis=1)
+    joined = pairs[(cosine > TOLERANCES.min_smooth_cosine) & facing[pairs].all(axis=1)]
+    return np.where(facing, components(joined, len(mesh.faces)), -1)
 
 
 def _behind(
@@ -295,5 +277,5 @@ def _behind(
 
     The distance is infinite where there is none, and the cosine 1.
     """
-    rows, reach = RayCaster(mesh.triangles)(places, -normals, lead=_INSIDE)
+    rows, reach = RayCaster(mesh.triangles)(places, -normals, lead=TOLERANCES.ray_lead)
     return reach, np.where(rows >= 0, (normals * mesh.face_normals[rows]).sum(axis=1), 1.0), rows

@@ -20,11 +20,11 @@ from jaxtyping import Float, Float64
 from scipy.signal import butter, sosfilt
 from torch import Tensor
 
+from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.baselines.diffsound.losses import ClipSpectra
 from avmsf.capture.impacts import Impacts
 from avmsf.editing.clips import resampled, with_length
 from avmsf.errors import EvaluationError
-from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.isotropic import IsotropicModes
 from avmsf.fem.material import MATERIALS, Material, material_named

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Complex, Float, Float64
 from torch import Tensor
 
+from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.baselines.diffsound.material_fit import (
     DampingCurve,
     DiffSoundConfig,
@@ -31,7 +32,6 @@ from avmsf.baselines.diffsound.material_fit import (
 )
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
-from avmsf.fem.body_family import BodyFamily
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.localization.likelihood import cosine_distance
 from avmsf.modal.config import scaled_fft_size

@@ -1,6 +1,7 @@
 """Surfaces made fit: what faces inwards is turned, noise goes, holes are measured, dense meshes are thinned."""
 
 import math
+from dataclasses import replace
 
 import fast_simplification
 import numpy as np
@@ -11,10 +12,10 @@ from scipy import ndimage
 from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem import mesh_check
+from avmsf.fem import meshing
 from avmsf.fem.candidate_bodies import SurfaceBodies
-from avmsf.fem.mesh_check import (
-    ROUGH,
+from avmsf.fem.meshing import (
+    TOLERANCES,
     CheckedSurface,
     checked,
     count_crowded_edges,
@@ -22,8 +23,9 @@ from avmsf.fem.mesh_check import (
     roughness,
     simplified,
     thinned,
+    weld,
 )
-from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed, weld
+from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed
 from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.level_set import enclose
@@ -91,10 +93,10 @@ def test_lids_are_measured_as_they_would_close_the_holes():
 def test_no_wall_is_guessed_where_the_surface_holds_little_more_than_it():
     whole = CheckedSurface(welded(trimesh.creation.icosphere(4)))
     # Twice the volume over the area is two thirds of the radius, of which a wall may be a sixth.
-    whole.expect_hollow(0.110)
+    whole.expect_wall(0.110, guessed=True)
     with raises(SimulationError, name="wall", value=0.112):
-        whole.expect_hollow(0.112)
-    CheckedSurface(cup(0.05)).expect_hollow(0.3)
+        whole.expect_wall(0.112, guessed=True)
+    CheckedSurface(cup(0.05)).expect_wall(0.3, guessed=True)
 
 
 def test_noise_is_taken_out_of_a_mesh_by_as_much_as_it_has():
@@ -113,7 +115,7 @@ def test_noise_is_taken_out_of_a_mesh_by_as_much_as_it_has():
 def test_what_is_not_noisy_stays_as_it_is():
     box = welded(trimesh.creation.box((1.0, 0.2, 0.01)))
     for mesh in (box, remeshed(box, 0.03), welded(trimesh.creation.icosphere(4)), cup(0.3)):
-        assert roughness(mesh) < ROUGH
+        assert roughness(mesh) < TOLERANCES.min_roughness_deg
         found, moved = denoised(mesh)
         assert found is mesh
         assert moved == 0.0
@@ -123,7 +125,7 @@ def test_a_rough_form_that_is_no_noise_stays():
     # Each vertex lies on a wave that its neighbors predict, though triangles turn by more than noise would make them.
     side = np.linspace(0, 1, 49)
     waves = weld(sheet_over(side, side, lambda x, y: 0.12 * np.sin(12 * math.pi * x) * np.sin(12 * math.pi * y)))
-    assert roughness(waves) > ROUGH
+    assert roughness(waves) > TOLERANCES.min_roughness_deg
     assert denoised(waves)[0] is waves
 
 
@@ -147,8 +149,7 @@ def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
 
 
 def limit(monkeypatch: pytest.MonkeyPatch, triangles: int) -> None:
-    for name in ("MAX_FACES", "ENOUGH_FACES"):
-        monkeypatch.setattr(mesh_check, name, triangles)
+    monkeypatch.setattr(meshing, "TOLERANCES", replace(TOLERANCES, max_faces=triangles, enough_faces=triangles))
 
 
 def ellipsoid(subdivisions: int) -> Trimesh:

@@ -12,26 +12,24 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.body_meshes import BodyMeshes, HollowShape
-from avmsf.fem.candidate_bodies import COARSE_WALL_DOFS, THICKNESS_RATIOS
+from avmsf.fem.body_meshes import HollowShape
+from avmsf.fem.candidate_bodies import COARSE_WALL_DOFS, THICKNESS_RATIOS, SurfaceBodies
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.solid import Solid
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 
-DOFS = COARSE_WALL_DOFS
-"""Degrees of freedom of each wall, about: prisms along walls of a pot and a tube are 1 % too stiff in frequency."""
-SOLID_DOFS = 40_000
-"""Of a solid body, about: tetrahedra lock where they fill thin parts."""
-_HOLES = 0.01
+DEFAULT_SOLID_DOFS = 40_000
+"""Degrees of freedom of a solid body, about: tetrahedra lock where they fill thin parts."""
+_MAX_DEFECT_LIDS = 0.01
 """Part of a closed surface that lids over holes make up, below which the holes are defects of a scan. The mouth of a
 bottle is about as much."""
-_SCALES = (0.6, 0.85, 1.2, 1.7)
+_WALL_RATIOS = (0.6, 0.85, 1.2, 1.7)
 """Thicknesses that are computed at first of a wall whose two sides are known, over that of the mesh. Scanners see the
 inside of a vessel worse than its outside."""
-_THICKNESSES = 6
+_SHAPE_THICKNESSES = 6
 """Thicknesses that are computed at first of a shape whose wall is not known."""
-_FINER = 0.7
+_REFINEMENT = 0.7
 """Factor on the length of prisms that are too coarse for a mesh."""
 
 
@@ -95,26 +93,24 @@ def body_family(
     surface: Surface | HollowShape,
     *,
     count: int,
-    dofs: int = DOFS,
-    solid_dofs: int = SOLID_DOFS,
+    dofs: int = COARSE_WALL_DOFS,
+    solid_dofs: int = DEFAULT_SOLID_DOFS,
     log: Callable[[str], None] | None = None,
 ) -> BodyFamily:
     """Return the bodies of a surface, with their lowest `count` modes.
 
-    Walls have about `dofs` degrees of freedom, a solid body `solid_dofs`.
-
-    A closed mesh that shows both sides of one wall has walls of `_SCALES` times its thickness behind its larger side;
-    another closed mesh is solid. An open mesh has walls of `THICKNESS_RATIOS` times its size. A shape from photographs
-    has walls all over its range of thickness, or is solid where it has no cavity.
+    Walls have about `dofs` degrees of freedom, a solid body `solid_dofs`: prisms along walls of a pot and a tube are
+    1 % too stiff in frequency. A closed mesh that shows both sides of one wall has walls of `_WALL_RATIOS` times its
+    thickness behind its larger side; another closed mesh is solid. An open mesh has walls of `THICKNESS_RATIOS` times
+    its size. A shape from photographs has walls all over its range of thickness, or is solid where it has no cavity.
 
     Raises SimulationError for points without triangles, and where no body can be made, with the reason.
     """
     report = log or (lambda message: None)
-    meshes = BodyMeshes(surface, log=report)
-    thicknesses, make = _walls(meshes, dofs)
+    candidates = SurfaceBodies(surface, log=report)
+    thicknesses, make = _walls(candidates, dofs)
     if make is None:
-        report("dividing the body into tetrahedra")
-        return BodyFamily((isotropic_modes(meshes.solid(None, solid_dofs), count=count),), ())
+        return BodyFamily((isotropic_modes(candidates.solid(None, solid_dofs), count=count),), ())
     made, reasons = {}, []
     for thickness in thicknesses:
         report(f"elastic modes of a wall of {1000 * thickness:.2g} mm")
@@ -128,23 +124,23 @@ def body_family(
     return BodyFamily(tuple(made.values()), tuple(made), make)
 
 
-def _walls(meshes: BodyMeshes, dofs: int) -> tuple[list[float], Callable[[float], Solid] | None]:
+def _walls(candidates: SurfaceBodies, dofs: int) -> tuple[list[float], Callable[[float], Solid] | None]:
     """Return the thicknesses of walls to compute, meters, and what makes them; nothing for a solid body."""
-    if meshes.shape is not None:
-        between = meshes.shape.thickness_range
+    if candidates.shape is not None:
+        between = candidates.shape.thickness_range
         if between is None:
             return [], None
-        return np.geomspace(*between, _THICKNESSES).tolist(), partial(meshes.solid, dofs=dofs)
-    found = meshes.checked
-    if found.lids > _HOLES:
+        return np.geomspace(*between, _SHAPE_THICKNESSES).tolist(), partial(candidates.solid, dofs=dofs)
+    found = candidates.checked
+    if found.lids > _MAX_DEFECT_LIDS:
         thicknesses = [ratio * found.mesh.scale for ratio in THICKNESS_RATIOS]
-        return [each for each in thicknesses if each < found.width], meshes.walls(dofs)
+        return [each for each in thicknesses if each < found.width], partial(candidates.solid, dofs=dofs)
     wall = wall_of(found.mesh)
     if wall is not None:
         length = wall.length(dofs)
-        for tried in (length, _FINER * length):
+        for tried in (length, _REFINEMENT * length):
             with suppress(SimulationError):
-                return [wall.thickness * scale for scale in _SCALES], wall.solids(tried)
+                return [wall.thickness * ratio for ratio in _WALL_RATIOS], wall.solids(tried)
     return [], None
 
 

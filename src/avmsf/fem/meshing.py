@@ -1,4 +1,10 @@
-"""A surface as people have them made fit for walls and tetrahedra, or the reason why it is not."""
+"""A surface as people have them made fit for walls and tetrahedra: welded, turned outwards, without noise, thinned.
+
+A scan's noise is drawn afresh at each vertex, while a surface runs on from one vertex to the next. Of the surfaces that
+balance closeness to the vertices against bending, (1 + strength L L) places = vertices with L the mean difference from
+the neighbors, generalized cross-validation (Craven and Wahba 1978) takes the one that predicts left-out vertices best.
+Meshes of very many triangles are simplified by quadrics (Garland and Heckbert 1997).
+"""
 
 import math
 from collections.abc import Callable
@@ -12,24 +18,42 @@ import scipy.sparse
 import trimesh
 from jaxtyping import Float64, Int
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of, oriented, weld
+from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of
 from avmsf.fem.solid import several_parts
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
 
-ROUGH = 20.0
-"""Degrees that neighboring triangles differ by on the mean, in a mesh that is likelier noisy than finely shaped."""
-_FINE = 0.06
-"""Mean edge over the body's size from which on a mesh is too coarse to tell noise from form: a box turns by 60."""
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What a mesh may have, and what it is taken for."""
+
+    weld_ratio: float = 2e-6  # distance of vertices that are one, over the size: text files round, STL repeats corners
+    max_lost_area: float = 0.05  # part of the area that may face against its neighbors
+    min_roughness_deg: float = 20.0  # mean angle between neighboring triangles, from which on noise is likelier
+    max_edge: float = 0.06  # mean edge over the size, beyond which noise and form are one: a box turns by 60 degrees
+    min_log_strength: float = -3.0  # decimal logarithm of the weakest smoothing
+    max_log_strength: float = 5.0  # of the strongest
+    max_freedom: float = 0.8  # part of the vertices' degrees of freedom that a mesh without noise would keep
+    max_faces: int = 60_000  # beyond which a mesh is simplified even where that changes its form
+    enough_faces: int = 16_000  # beyond which it is simplified as far as its form stays; models have some thousand
+    max_distance: float = 0.01  # root mean square, of a simplified mesh over its mean thickness; by a twisted blade
+    max_lids: float = 0.25  # part of the closed surface that lids over holes may make up, as `fill` has it
+    max_small_lids: float = 0.02  # likewise of defects of a scan: openings of vessels are larger
+    max_loose_area: float = 0.1  # part of the area in loose bits, which a wall leaves out
+    min_vessel: float = 0.03  # volume behind lids over area^1.5 of a surface with an inside; .13 of a hemisphere
+    max_wall: float = 1.0 / 6.0  # thickness of a guessed wall over the mean thickness of what a closed surface holds
+
+
+TOLERANCES = Tolerances()
 _PROBES = 8
 """Random vectors that estimate the number of degrees of freedom left, within a per cent for thousands of vertices."""
-_WEAKEST, _STRONGEST = -3.0, 5.0
-"""Decimal logarithms of the strengths to choose from."""
-_KEPT = 0.8
-"""Part of the vertices' degrees of freedom that a mesh without noise would keep."""
+_ROUNDS = 4
+"""Averages taken of a noisy mesh over the thinning: they reach little farther than an edge that stays."""
 
 
 def count_crowded_edges(mesh: Trimesh) -> int:
@@ -37,10 +61,63 @@ def count_crowded_edges(mesh: Trimesh) -> int:
     return int((np.bincount(mesh.edges_unique_inverse) > 2).sum())
 
 
+def weld(surface: Surface) -> Trimesh:
+    """Return a surface's triangles with vertices in one place made one, without those that have no area.
+
+    Raises SimulationError for points without triangles, coordinates that are not finite, triangles that name vertices
+    which are not there, and where no triangle has an area.
+    """
+    points, faces = surface.vertices.double().numpy(), surface.faces.numpy()
+    if not len(faces):
+        got = f"{len(points)} points without triangles"
+        raise SimulationError.expected("a mesh", 0, got=got, name="faces", advice="make a mesh of the points")
+    unfit = faces[(faces < 0) | (faces >= len(points))]
+    if len(unfit):
+        wanted = f"corners of triangles from 0 to {len(points) - 1}"
+        raise SimulationError.expected(wanted, int(unfit[0]), name="faces", advice="export the mesh again")
+    if not np.isfinite(points).all():
+        row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise SimulationError.expected("finite coordinates in meters", points[row].tolist(), row=row, name="vertices")
+    places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
+    size = float(np.linalg.norm(np.ptp(places, axis=0)))
+    pairs = cKDTree(places).query_pairs(TOLERANCES.weld_ratio * size, output_type="ndarray")
+    if len(pairs):
+        label = components(pairs, len(places))
+        places, rows = places[np.unique(label, return_index=True)[1]], label[rows]
+    welded = rows.reshape(-1, 3)
+    wide = np.linalg.norm(trimesh.triangles.cross(places[welded]), axis=1) > 1e-12 * size**2
+    if not wide.any():
+        got, advice = f"{len(faces)} without", "scan the object again"
+        raise SimulationError.expected("triangles with an area", 0.0, got=got, name="areas", advice=advice)
+    return mesh_of(places, welded[wide])
+
+
+def oriented(mesh: Trimesh) -> Trimesh:
+    """Return a mesh without triangles that share an edge with two others or face against their neighbors.
+
+    The widest are kept. Raises SimulationError where more than a twentieth of the area would be lost.
+    """
+    areas = mesh.area_faces
+    used: set[tuple[int, int]] = set()
+    kept = np.zeros(len(mesh.faces), dtype=bool)
+    for row in np.argsort(-areas, kind="stable"):
+        a, b, c = mesh.faces[row].tolist()
+        sides = ((a, b), (b, c), (c, a))
+        if used.isdisjoint(sides):
+            used.update(sides)
+            kept[row] = True
+    lost = float(areas[~kept].sum() / areas.sum())
+    if lost > TOLERANCES.max_lost_area:
+        wanted = "triangles counter-clockwise from outside and at most two per edge"
+        got, advice = f"others on {lost:.0%} of the surface", "make the normals of the mesh consistent"
+        raise SimulationError.expected(wanted, lost, got=got, name="normals", advice=advice)
+    return mesh_of(mesh.vertices, mesh.faces[kept])
+
+
 def roughness(mesh: Trimesh) -> float:
     """Return the mean angle between the normals of neighboring triangles, degrees; 0 for a mesh of few long edges."""
     ends = mesh.vertices[mesh.face_adjacency_edges]
-    if not len(ends) or np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean() > _FINE * mesh.scale:
+    if not len(ends) or np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean() > TOLERANCES.max_edge * mesh.scale:
         return 0.0
     return math.degrees(float(mesh.face_adjacency_angles.mean()))
 
@@ -48,13 +125,10 @@ def roughness(mesh: Trimesh) -> float:
 def denoised(mesh: Trimesh) -> tuple[Trimesh, float]:
     """Return a noisy mesh without its noise, and how far that moved the vertices, meters, root mean square.
 
-    A scan's noise is drawn afresh at each vertex, while a surface runs on from one vertex to the next. Of the surfaces
-    that balance closeness to the vertices against bending, (1 + strength L L) places = vertices with L the mean
-    difference from the neighbors, generalized cross-validation takes the one that predicts left-out vertices best.
     A mesh that is not rough, or whose vertices predict each other no better when smoothed, comes back as it is, with
     0. The volume of a closed one stays.
     """
-    if roughness(mesh) < ROUGH:
+    if roughness(mesh) < TOLERANCES.min_roughness_deg:
         return mesh, 0.0
     points = np.asarray(mesh.vertices)
     # The squared difference of each vertex from the mean of its neighbors.
@@ -70,12 +144,13 @@ def denoised(mesh: Trimesh) -> tuple[Trimesh, float]:
         return solve(points), float((probes * solve(probes)).sum(axis=0).mean() / len(probes))
 
     def error(exponent: float) -> float:
-        smoothed, kept = smooth(exponent)
-        return math.log(float(((smoothed - points) ** 2).mean()) / (1.0 - kept) ** 2)
+        smoothed, freedom = smooth(exponent)
+        return math.log(float(((smoothed - points) ** 2).mean()) / (1.0 - freedom) ** 2)
 
-    found = scipy.optimize.minimize_scalar(error, bounds=(_WEAKEST, _STRONGEST), options={"xatol": 0.05})
-    smoothed, kept = smooth(float(found.x))
-    if kept > _KEPT:
+    bounds = TOLERANCES.min_log_strength, TOLERANCES.max_log_strength
+    found = scipy.optimize.minimize_scalar(error, bounds=bounds, options={"xatol": 0.05})
+    smoothed, freedom = smooth(float(found.x))
+    if freedom > TOLERANCES.max_freedom:
         return mesh, 0.0
     result = _as_large(smoothed, mesh)
     return result, float(np.sqrt(((result.vertices - points) ** 2).sum(axis=1).mean()))
@@ -115,37 +190,28 @@ def _as_large(points: Float64[np.ndarray, "points 3"], mesh: Trimesh) -> Trimesh
     return Trimesh(middle + factor * (points - middle), mesh.faces, process=False)
 
 
-MAX_FACES = 60_000
-"""Triangles beyond which a mesh is simplified even where that changes its form."""
-ENOUGH_FACES = 16_000
-"""Triangles beyond which it is simplified as far as its form stays; finite-element models have some thousand."""
-_TOLERANCE = 0.01
-"""Root mean square distance of the simplified mesh from the given one, over its mean thickness; by a twisted blade."""
-_ROUNDS = 4
-"""Averages taken of a noisy mesh over the thinning: they reach little farther than an edge that stays."""
-
-
 def thinned(mesh: Trimesh, *, log: Callable[[str], None]) -> Trimesh:
-    """Return a mesh of at most `MAX_FACES` triangles, fewer within the tolerance; log what was done to a larger one.
+    """Return a mesh of at most `max_faces` triangles, fewer within the tolerance; log what was done to a larger one.
 
     More are left where fewer would open a seam or share an edge among three.
     """
-    count = len(mesh.faces)
-    if count <= ENOUGH_FACES:
+    count, enough, most = len(mesh.faces), TOLERANCES.enough_faces, TOLERANCES.max_faces
+    if count <= enough:
         return mesh
     log(f"checking a mesh of {count} triangles")
     rough = roughness(mesh)
     # Quadrics follow each noisy corner, and tie the mesh into knots.
-    even = averaged(mesh, math.ceil(_ROUNDS * count / MAX_FACES)) if rough >= ROUGH else mesh
-    tolerance, places = _TOLERANCE * 2.0 * abs(_volume(even.triangles)) / even.area, even_points(even)
-    for most in (ENOUGH_FACES, 2 * ENOUGH_FACES, MAX_FACES):
-        found = simplified(even, most, like=mesh)
+    noisy = rough >= TOLERANCES.min_roughness_deg
+    even = averaged(mesh, math.ceil(_ROUNDS * count / most)) if noisy else mesh
+    tolerance, places = TOLERANCES.max_distance * 2.0 * abs(_volume(even.triangles)) / even.area, even_points(even)
+    for target in (enough, 2 * enough, most):
+        found = simplified(even, target, like=mesh)
         distances = ClosestPoints(found.triangles)(places).distances
         if float(np.sqrt((distances**2).mean())) <= tolerance:
             break
     if found is even:
         return mesh
-    noise = "" if even is mesh else f", after smoothing its noise of {rough:.0f} degrees"
+    noise = f", after smoothing its noise of {rough:.0f} degrees" if noisy else ""
     log(f"mesh simplified to {len(found.faces)} triangles{noise}")
     return found
 
@@ -172,18 +238,6 @@ def simplified(mesh: Trimesh, count: int, *, like: Trimesh | None = None, most: 
     return mesh
 
 
-_LIDS = 0.25
-"""Part of the closed surface that lids over holes may make up, as `fill` has it."""
-_SMALL = 0.02
-"""Part of the closed surface that lids over defects of a scan may make up; the openings of vessels are larger."""
-_LOOSE = 0.1
-"""Part of the area that may lie in loose bits, which a wall leaves out."""
-_VESSEL = 0.03
-"""Volume behind lids over the area to the power of 1.5 of an open surface with an inside; of a hemisphere it is .13."""
-_HOLLOW = 1.0 / 6.0
-"""Thickness of a wall over the mean thickness of what a closed surface holds, beyond which no wall is guessed."""
-
-
 @dataclass(frozen=True, eq=False)
 class CheckedSurface:
     """A surface that has triangles, faces outwards and is smooth."""
@@ -193,9 +247,7 @@ class CheckedSurface:
     @cached_property
     def width(self) -> float:
         """Extent along the second of the axes that the vertices spread along, meters: of a sheet, its narrower side."""
-        places = self.mesh.vertices - self.mesh.vertices.mean(axis=0)
-        _, axes = np.linalg.eigh(places.T @ places)
-        return float(np.sort(np.ptp(places @ axes, axis=0))[1])
+        return float(np.sort(principal_extents(self.mesh.vertices))[1])
 
     @cached_property
     def lids(self) -> float:
@@ -206,23 +258,29 @@ class CheckedSurface:
     @cached_property
     def mean_thickness(self) -> float | None:
         """Twice the volume over the area, meters: of a thin wall, its thickness; None for a sheet, which holds none."""
-        if self.lids > _LIDS:
-            return None
-        return 2.0 * abs(_held(self.mesh)) / self.mesh.area
+        return None if self.lids > TOLERANCES.max_lids else 2.0 * abs(_held(self.mesh)) / self.mesh.area
 
     def expect_filling(self) -> None:
         """Raise SimulationError where the surface is too open to be filled."""
-        if self.lids > _LIDS:
+        if self.lids > TOLERANCES.max_lids:
             got = f"{len(boundary_edges(self.mesh))} open edges whose holes are {self.lids:.0%} of the surface"
             advice = "give a wall thickness, or close the mesh"
             raise SimulationError.expected("a closed one", self.lids, got=got, name="mesh", advice=advice)
 
-    def expect_hollow(self, wall: float) -> None:
-        """Raise SimulationError where the surface holds too little to be the outside of such a wall."""
-        held = self.mean_thickness
-        if held is not None and wall > _HOLLOW * held:
-            wanted = f"at most {1000 * _HOLLOW * held:.3g} mm in a mesh that is {1000 * held:.3g} mm thick on average"
-            raise SimulationError.expected(wanted, wall, got="more", name="wall", advice="use a solid body")
+    def expect_wall(self, thickness: float, *, guessed: bool) -> None:
+        """Raise SimulationError where no wall of so many meters can lie behind the surface.
+
+        A `guessed` one cannot where the surface holds little more than it would.
+        """
+        if thickness >= self.width:
+            wanted = f"a thickness below the object's width of {millimeters(self.width, 3)}"
+            got, advice = millimeters(thickness, 3), "give a thinner wall"
+            raise SimulationError.expected(wanted, thickness, got=got, name="wall", advice=advice)
+        held = self.mean_thickness if guessed else None
+        if held is not None and thickness > TOLERANCES.max_wall * held:
+            most = 1000 * TOLERANCES.max_wall * held
+            wanted = f"at most {most:.3g} mm in a mesh that is {1000 * held:.3g} mm thick on average"
+            raise SimulationError.expected(wanted, thickness, got="more", name="wall", advice="use a solid body")
 
     def sheet(self) -> Trimesh:
         """Return what a wall can follow: the largest part, neighbors facing alike.
@@ -231,7 +289,7 @@ class CheckedSurface:
         """
         parts = _parts(self.mesh)
         areas = np.bincount(parts, weights=self.mesh.area_faces)
-        if areas[0] < (1.0 - _LOOSE) * areas.sum():
+        if areas[0] < (1.0 - TOLERANCES.max_loose_area) * areas.sum():
             raise several_parts("mesh", (10_000 * areas).tolist(), "cm2")
         return oriented(mesh_of(self.mesh.vertices, self.mesh.faces[parts == 0]))
 
@@ -239,8 +297,7 @@ class CheckedSurface:
 def checked(surface: Surface, *, log: Callable[[str], None]) -> CheckedSurface:
     """Return a surface with inverted parts turned and noise taken out, and log what was done and what is missing.
 
-    A mesh of very many triangles is thinned first. Raises SimulationError for points without triangles, damaged
-    triangles and a mesh without area.
+    A mesh of very many triangles is thinned first. Raises SimulationError as `weld`.
     """
     mesh, turned = _turned(thinned(_closed(weld(surface)), log=log))
     if turned:
@@ -252,18 +309,29 @@ def checked(surface: Surface, *, log: Callable[[str], None]) -> CheckedSurface:
             f"noisy mesh, adjacent triangles differ by {before:.0f} degrees on average: smoothed, vertices moved by "
             f"{1000 * moved:.2g} mm (RMS)"
         )
-    result = CheckedSurface(mesh)
-    opened = len(boundary_edges(mesh))
+    result, opened = CheckedSurface(mesh), len(boundary_edges(mesh))
     if opened:
         # No mistake that could be undone: what was seen from inside alone faces inwards, and its wall lies outside.
-        if _held(mesh) < -_VESSEL * mesh.area**1.5:
+        if _held(mesh) < -TOLERANCES.min_vessel * mesh.area**1.5:
             log(
                 "open mesh whose triangles face inwards: its wall is taken to be outside; reverse the triangles if the "
                 "wall is inside"
             )
-        helps = "trying to close the holes" if result.lids <= _LIDS else "give a wall thickness"
+        helps = "trying to close the holes" if result.lids <= TOLERANCES.max_lids else "give a wall thickness"
         log(f"the mesh has {opened} open edges: {helps}")
     return result
+
+
+def millimeters(meters: float, digits: int) -> str:
+    """Return a length with so many significant digits and no exponent."""
+    return f"{float(f'{1000 * meters:.{digits}g}'):g} mm"
+
+
+def principal_extents(places: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "3"]:
+    """Return the extents of points along the axes that they spread along, the least of these axes first, meters."""
+    places = places - places.mean(axis=0)
+    _, axes = np.linalg.eigh(places.T @ places)
+    return np.ptp(places @ axes, axis=0)
 
 
 def _closed(mesh: Trimesh) -> Trimesh:
@@ -271,7 +339,7 @@ def _closed(mesh: Trimesh) -> Trimesh:
 
     Holes as large as openings that an object may have stay.
     """
-    if not 0.0 < CheckedSurface(mesh).lids <= _SMALL:
+    if not 0.0 < CheckedSurface(mesh).lids <= TOLERANCES.max_small_lids:
         return mesh
     corners = np.concatenate([mesh.triangles, _lids(mesh)])
     points, rows = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
