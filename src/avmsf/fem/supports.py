@@ -15,22 +15,23 @@ from avmsf.fem.elements import SecondOrder
 FREE = "free"
 FREE_PRIOR = 0.7
 """Probability that an object is free; recordings are meant to be made so. The supports share the rest."""
-_HELD_DISTANCE = 0.01
-"""Distance from the lowest plane, or from an edge, over the body's size, within which nodes are held."""
-_MAX_EDGE_HEIGHT = 0.03
-"""Height above the lowest point, over the body's size, up to which an edge is a lower one."""
-_MIN_FACE_EXTENT = 0.1
-"""Extent of the lowest nodes over the body's size, below which they are a point and no face."""
-_MIN_EDGE_EXTENT = 0.3
-"""Least length of a straight lower edge over the body's size: the outline of a round base has no such side."""
-_MAX_BEND = 0.002
-"""Distance over the body's size of a corner from the line between its neighbors, below which that line is straight."""
-_MIN_LENGTH_RATIO = 0.5
-"""Least length of an edge over the longest one's."""
-_MAX_EDGES = 4
-"""Edges that are tried at most: a rectangular plate has so many."""
-_MAX_HELD_RATIO = 0.4
-"""Part of the surface's nodes that may be held: what is left would not ring."""
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What is held of a body; lengths are over its size."""
+
+    held_distance: float = 0.01  # from the lowest plane, or from an edge, within which nodes are held
+    max_edge_height: float = 0.03  # above the lowest point, up to which an edge is a lower one
+    min_face_extent: float = 0.1  # of the lowest nodes, below which they are a point and no face
+    min_edge_extent: float = 0.3  # of a straight lower edge: the outline of a round base has no such side
+    max_bend: float = 0.002  # of a corner from the line between its neighbors, below which that line is straight
+    min_length_ratio: float = 0.5  # of an edge over the longest one
+    max_edges: int = 4  # that are tried: a rectangular plate has so many
+    max_held_ratio: float = 0.4  # part of the surface's nodes that may be held: what is left would not ring
+
+
+TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,16 @@ class Support:
         places, size = mesh.nodes[outer], mesh.solid.size
         heights = places[:, 2] - places[:, 2].min()
         if self.edge is None:
-            return outer[heights <= _HELD_DISTANCE * size]
+            return outer[heights <= TOLERANCES.held_distance * size]
         start, end = np.array(self.edge)
         along = (end - start) / np.linalg.norm(end - start)
-        near = (np.abs(_cross(along, places[:, :2] - start)) <= _HELD_DISTANCE * size) & (
-            heights <= _MAX_EDGE_HEIGHT * size
+        near = (np.abs(_cross(along, places[:, :2] - start)) <= TOLERANCES.held_distance * size) & (
+            heights <= TOLERANCES.max_edge_height * size
         )
         if not near.any():
-            raise SimulationError.expected(f"nodes within {1000 * _HELD_DISTANCE * size:.2g} mm", name=self.name)
+            raise SimulationError.expected(
+                f"nodes within {1000 * TOLERANCES.held_distance * size:.2g} mm", name=self.name
+            )
         return outer[near]
 
 
@@ -64,12 +67,14 @@ def supports_of(mesh: SecondOrder) -> list[Support]:
     outer = mesh.surface[0]
     places, size = mesh.nodes[outer], mesh.solid.size
     heights = places[:, 2] - places[:, 2].min()
-    extent = float(np.linalg.norm(np.ptp(places[heights <= _HELD_DISTANCE * size, :2], axis=0)))
-    found = [Support(f"held at its lowest {'point' if extent < _MIN_FACE_EXTENT * size else 'face'}")]
-    for number, (start, end) in enumerate(_lower_edges(places[heights <= _MAX_EDGE_HEIGHT * size, :2], size), start=1):
+    extent = float(np.linalg.norm(np.ptp(places[heights <= TOLERANCES.held_distance * size, :2], axis=0)))
+    found = [Support(f"held at its lowest {'point' if extent < TOLERANCES.min_face_extent * size else 'face'}")]
+    for number, (start, end) in enumerate(
+        _lower_edges(places[heights <= TOLERANCES.max_edge_height * size, :2], size), start=1
+    ):
         edge = (float(start[0]), float(start[1])), (float(end[0]), float(end[1]))
         found.append(Support(f"held along lower edge {number}", edge))
-    return [each for each in found if len(each.nodes(mesh)) <= _MAX_HELD_RATIO * len(outer)]
+    return [each for each in found if len(each.nodes(mesh)) <= TOLERANCES.max_held_ratio * len(outer)]
 
 
 def _lower_edges(
@@ -88,13 +93,13 @@ def _lower_edges(
             place = kept.index(row)
             before, after = outline[kept[place - 1]], outline[kept[(place + 1) % len(kept)]]
             chord = after - before
-            if abs(_cross(chord, outline[row] - before)) <= _MAX_BEND * size * np.linalg.norm(chord):
+            if abs(_cross(chord, outline[row] - before)) <= TOLERANCES.max_bend * size * np.linalg.norm(chord):
                 kept.pop(place)
     corners = outline[kept]
     sides = [(corners[row - 1], corners[row]) for row in range(len(corners))]
     lengths = [float(np.linalg.norm(end - start)) for start, end in sides]
-    order = np.argsort(np.negative(lengths), kind="stable")[:_MAX_EDGES]
-    least = max(_MIN_EDGE_EXTENT * size, _MIN_LENGTH_RATIO * max(lengths))
+    order = np.argsort(np.negative(lengths), kind="stable")[: TOLERANCES.max_edges]
+    least = max(TOLERANCES.min_edge_extent * size, TOLERANCES.min_length_ratio * max(lengths))
     return [sides[row] for row in order if lengths[row] >= least]
 
 

@@ -29,25 +29,27 @@ from torch import Tensor
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.perturbation import Perturbations
 
-STIFFNESS, DENSITY, POISSON, FACTOR = 0.10, 0.04, 1.0, 0.5
-"""Prior standard deviations of the coefficients: of Young's modulus and density over their nominal values, of Poisson's
-ratio over a change of .05, and of the log factor on all frequencies over one round."""
-_POISSON_STEP = 0.05
-"""Change of Poisson's ratio that a coefficient of 1 stands for."""
-_MAX_ROUNDS = 6
-"""Most rounds; on simulated objects the evidence rises for 3 to 6."""
-_MIN_CERTAINTY = 0.7
-"""Probability of a shape from which on a mode is taken for it."""
-_FREQUENCY = 0.02, 0.002
-"""Standard deviation of log frequency at first, and at least."""
-_GAIN_NOISE = 0.02
-"""Least variance of gains that updating cannot explain, over their mean square."""
-_MIXING_GAP = 0.01
-"""Relative difference of squared frequencies below which shapes mix freely and first order says nothing."""
-_GROUP_GAP = 0.02
-"""Relative difference of squared frequencies within which shapes count as one group."""
-_MAX_STEP = 2.0
-"""Longest step of a coefficient, in prior standard deviations."""
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Prior standard deviations of the coefficients, and what counts as known and as near."""
+
+    stiffness_std: float = 0.10  # of Young's modulus over its nominal value
+    density_std: float = 0.04  # of the density over its nominal value
+    poisson_std: float = 1.0  # of Poisson's ratio over `poisson_step`
+    factor_std: float = 0.5  # of the log factor on all frequencies over one round
+    poisson_step: float = 0.05  # change of Poisson's ratio that a coefficient of 1 stands for
+    max_rounds: int = 6  # on simulated objects the evidence rises for 3 to 6
+    min_certainty: float = 0.7  # probability of a shape from which on a mode is taken for it
+    frequency_std: float = 0.02  # of log frequency at first
+    min_frequency_std: float = 0.002
+    min_gain_noise: float = 0.02  # variance of gains that updating cannot explain, over their mean square
+    mixing_gap: float = 0.01  # of squared frequencies, relative, below which shapes mix and first order says nothing
+    group_gap: float = 0.02  # of squared frequencies, relative, within which shapes count as one group
+    max_step: float = 2.0  # of a coefficient, in prior standard deviations
+
+
+TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +84,10 @@ def update(
     known = local.gains(points, directions).numpy()
     measured = frequency[usable].numpy(), values[:, usable].numpy()
     problem = _Problem(modes.frequency.numpy(), modes.perturbations, known, *measured)
-    theta, spread, best = np.zeros(len(problem.deviation)), _FREQUENCY[0], None
+    theta, spread, best = np.zeros(len(problem.deviation)), TOLERANCES.frequency_std, None
     found = match(local)
     nominal = highest = found.evidence
-    for step in range(_MAX_ROUNDS):
+    for step in range(TOLERANCES.max_rounds):
         theta, spread, volume = problem.solved(theta, found, found.centers[:, usable], spread, with_gains=step > 0)
         size = float(np.square(theta / problem.deviation).sum())
         if size > len(theta):
@@ -110,9 +112,12 @@ class _Problem:
     ) -> None:
         self.known, self.frequency, self.values = known, frequency, values
         self.squares = np.square(2.0 * np.pi * nominal)
-        self.forces = np.concatenate([perturbations.stiffness, _POISSON_STEP * perturbations.poisson[None]])
+        self.forces = np.concatenate([perturbations.stiffness, TOLERANCES.poisson_step * perturbations.poisson[None]])
         self.masses = perturbations.mass
-        self.deviation = np.repeat([STIFFNESS, POISSON, DENSITY], [len(self.forces) - 1, 1, len(self.masses)])
+        self.deviation = np.repeat(
+            [TOLERANCES.stiffness_std, TOLERANCES.poisson_std, TOLERANCES.density_std],
+            [len(self.forces) - 1, 1, len(self.masses)],
+        )
 
     def solution(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the squared angular frequencies and the updated shapes over the nominal ones, [nominal, updated]."""
@@ -140,11 +145,11 @@ class _Problem:
         """
         squares, shapes = self.solution(theta)
         centers = known.numpy()
-        together = np.abs(squares[:, None] - squares) <= _GROUP_GAP * squares[:, None]
+        together = np.abs(squares[:, None] - squares) <= TOLERANCES.group_gap * squares[:, None]
         grouped = together @ centers
         shape = centers.argmax(0)
         certainty = grouped[shape, np.arange(len(shape))]
-        mode = np.flatnonzero(certainty > _MIN_CERTAINTY)
+        mode = np.flatnonzero(certainty > TOLERANCES.min_certainty)
         shape, certainty = shape[mode], certainty[mode]
         forces = np.einsum("jk,ljm,mn->lkn", shapes, self.forces, shapes, optimize=True)
         masses = np.einsum("jk,ljm,mn->lkn", shapes, self.masses, shapes, optimize=True)
@@ -160,17 +165,21 @@ class _Problem:
                 rows.append(np.concatenate([row * weight, np.zeros((len(row), 1))], axis=1))
                 rest.append((value + row @ theta) * weight)
         matrix, right = np.concatenate(rows), np.concatenate(rest)
-        precision = np.append(self.deviation, FACTOR) ** -2.0
+        precision = np.append(self.deviation, TOLERANCES.factor_std) ** -2.0
         posterior = matrix.T @ matrix + np.diag(precision)
         solution = np.linalg.solve(posterior, matrix.T @ right)
         # Of the coefficients alone: the factor is not known of the nominal body either.
         alone = posterior[:-1, :-1] - np.outer(posterior[:-1, -1], posterior[-1, :-1]) / posterior[-1, -1]
         volume = 0.5 * np.linalg.slogdet(alone * self.deviation[:, None] * self.deviation)[1]
-        step = np.clip(solution[:-1] - theta, -_MAX_STEP * self.deviation, _MAX_STEP * self.deviation)
+        step = np.clip(
+            solution[:-1] - theta, -TOLERANCES.max_step * self.deviation, TOLERANCES.max_step * self.deviation
+        )
         # More than the root mean square of the fitted residuals: as many coefficients as modes fit them.
         left = apart - slopes @ step - solution[-1]
         if len(mode):
-            spread = float(np.clip(1.5 * np.sqrt(np.average(left**2, weights=certainty)), _FREQUENCY[1], spread))
+            spread = float(
+                np.clip(1.5 * np.sqrt(np.average(left**2, weights=certainty)), TOLERANCES.min_frequency_std, spread)
+            )
         return theta + step, spread, float(volume)
 
     def _gain_rows(
@@ -187,11 +196,11 @@ class _Problem:
         basis, _ = np.linalg.qr(own)
         sizes = np.linalg.lstsq(own, values, rcond=1e-3)[0]
         left = values - basis @ (basis.T @ values)
-        noise = np.sqrt(max(_GAIN_NOISE, 0.5 * (left @ left) / (values @ values)) * np.mean(values**2))
+        noise = np.sqrt(max(TOLERANCES.min_gain_noise, 0.5 * (left @ left) / (values @ values)) * np.mean(values**2))
         moved = np.zeros((len(values), len(self.deviation)))
         for k, size in zip(np.flatnonzero(group), sizes, strict=True):
             apart = squares[k] - squares
-            mixing = np.where(group, 0.0, apart / (apart**2 + (_MIXING_GAP * squares[k]) ** 2))
+            mixing = np.where(group, 0.0, apart / (apart**2 + (TOLERANCES.mixing_gap * squares[k]) ** 2))
             coefficients = np.concatenate([forces[:, :, k], -squares[k] * masses[:, :, k]]) * mixing
             moved += size * along @ coefficients.T
         moved -= basis @ (basis.T @ moved)
