@@ -56,8 +56,7 @@ def drawn_field(points: int, *, modes: int = 128, seconds: float, rate: float = 
         normals,
         frequency,
         6.9 * 10 ** torch.rand(modes, generator=draw, dtype=torch.float64),
-        torch.randn(points, modes, generator=draw),
-        0.5 * torch.randn(points, modes, generator=draw),
+        torch.complex(torch.randn(points, modes, generator=draw), 0.5 * torch.randn(points, modes, generator=draw)),
         0.02 * torch.randn(round(seconds * rate), generator=draw),
         rate,
         name="drawn",
@@ -65,7 +64,7 @@ def drawn_field(points: int, *, modes: int = 128, seconds: float, rate: float = 
 
 
 def _exports(field: SampledField) -> Report:
-    plain = replace(field, cosine=torch.zeros_like(field.cosine), noise=torch.zeros_like(field.noise))
+    plain = replace(field, gains=field.gains.real + 0j, noise=torch.zeros_like(field.noise))
     rows = field.spread(4)
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -78,7 +77,7 @@ def _exports(field: SampledField) -> Report:
             "uff": write_universal(field, place / "field.uff"),
         }
         found["export.gltf_error"] = _worst(_gltf_sounds(place / "field.glb", plain, rows), plain, rows)
-        turned = replace(plain, sine=torch.zeros_like(plain.sine), cosine=plain.sine)
+        turned = replace(plain, gains=1j * plain.gains)
         heard = _demo_sounds(place / "demo", plain, rows)
         found["export.demo_error"] = _worst(heard, turned, rows)
         found["export.demo_waveform_error"] = _worst(heard, plain, rows)

@@ -135,7 +135,7 @@ def test_the_demo_has_the_given_gaussians(field_file: Path, tmp_path: Path) -> N
     assert torch.equal(read_arrays(tmp_path / "demo")["means"], cloud.centers)
     true = SampledField.of(load(field_file), cloud.centers)
     gains = read_arrays(tmp_path / "demo" / "original")["gains"]
-    torch.testing.assert_close(gains.abs(), torch.hypot(true.sine, true.cosine))
+    torch.testing.assert_close(gains.abs(), true.gains.abs())
     words += ["--output", str(tmp_path / "few"), "--contacts", "11", "--variant", "glass"]
     assert main(["export", str(field_file), *words]) == 0
     assert json.loads((tmp_path / "few" / "manifest.json").read_text())["variants"] == ["glass"]
@@ -227,7 +227,7 @@ def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
 ) -> None:
     sampled = SampledField.of(load(field_file), limit=5)
     factor = torch.tensor([1.0, 1.0, 1e-3, 1.0, 1.0])[:, None]
-    silent = replace(sampled, sine=factor * sampled.sine, cosine=factor * sampled.cosine)
+    silent = replace(sampled, gains=factor * sampled.gains)
     monkeypatch.setattr("avmsf.cli.export._sampled", lambda *_: silent)
     words = ["export", str(field_file), "--to", "wavs", "--seconds", "0.05"]
     for given, keys in (([], 4), (["--position", "0", "0", "0"], 5)):

@@ -4,6 +4,7 @@ import csv
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,11 +77,9 @@ def test_another_sample_rate_changes_neither_pitch_nor_decay(tmp_path):
     assert apart(twice[::2], struck(field, 3)) < 2e-6
     # At 6 kHz the mode at 3300 Hz would alias to 2700 Hz, and is silent.
     lower = sounded(tmp_path / "thing.dsp", (3, 1.0, 0.0, 0), rate=6000, samples=1200)
-    sine = field.sine.clone()
-    sine[:, 3] = 0
-    silent = SampledField(
-        field.points, field.normals, field.frequency, field.damping, sine, field.cosine, torch.zeros(1200), 6000.0
-    )
+    gains = field.gains.clone()
+    gains[:, 3] = 0
+    silent = replace(field, gains=gains, noise=torch.zeros(1200), sample_rate=6000.0)
     assert apart(lower, struck(silent, 3)) < 2e-6
 
 
@@ -104,11 +103,7 @@ def test_silence_before_the_first_blow(tmp_path):
 
 
 def test_the_name_cannot_break_out_of_its_string():
-    field = table()
-    named = SampledField(
-        field.points, field.normals, field.frequency, field.damping, field.sine, field.cosine, field.noise, RATE,
-        name='a"; process = _; // \n b\\',
-    )  # fmt: skip
+    named = replace(table(), name='a"; process = _; // \n b\\')
     lines = faust_library(named, noise=False).splitlines()
     assert lines[1] == 'declare name "a; process = _; //  b";'
     assert not any(re.match(r"\s*process", line) for line in lines)

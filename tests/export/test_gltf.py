@@ -58,7 +58,7 @@ def struck(model: dict[str, np.ndarray], point: int, impulse: np.ndarray) -> np.
         2 * np.pi * float(f) * float(model["shapes"][m * points + point].astype(float) @ impulse)
         for m, f in enumerate(model["frequencies"])
     ]
-    return summed(amplitudes, np.zeros(MODES), model["frequencies"], model["decayRates"])
+    return summed(amplitudes, model["frequencies"], model["decayRates"])
 
 
 @pytest.mark.parametrize("force", [1.0, 3.0])
@@ -107,7 +107,7 @@ def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
     model = modal(document, arrays)
     extras = document["extensions"]["KHR_audio_rigid_bodies"]["modalModels"][0]["extras"]["avmsf"]
     rows = [arrays[extras[name]].reshape(MODES, POINTS)[:, 5] for name in ("sine", "cosine", "decayRates")]
-    whole = summed(rows[0], rows[1], model["frequencies"], rows[2]) + arrays[extras["noise"]]
+    whole = summed(rows[0] + 1j * rows[1], model["frequencies"], rows[2]) + arrays[extras["noise"]]
     assert apart(whole, field.render(torch.tensor([5]))[0]) < 3e-4
     plain = [struck(model, row, -field.normals[row].double().numpy()) for row in field.spread(8).tolist()]
     true = field.render(field.spread(8)).double().numpy()
@@ -122,7 +122,7 @@ def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
 def test_phases_alone_change_the_waveform_and_hardly_the_spectrum(tmp_path):
     # Modes far apart in frequency: a window of 40 ms tells them from one another.
     field = replace(table(phased=True), frequency=torch.tensor([412.3, 1077.7, 2081.25, 3300.1], dtype=torch.float64))
-    turned = replace(field, sine=0.1 * field.cosine, cosine=field.cosine)
+    turned = replace(field, gains=torch.complex(0.1 * field.gains.imag, field.gains.imag))
     written = write_gltf(turned, tmp_path / "thing.glb")
     assert written.error > 0.7
     assert 0.0 < written.spectrum_error_db < 0.7
@@ -212,10 +212,7 @@ def test_a_mesh_too_fine_for_viewers_is_reduced_and_keeps_its_colors(tmp_path, m
 
 def test_a_field_without_modes_is_refused(tmp_path):
     field = table()
-    empty = type(field)(
-        field.points, field.normals, field.frequency[:0], field.damping[:0], field.sine[:, :0], field.cosine[:, :0],
-        field.noise, field.sample_rate,
-    )  # fmt: skip
+    empty = replace(field, frequency=field.frequency[:0], damping=field.damping[:0], gains=field.gains[:, :0])
     with raises(ExportError, file="thing.glb", name="modes", value=0):
         write_gltf(empty, tmp_path / "thing.glb")
     with raises(ExportError, file="thing.obj", name="suffix", value=".obj"):

@@ -56,7 +56,7 @@ def test_the_formula_holds_in_plain_sums():
     sound = table.noise.double().clone()
     for mode, (frequency, damping) in enumerate(zip(table.frequency, table.damping[row], strict=True)):
         angle = 2 * torch.pi * frequency * times
-        swing = table.sine[row, mode] * torch.sin(angle) + table.cosine[row, mode] * torch.cos(angle)
+        swing = table.gains[row, mode].real * torch.sin(angle) + table.gains[row, mode].imag * torch.cos(angle)
         sound += torch.exp(-damping * times) * swing
     expected = sound_field.render(table.points[[row]])[0].double()
     torch.testing.assert_close(sound, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))

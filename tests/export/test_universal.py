@@ -38,7 +38,7 @@ def test_nodes_and_real_shapes_come_back(tmp_path):
         gains.append((shape * -field.normals.numpy()).sum(1))
     np.testing.assert_allclose(frequency, field.frequency, rtol=6e-6)
     np.testing.assert_allclose(damping, field.damping, rtol=2e-5)
-    np.testing.assert_allclose(np.array(gains).T, field.sine, atol=2e-5)
+    np.testing.assert_allclose(np.array(gains).T, field.gains.real, atol=2e-5)
 
 
 def test_complex_shapes_are_residues(tmp_path):
@@ -58,7 +58,7 @@ def test_responses_are_the_transforms_of_the_sounds(tmp_path):
     field = table(phased=True)
     quick = replace(field, frequency=field.frequency / 20, damping=field.damping * 4)
     rate = 1e6
-    sound = summed(quick.sine[2], quick.cosine[2], quick.frequency, quick.damping, samples=400_000, rate=rate)
+    sound = summed(quick.gains[2], quick.frequency, quick.damping, samples=400_000, rate=rate)
     times = np.arange(len(sound)) / rate
     weights = np.full(len(sound), 1 / rate)
     weights[0] /= 2
@@ -113,7 +113,7 @@ def test_one_damping_a_mode_is_said_to_be_a_mean(tmp_path):
     assert "mean by energy" in words
     assert "noise" in words
     assert not sets(tmp_path / "thing.unv", 58)
-    energy = field.sine.double().square()
+    energy = field.gains.real.double().square()
     mode = sets(tmp_path / "thing.unv", 55)[1]
     expected = float((energy * field.damping).sum(0)[1] / energy.sum(0)[1])
     assert mode["modal_damp_vis"] * 2 * math.pi * mode["freq"] == pytest.approx(expected, rel=2e-5)

@@ -1,7 +1,5 @@
 """Tables of points whose sound is known in full, for the tests of exports."""
 
-import math
-
 import numpy as np
 import torch
 
@@ -21,22 +19,23 @@ def table(
         torch.nn.functional.normalize(torch.randn(points, 3, generator=draw), dim=1),
         torch.tensor([412.3, 1077.7, 1081.25, 3300.1], dtype=torch.float64),
         damping if spatial else damping[0],
-        torch.randn(points, MODES, generator=draw),
-        torch.randn(points, MODES, generator=draw) * 0.5 if phased else torch.zeros(points, MODES),
+        torch.complex(
+            torch.randn(points, MODES, generator=draw),
+            torch.randn(points, MODES, generator=draw) * 0.5 if phased else torch.zeros(points, MODES),
+        ),
         torch.randn(SAMPLES, generator=draw) * (0.02 if noisy else 0.0),
         RATE,
         name="thing",
     )
 
 
-def summed(sine, cosine, frequency, damping, *, samples=SAMPLES, rate=RATE) -> np.ndarray:
+def summed(gains, frequency, damping, *, samples=SAMPLES, rate=RATE) -> np.ndarray:
     """Return the sum of damped waves, one at a time: an oracle that shares nothing with the package."""
     times = np.arange(samples) / rate
     total = np.zeros(samples)
-    for s, c, f, d in zip(sine, cosine, frequency, damping, strict=True):
-        total += math.e ** (-float(d) * times) * (
-            float(s) * np.sin(2 * np.pi * float(f) * times) + float(c) * np.cos(2 * np.pi * float(f) * times)
-        )
+    for gain, f, d in zip(gains, frequency, damping, strict=True):
+        angle = 2 * np.pi * float(f) * times
+        total += np.exp(-float(d) * times) * (float(gain.real) * np.sin(angle) + float(gain.imag) * np.cos(angle))
     return total
 
 

@@ -33,8 +33,9 @@ def struck_table(
         out,
         frequency,
         damping,
-        (size * (drawn(points, modes) - 0.5)).float(),
-        (0.3 * size * (drawn(points, modes) - 0.5)).float(),
+        torch.complex(size * (drawn(points, modes) - 0.5), 0.3 * size * (drawn(points, modes) - 0.5)).to(
+            torch.complex64
+        ),
         draw,
         rate,
         per_newton=True,

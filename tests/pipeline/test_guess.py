@@ -143,7 +143,7 @@ def test_a_guess_is_kept_whole_and_says_what_it_is(tmp_path: Path):
     with raises(FitError, name="field", value="body"):
         suggest(read)
     assert infer_material(read, option="--from")[0] == STEEL
-    assert SampledField.of(read, limit=20).sine.shape == (20, 12)
+    assert SampledField.of(read, limit=20).gains.shape == (20, 12)
 
 
 def test_what_cannot_vibrate_or_is_in_another_unit_is_refused():

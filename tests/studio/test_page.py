@@ -123,11 +123,11 @@ def test_the_table_tells_pitch_decay_and_level_at_the_contact(plain: "Page") -> 
     page.click("#tab-modes")
     cells = [float(text) for text in page.locator("tr[data-mode='3'] td").all_inner_texts()]
     table = plate_table()
-    level = 20 * float((table.sine[row, 3].abs() / table.sine[row].abs().max()).log10())
+    level = 20 * float((table.gains[row, 3].abs() / table.gains[row].abs().max()).log10())
     assert cells == pytest.approx([4, 1600.0, 6.9078 / 16.0, level], abs=0.06)
     page.click("th[data-column='level'] button")
     first = page.locator("tbody tr").first.get_attribute("data-mode")
-    assert first == str(int(table.sine[row].abs().argmax()))
+    assert first == str(int(table.gains[row].abs().argmax()))
 
 
 def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:

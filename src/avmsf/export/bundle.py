@@ -108,10 +108,10 @@ def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:
         "damping": field.damping.numpy(),
         "points": field.points.float().numpy(),
         "normals": field.normals.numpy(),
-        "sine": field.sine.numpy(),
+        "sine": field.gains.real.numpy(),
         "noise": field.noise.numpy(),
     }
-    return {**named, "cosine": field.cosine.numpy()} if bool(field.cosine.any()) else named
+    return {**named, "cosine": field.gains.imag.numpy()} if field.has_phases else named
 
 
 def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[str, Any]], dict[str, bytes]]:

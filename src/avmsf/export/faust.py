@@ -73,7 +73,7 @@ def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bo
 
 
 def _numbers_at_a_point(field: SampledField) -> int:
-    return field.sine.shape[1] * (1 + bool(field.cosine.any()) + (not field.shared_damping))
+    return field.gains.shape[1] * (1 + field.has_phases + (not field.shared_damping))
 
 
 def faust_library(field: SampledField, *, noise: bool) -> str:
@@ -81,7 +81,7 @@ def faust_library(field: SampledField, *, noise: bool) -> str:
 
     Raises ExportError for more than `MAX_NUMBERS`.
     """
-    points, modes = field.sine.shape
+    points, modes = field.gains.shape
     numbers = points * _numbers_at_a_point(field) + noise * field.samples
     if numbers > MAX_NUMBERS:
         samples = f", {field.samples} samples of noise" if noise else ""
@@ -109,7 +109,7 @@ def _bank(field: SampledField) -> str:
     lines = []
     for k, frequency in enumerate(field.frequency.tolist()):
         damping = repr(float(field.damping[k])) if field.shared_damping else _at_contact(field.damping[:, k])
-        sine, cosine = _at_contact(field.sine[:, k]), _at_contact(field.cosine[:, k])
+        sine, cosine = _at_contact(field.gains[:, k].real), _at_contact(field.gains[:, k].imag)
         lines.append(f"  resonator({frequency!r}, {damping},\n    {sine},\n    {cosine})")
     return "bank(contact) = _ <:\n" + ",\n".join(lines) + "\n  :> _;"
 

@@ -69,8 +69,7 @@ def _document(
     damping: Float[Tensor, " modes"],
 ) -> tuple[dict[str, Any], bytes]:
     """Return the JSON and the binary chunk, whose arrays are in the order of the accessors' numbers."""
-    energy = (sampled.sine.double().square() + sampled.cosine.double().square()).sum(0) / damping
-    order = torch.argsort(energy, descending=True, stable=True)
+    order = torch.argsort(sampled.power.sum(0) / damping, descending=True, stable=True)
     modal, extra, drawn = _modal(sampled, order, gains, damping), _extra(sampled, order), _drawn(geometry)
     views, accessors, content = _packed([*modal.items(), *extra.items(), *drawn.items()])
     number = count()
@@ -121,8 +120,9 @@ def _modal(
 def _extra(sampled: SampledField, order: Int[Tensor, " modes"]) -> dict[str, Tensor]:
     """Return the arrays that the draft has no place for, mode-major like the shapes."""
     arrays: dict[str, Tensor] = {}
-    if sampled.cosine.any():
-        arrays |= {"sine": sampled.sine[:, order].T.reshape(-1), "cosine": sampled.cosine[:, order].T.reshape(-1)}
+    if sampled.has_phases:
+        gains = sampled.gains[:, order].T.reshape(-1)
+        arrays |= {"sine": gains.real, "cosine": gains.imag}
     if not sampled.shared_damping:
         arrays["decayRates"] = sampled.damping[:, order].T.reshape(-1)
     if sampled.noise.any():
@@ -172,7 +172,7 @@ def _glb(document: Mapping[str, Any], content: bytes) -> bytes:
 
 def _remarks(sampled: SampledField) -> tuple[str, ...]:
     remarks = ["the draft leaves the absolute level to the player: an impulse of 1 N s is an impact of force 1 here"]
-    if sampled.cosine.any():
+    if sampled.has_phases:
         remarks.append("every mode starts as a sine, with the field's level; phases are in extras")
     if not sampled.shared_damping:
         remarks.append("each mode has one damping, its mean by energy; those of each point are in extras")

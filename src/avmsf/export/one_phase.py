@@ -25,7 +25,7 @@ def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
     It is the magnitude of sine and cosine part, so that levels do not change, with the sign of the projection on the
     phase that is common to all points, so that it changes at the mode's nodal lines.
     """
-    amplitude = torch.complex(field.sine.double(), field.cosine.double())
+    amplitude = field.gains.to(torch.complex128)
     phase = common_phase(amplitude)
     along = (amplitude * torch.polar(torch.ones_like(phase), -phase)).real
     return torch.where(along < 0, -amplitude.abs(), amplitude.abs()).float()
@@ -35,9 +35,8 @@ def shared_dampings(field: SampledField) -> Float64[Tensor, " modes"]:
     """Return one damping for each mode, 1/s: the mean over points, weighted by the mode's energy there."""
     if field.shared_damping:
         return field.damping
-    energy = field.sine.double().square() + field.cosine.double().square()
-    total = energy.sum(0)
-    weights = torch.where(total > 0, energy / total.clamp(min=1e-300), 1.0 / len(field))
+    total = field.power.sum(0)
+    weights = torch.where(total > 0, field.power / total.clamp(min=1e-300), 1.0 / len(field))
     return (weights * field.damping).sum(0)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Complex64, Float, Float32, Float64, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
@@ -31,8 +31,8 @@ _DRAWN = 4
 class SampledField:
     """Modal parameters of impacts at some points, perpendicular to the surface unless other directions are given.
 
-    The sound of an impact of force 1 at a point is the sum over modes of exp(-d t) (sine sin(2 pi f t) + cosine
-    cos(2 pi f t)), plus the noise.
+    The sound of an impact of force 1 at a point is the sum over modes of the imaginary part of gain exp(-d t + 2 pi i f
+    t), plus the noise: exp(-d t) (Re gain sin(2 pi f t) + Im gain cos(2 pi f t)).
     """
 
     points: Float[Tensor, "points 3"]
@@ -43,10 +43,8 @@ class SampledField:
     """Hz, all below half the sample rate."""
     damping: Float64[Tensor, "*points modes"]
     """1/s; one row for each point if the damping depends on the contact, otherwise one vector for all."""
-    sine: Float32[Tensor, "points modes"]
-    """Signed amplitudes of the sines, in the unit of the training sounds."""
-    cosine: Float32[Tensor, "points modes"]
-    """Signed amplitudes of the cosines; zero where all modes start as sines."""
+    gains: Complex64[Tensor, "points modes"]
+    """Amplitudes of the sines, and of the cosines times i, in the unit of the training sounds."""
     noise: Float32[Tensor, " samples"]
     """Residual noise: the realization that `SoundField.render` adds."""
     sample_rate: float
@@ -100,8 +98,7 @@ class SampledField:
             torch.nn.functional.normalize(normals.float(), dim=1),
             sound_field.bank.frequency[audible],
             damping * torch.cat(factors) if factors else damping,
-            gains.real.contiguous(),
-            gains.imag.contiguous(),
+            gains,
             sound_field.noise().float(),
             sound_field.sample_rate,
             sound_field.origin.per_newton,
@@ -120,9 +117,19 @@ class SampledField:
         return self.damping.ndim == 1
 
     @property
+    def has_phases(self) -> bool:
+        """Whether a mode starts otherwise than as a sine."""
+        return bool(self.gains.imag.any())
+
+    @property
+    def power(self) -> Float64[Tensor, "points modes"]:
+        """Squared magnitudes of the gains."""
+        return self.gains.real.double().square() + self.gains.imag.double().square()
+
+    @property
     def energy(self) -> Float64[Tensor, " points"]:
         """Energy of the modes over time of an impact of force 1, gain^2 / (4 d) summed."""
-        return ((self.sine.double().square() + self.cosine.double().square()) / (4.0 * self.damping)).sum(1)
+        return (self.power / (4.0 * self.damping)).sum(1)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -142,8 +149,7 @@ class SampledField:
             points=self.points[rows],
             normals=self.normals[rows],
             damping=self.damping if self.shared_damping else self.damping[rows],
-            sine=self.sine[rows],
-            cosine=self.cosine[rows],
+            gains=self.gains[rows],
         )
 
     def damping_at(self, rows: Int[Tensor, " chosen"]) -> Float64[Tensor, "chosen modes"]:
@@ -169,7 +175,7 @@ class SampledField:
         parts = []
         for chosen in torch.split(rows, _RENDER_BATCH):
             modes = synthesize(
-                torch.complex(self.sine[chosen], self.cosine[chosen]),
+                self.gains[chosen],
                 self.frequency,
                 self.damping if self.shared_damping else self.damping[chosen],
                 samples=length,

@@ -89,9 +89,9 @@ def response(
     place = torch.tensor([row])
     damping = field.damping_at(place)[0].numpy()
     turning = 2 * math.pi * field.frequency.numpy()
-    sine, cosine = field.sine[row].double().numpy(), field.cosine[row].double().numpy()
+    gains = field.gains[row].to(torch.complex128).numpy()
     total = np.zeros(len(frequencies), dtype=np.complex128)
-    for a, b, omega, rate in zip(sine, cosine, turning, damping, strict=True):
+    for a, b, omega, rate in zip(gains.real, gains.imag, turning, damping, strict=True):
         shifted = 2j * math.pi * frequencies + rate
         total += (a * omega + b * shifted) / (shifted**2 + omega**2)
     return total
@@ -132,10 +132,10 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
         "mode_n": mode + 1,
         "node_nums": np.arange(1, len(field) + 1),
     }
-    sine, cosine = (part[:, mode].double().numpy() for part in (field.sine, field.cosine))
-    if field.cosine.any():
+    gains = field.gains[:, mode].to(torch.complex128).numpy()
+    if field.has_phases:
         # sine sin + cosine cos = 2 Re(residue exp(i w t)).
-        values = 0.5 * (cosine - 1j * sine)
+        values = -0.5j * gains
         kind = {
             "analysis_type": _COMPLEX_MODE,
             "id3": "residues: sound = 2 Re sum shape exp(eig t)",
@@ -144,7 +144,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
             "modal_b": 0.0 + 0.0j,
         }
     else:
-        values = sine
+        values = gains.real
         undamped = math.hypot(frequency, rate / (2 * math.pi))
         kind = {
             "analysis_type": _NORMAL_MODE,

@@ -110,9 +110,10 @@ class Showcase:
         field = revision.field
         if field is None:
             points, normals = self._clickable()
-            nothing, empty = torch.zeros(len(points), 0), torch.zeros(0, dtype=torch.float64)
+            nothing = torch.zeros(len(points), 0, dtype=torch.complex64)
+            empty = torch.zeros(0, dtype=torch.float64)
             name = self.opened.name
-            return SampledField(points, normals, empty, empty, nothing, nothing, torch.zeros(0), 48_000.0, name=name)
+            return SampledField(points, normals, empty, empty, nothing, torch.zeros(0), 48_000.0, name=name)
         if not self._is_other_field(revision):
             before = self.current
             assert before.revision.field is not None
@@ -213,7 +214,6 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
         sampled,
         frequency=after.bank.frequency[audible],
         damping=sampled.damping[..., columns] * change,
-        sine=(sampled.sine[:, columns] * factor).float(),
-        cosine=(sampled.cosine[:, columns] * factor).float(),
+        gains=(sampled.gains[:, columns] * factor).to(torch.complex64),
         supporting=supporting_columns(after),
     )
