@@ -235,12 +235,6 @@ def test_patience_ends_a_trial_early_and_shortens_the_fit():
     assert max(final) == 20 + report["steps"]
 
 
-def test_few_contacts_are_not_divided():
-    report = fitted(VALIDATED, train=plate_impacts(5)).origin.report
-    assert report.keys() == {"gain_model", "damping", "validated", "damping_reason"}
-    assert (report["damping"], report["validated"]) == ("shared", False)
-
-
 def test_the_reason_for_the_form_of_damping_is_reported():
     one_step = replace(VALIDATED, warmup_steps=1, steps=1)
     few = {"train": plate_impacts(5)}
@@ -252,6 +246,8 @@ def test_the_reason_for_the_form_of_damping_is_reported():
         validated_fit(),
     )
     reasons = [field.origin.report["damping_reason"] for field in fits]
+    assert [field.origin.report["validated"] for field in fits] == [False] * 4 + [True]
+    assert {field.origin.report["damping"] for field in fits[:4]} == {"shared"}
     # Too few positions, as set, none held out, a gain model of one form, validated.
     assert len(set(reasons)) == len(fits)
     assert [reason in summary(field, 5) for reason, field in zip(reasons, fits, strict=True)] == [True] * len(fits)

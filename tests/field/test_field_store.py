@@ -203,7 +203,7 @@ def changed(tmp_path: Path, change: Change) -> Path:
         lambda whole: to_bytes({"bank.frequency": torch.ones(3)}, {"format": "pt"}),
         *(
             lambda whole, words=words: to_bytes(from_bytes(whole), {"avmsf": words})
-            for words in ("", "[]", "{", '"avmsf"', f'{{"format": {FORMAT}}}')
+            for words in ("", "[]", "[" * 100_000, "{", '"avmsf"', f'{{"format": {FORMAT}}}')
         ),
     ],
 )
@@ -260,6 +260,7 @@ def test_an_older_format_is_refused_with_the_command_that_makes_the_field_again(
         ("bank.frequency", lambda each: each * 0, None),
         ("bank.frequency", lambda each: each * torch.inf, None),
         ("residual.magnitude", lambda each: -each, None),
+        ("residual.magnitude", lambda each: each + 1e38, None),
     ],
 )
 def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, name, made, shape):
@@ -285,6 +286,10 @@ def test_tensors_of_another_form_or_of_impossible_values_are_refused(tmp_path, n
         (("sample_rate",), "44100", "sample_rate"),
         (("sample_rate",), -1.0, "sample_rate"),
         (("samples",), 0, "samples"),
+        # No recording has so many.
+        (("samples",), 10**9, "samples"),
+        *((("sample_rate",), rate, "sample_rate") for rate in (1e300, 1e-300, 10**400)),
+        (("gains", "modes"), 10**30, ...),
         (("sizes",), {}, "modes"),
         (("sizes", "bins"), True, "sizes.bins"),
         (("gains",), {}, "kind"),
@@ -333,6 +338,8 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path):
     bank = replace(field().bank, damping=-field().bank.damping)
     with raises(FieldFileError, file=path, name="bank.damping"):
         save(replace(field(), bank=bank), path)
+    with raises(FieldFileError, file=path, name="samples"):
+        save(replace(field(), samples=10**9), path)
     for broken in (float("nan"), torch.ones(1)):
         origin = replace(field().origin, report={"loss": broken})
         with raises(FieldFileError, file=path, name="origin.report"):
