@@ -10,7 +10,7 @@ import torch
 
 from avmsf.capture import CaptureSettings, check, read_capture, read_recording
 from avmsf.capture.audio import clipped_samples, constant_offset
-from avmsf.capture.measure import shared_problems
+from avmsf.capture.issues import shared_problems
 from avmsf.errors import CaptureError, CaptureWarning
 from factories.capture_folder import RATE, fill, ring
 from factories.raising import raises, warns

@@ -119,13 +119,13 @@ def test_directions_become_unit_vectors(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "rows", "row", "name", "value"),
     [
-        ("file,x,y", ("a.wav,0,0",), None, "z", ["file", "x", "y"]),
-        ("name,x,y", ("a.wav,0,0",), None, "file", ["name", "x", "y"]),
+        ("file,x,y", ("a.wav,0,0",), 1, "z", ["file", "x", "y"]),
+        ("name,x,y", ("a.wav,0,0",), 1, "file", ["name", "x", "y"]),
         ("file,x,y,z,nx", ("a.wav,0,0,0,1",), None, "ny", ["nx"]),
-        ("file,x,y,z,x", ("a.wav,0,0,0,1",), None, "x", ["file", "x", "y", "z", "x"]),
+        ("file,x,y,z,x", ("a.wav,0,0,0,1",), 1, "x", ["file", "x", "y", "z", "x"]),
         (HEADER, (), None, None, 0),
         ("", (), None, None, ""),
-        (HEADER, ("a.wav,0.1,0", *ROWS[1:]), 2, None, 3),
+        (HEADER, ("a.wav,0.1,0", *ROWS[1:]), 2, "z", 3),
         (HEADER, (ROWS[0], "b.wav,0,nan,0", ROWS[2]), 3, "y", "nan"),
         (HEADER, (ROWS[0], "b.wav,0,left,0", ROWS[2]), 3, "y", "left"),
         (HEADER, (ROWS[0], "b.wav,0,,0", ROWS[2]), 3, "y", ""),

@@ -100,7 +100,7 @@ WRONG: dict[str, dict[str, Any]] = {
     f"{TABLE} no-z.csv": {"file": "no-z.csv", "row": 1, "name": "z"},
     f"{TABLE} empty.csv": {"file": "empty.csv", "name": None},
     f"{TABLE} words.csv": {"file": "words.csv", "row": 3, "name": "y", "value": "left"},
-    f"{TABLE} short.csv": {"file": "short.csv", "row": 2, "name": "z", "value": ""},
+    f"{TABLE} short.csv": {"file": "short.csv", "row": 2, "name": "z", "value": 2},
     f"{TABLE} twice.csv": {"file": "twice.csv", "row": 3, "name": "file", "value": "a.wav"},
     f"{TABLE} outside.csv": {"file": "outside.csv", "row": 2, "name": "file", "value": "../a.wav"},
     f"render field.safetensors {AT} --output {LONG}/x.wav": {"file": f"{LONG}/x.wav", "value": TOO_LONG},

@@ -6,5 +6,5 @@ from .folder import check as check
 from .folder import read_capture as read_capture
 from .folder import write_capture as write_capture
 from .impacts import Impacts as Impacts
-from .measure import RecordingReport as RecordingReport
+from .issues import RecordingReport as RecordingReport
 from .settings import CaptureSettings as CaptureSettings

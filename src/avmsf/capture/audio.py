@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import stdtrit
 
 from avmsf._utils.files import is_lfs_pointer
-from avmsf.capture.filenames import missing_recording
+from avmsf.capture.filenames import similar_name
 from avmsf.errors import CaptureError, RecordingLengthError
 
 LOWEST_RATE = 100.0
@@ -136,8 +136,8 @@ def constant_offset(sound: Float64[np.ndarray, " frames"], *, sample_rate: float
     return offset if abs(offset) > limit else 0.0
 
 
-def read_recording(path: Path, name: str | None = None, *, advice: str = "check the path") -> Recording:
-    """Read every channel of a sound file. `advice` says what to do where there is none of a similar name.
+def read_recording(path: Path, name: str | None = None) -> Recording:
+    """Read every channel of a sound file, which messages call `name`.
 
     Raises `CaptureError` where the file is missing, corrupt, empty or longer than `MAX_SAMPLES`, or holds samples that
     are not numbers or larger than `MAX_PEAK`.
@@ -147,9 +147,13 @@ def read_recording(path: Path, name: str | None = None, *, advice: str = "check 
         if path.is_dir():
             raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
         if not path.is_file():
-            raise missing_recording(path, name, advice=advice)
+            near = similar_name(path.name, (each.name for each in path.parent.glob("*")))
+            message = (
+                f"{name}: expected a sound file, got none; {f'did you mean {near}?' if near else 'check the path'}"
+            )
+            raise CaptureError(message, file=path, value=near)
     except OSError as error:
-        message = f"{name[:80]}…: expected the name of a sound file, got {error.strerror!r}; {advice}"
+        message = f"{name[:80]}…: expected the name of a sound file, got {error.strerror!r}; shorten it"
         raise CaptureError(message, file=path, value=name) from error
     if is_lfs_pointer(path):
         raise CaptureError.expected("a sound file", got="a Git LFS pointer", file=name, advice="run git lfs pull")

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from avmsf._utils.text import listed
 from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.issues import TABLE, Issues
 from avmsf.capture.placement import Placement, check_placement
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.capture.table import TABLE, Impact, fitting_units, read_rows, valid_rows
+from avmsf.capture.table import Impact, fitting_units, parse_rows, read_rows
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points
 
@@ -33,7 +35,7 @@ def check_contacts(impacts: Sequence[Impact], settings: CaptureSettings) -> list
         places[tuple(round(value, 6) for value in label)].append(impact.line)
     repeated = [lines for lines in places.values() if len(lines) > 1]
     if repeated:
-        shown = "; ".join(", ".join(map(str, lines)) for lines in repeated[:5])
+        shown = "; ".join(listed(list(map(str, lines))) for lines in repeated[:5])
         more = " and more" * (len(repeated) > 5)
         message = f"{TABLE}: rows at the same contact: {shown}{more}; used as repeated impacts"
         remarks.append(CaptureWarning(message, file=TABLE, row=repeated[0][1], value=repeated))
@@ -87,7 +89,7 @@ def check_one_unit(folder: Path, settings: CaptureSettings) -> None:
     """
     impacts = list[Impact]()
     with suppress(CaptureError):
-        impacts += valid_rows(read_rows(folder)[0], settings)
+        impacts += parse_rows(read_rows(folder)[0], settings, Issues(collect=True))
     surface = find_surface(folder, settings) if impacts else None
     if surface is not None:
         check_surface(impacts, surface, settings=settings)

@@ -1,7 +1,7 @@
 """Names by which the files of a folder are recognized; importing this loads nothing that computes."""
 
 import re
-from collections.abc import Collection
+from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -107,21 +107,12 @@ def no_views(folder: Path) -> SceneError:
     )
 
 
-def missing_recording(path: Path, name: str, *, advice: str, used: Collection[Path] = ()) -> CaptureError:
-    """Return the error of a sound file that does not exist, with the file of the most similar name that is not `used`.
+def similar_name(name: str, names: Iterable[str]) -> str | None:
+    """Return the name of a file most similar to one, if any.
 
-    `advice` says what to do where there is none of a similar name.
+    A file with another number is another recording, not another spelling: 5.wav is similar to 005.wav, 040.wav is not.
     """
-    near = None
-    if not path.parent.is_dir():
-        advice = f"the folder {path.parent} does not exist either; {advice}"
-    else:
-        # A file with another number is another recording, not another spelling: 5.wav is similar to 005.wav, 040.wav
-        # is not. Sorted by name: the order of a folder differs from disk to disk.
-        unused = sorted(other.name for other in path.parent.iterdir() if other not in used)
-        numbers = {each: [int(digits) for digits in re.findall("[0-9]+", each)] for each in (*unused, path.name)}
-        wanted = numbers[path.name]
-        names = {each.lower(): each for each in unused if not wanted or numbers[each] in (wanted, [])}
-        near = next((names[each] for each in get_close_matches(path.name.lower(), names, n=1, cutoff=0.7)), None)
-        advice = advice if near is None else f"did you mean {near}?"
-    return CaptureError(f"{name}: expected a sound file, got none; {advice}", file=path, value=near)
+    numbers = {each: [int(digits) for digits in re.findall("[0-9]+", each)] for each in (*sorted(names), name)}
+    wanted = numbers.pop(name)
+    lower = {each.lower(): each for each, own in numbers.items() if not wanted or own in (wanted, [])}
+    return next((lower[each] for each in get_close_matches(name.lower(), lower, n=1, cutoff=0.7)), None)

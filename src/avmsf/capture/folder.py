@@ -3,7 +3,7 @@
 import csv
 import json
 import warnings
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -15,24 +15,10 @@ from avmsf.capture.audio import Recording, read_recording, wav_bytes
 from avmsf.capture.checks import check_contacts, check_surface, find_surface
 from avmsf.capture.filenames import files_in, number_key
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import RecordingReport, shared_problems, shortened
-from avmsf.capture.preprocess import Issues, check_levels, preprocess
+from avmsf.capture.issues import TABLE, Issues, RecordingReport, shared_problems, shortened
+from avmsf.capture.preprocess import check_levels, preprocess
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.table import (
-    DIRECTION,
-    FARTHEST,
-    FORCE,
-    REQUIRED,
-    TABLE,
-    Impact,
-    check_files_differ,
-    check_files_exist,
-    fitting_units,
-    in_folder,
-    is_missing,
-    parse_row,
-    read_rows,
-)
+from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, Impact, in_folder, present_impacts, read_impacts
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, write_surface
 
@@ -115,18 +101,7 @@ def check_and_read(folder: str | Path, settings: CaptureSettings | None = None) 
         impacts, _ = _walk(folder, settings, issues)
     except CaptureError as error:
         return CaptureReport(False, (), (str(error),)), None
-    failed = [RecordingReport(file, line, False, (str(error),)) for file, line, error in issues.failures]
-    far = [(line, error.value) for _, line, error in issues.failures if error.name == "unit"]
-    if len(far) > 1:
-        # One message for all, with which they are listed together.
-        largest = max(abs(value) for _, written in far for value in written)
-        message = (
-            f"expected a contact within {FARTHEST:g} m of the origin, got coordinates of up to {largest:g} "
-            f"(unit = {settings.unit!r}): {fitting_units(largest)}"
-        )
-        failed = [replace(each, problems=(message,)) if each.line in dict(far) else each for each in failed]
-    reports = sorted([*issues.reports, *failed], key=lambda report: report.line)
-    remarks = []
+    reports, remarks = sorted(issues.reports, key=lambda report: report.line), []
     if issues.uncut:
         reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
         remarks.append(UNCUT)
@@ -134,46 +109,32 @@ def check_and_read(folder: str | Path, settings: CaptureSettings | None = None) 
     if names == sorted(names) != sorted(names, key=number_key):
         remarks.append(TEXT_ORDER)
     problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, set(names))]
-    readable = not issues.errors and not failed
+    readable = not issues.errors and all(each.readable for each in reports)
     report = CaptureReport(readable, tuple(reports), tuple(problems), tuple(remarks))
     return report, impacts if readable else None
 
 
 def _walk(folder: Path, settings: CaptureSettings, issues: Issues) -> tuple[Impacts | None, Surface | None]:
     """Return the impacts and the part of the surface that they lie on; add to what is wrong."""
-    rows, warned = read_rows(folder)
-    issues.warnings += warned
-    parsed = []
-    for row in rows:
-        with issues.keep(row):
-            parsed.append(parse_row(row, settings))
-    with issues.keep():
-        check_files_differ(parsed)
-    with issues.keep():
-        check_files_exist(folder, parsed)
-    issues.warnings += check_contacts(parsed, settings)
-    surface = None
+    listed_impacts, surface = read_impacts(folder, settings, issues), None
+    issues.warnings += check_contacts(listed_impacts, settings)
     with issues.keep():
         surface = find_surface(folder, settings)
-        if surface is not None and parsed:
-            surface, warned = check_surface(parsed, surface, settings=settings)
+        if surface is not None and listed_impacts:
+            surface, warned = check_surface(listed_impacts, surface, settings=settings)
             issues.warnings += warned
-    impacts, _ = preprocess(read_recordings(folder, parsed, issues), settings, issues)
+    impacts, _ = preprocess(read_recordings(folder, listed_impacts, issues), settings, issues)
     with issues.keep():
         issues.warnings += check_levels(issues.sounds)
     return impacts, surface
 
 
-def read_recordings(folder: Path, impacts: Iterable[Impact], issues: Issues) -> Iterator[tuple[Impact, Recording]]:
-    """Read the recordings of impacts one after the other; add what is wrong with those that cannot be read."""
-    advice = f"copy it there, or remove its row from {TABLE}"
-    for each in impacts:
+def read_recordings(folder: Path, impacts: Sequence[Impact], issues: Issues) -> Iterator[tuple[Impact, Recording]]:
+    """Read the recordings of impacts one after the other; `issues` raise or collect what is wrong with them."""
+    for each in present_impacts(folder, impacts, issues):
         recording = None
-        with issues.keep(each):
-            # Reading would name similar files, for which it compares up to a thousand names.
-            if is_missing(folder / each.file):
-                raise CaptureError.expected("a sound file", file=each.file)
-            recording = read_recording(folder / each.file, each.file, advice=advice)
+        with issues.keep((each.file, each.line)):
+            recording = read_recording(folder / each.file, each.file)
         if recording is not None:
             yield each, recording
 

@@ -1,14 +1,13 @@
 """Quality of one recording: its length, level, noise, clipping, onset and second impacts; and whether it is of one."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
 from avmsf._utils.text import counted
 from avmsf.capture.audio import EIGHT_BIT, LOSSLESS, Recording, clipped_samples
+from avmsf.capture.issues import RecordingReport
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_impact, find_second_push
 from avmsf.capture.prepare import Prepared, remove_rumble
 from avmsf.capture.settings import CaptureSettings
@@ -21,36 +20,6 @@ LOWEST_PEAK_DB = -50.0
 
 _MIN_RISE = 10 ** (6.0 / 20.0)
 """How far the loudest hundredth of a second must stand above the quietest, 6 dB: the least that an impact does."""
-
-
-@dataclass(frozen=True)
-class RecordingReport:
-    """One row of `avmsf check`: plain values; those that could not be measured are None."""
-
-    file: str
-    line: int
-    """Line of impacts.csv."""
-    readable: bool
-    """Whether the capture can be read with this recording in it."""
-    problems: tuple[str, ...] = ()
-    """What is wrong and what to do about it."""
-    seconds: float | None = None
-    """Length of the whole file, as recorded."""
-    sample_rate: float | None = None
-    """The file's own, Hz."""
-    channels: int | None = None
-    coding: str | None = None
-    """PCM_16, FLOAT and so on."""
-    peak_db: float | None = None
-    """Peak of the response against full scale (against 1.0 in float files), dB."""
-    noise_db: float | None = None
-    """Noise (root mean square) against the peak, dB: before the impact, or else in the quietest tenth of the file."""
-    onset_seconds: float | None = None
-    """When the impact begins in the file, seconds as recorded."""
-    clipped: int | None = None
-    """Samples on flat tops, in the response and the force."""
-    double_hit_seconds: float | None = None
-    """When a second impact begins in the file, within the length that is used; None without one."""
 
 
 def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettings, line: int) -> RecordingReport:
@@ -105,27 +74,6 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         clipped=clipped,
         double_hit_seconds=None if second is None else second / rate,
     )
-
-
-def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
-    """Return the recordings' problems, each with its file; common ones once, with the first names."""
-    places: dict[str, list[str]] = {}
-    for report in reports:
-        for problem in report.problems:
-            places.setdefault(problem.removeprefix(f"{report.file}: "), []).append(report.file)
-    sentences = []
-    for problem, files in places.items():
-        # Errors of the table's reader begin with the row.
-        where = "" if problem.startswith("impacts.csv") else f"{files[0]}: "
-        if len(files) > 1:
-            where = f"{len(files)} recordings ({', '.join(files[:3])}{', …' * (len(files) > 3)}): "
-        sentences.append(f"{where}{problem}")
-    return sentences
-
-
-def shortened(sentences: Sequence[str], *, most: int = 5) -> str:
-    """Return the first messages, and how many more there are."""
-    return "; ".join([*sentences[:most], *([f"and {len(sentences) - most} more"] if len(sentences) > most else [])])
 
 
 def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:

@@ -8,16 +8,16 @@ discrete is fitted by iterated closest points (Besl and McKay, 1992). They are c
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from avmsf._utils.text import listed
+from avmsf.capture.settings import unit_named
 from avmsf.errors import CaptureError, FitError
 from avmsf.mesh.surface import MOST_POINTS
 
@@ -28,9 +28,8 @@ On the aircraft, measured by hand against a nominal surface, the farthest of 74 
 """
 WRONG_ROWS = 0.1
 """Part of the contacts up to which those that lie off count as single mistakes, not as one made with all of them."""
-UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "inches", 0.3048: "feet"}
 FACTORS = (1.0, *(power for size in (1000.0, 100.0, 10.0, 25.4, 0.0254, 0.3048) for power in (size, 1 / size)))
-_IDENTITY, _ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+"""Ratios of units that one of the two may count by mistake."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,8 @@ class _Bounds:
 
     spot: float = 0.05  # diagonal of the contacts below which their unit must be another
     spot_contacts: int = 5  # from which on a small spread alone shows that
-    least_spread: float = 0.4  # diagonal that another unit must leave: what is shrunk enough fits anywhere
+    least_spread: float = 0.4  # diagonal that another scale must leave: what is shrunk enough fits anywhere
+    most_spread: float = 1.2  # diagonal that it may leave
     resolution: float = 1 / 200  # distance below which contacts lie equally well: they are not exact
     log_size: float = 0.25  # logarithm of a scale beyond which it is another object's: no material explains that
     outlier_nats: float = 3.0  # of a contact that is a mistake of its own, as one of twenty is
@@ -58,51 +58,47 @@ class FrameMismatch:
     """What may have been done to all contacts, by how it is undone: x becomes `factor` * `axes` x + `shift`."""
 
     factor: float = 1.0
-    axes: Float[Tensor, "3 3"] = _IDENTITY
-    """A permutation with signs; float64."""
-    shift: Float[Tensor, " 3"] = _ORIGIN
-    """Meters; float64."""
+    axes: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """A permutation with signs."""
+    shift: Float64[np.ndarray, " 3"] = field(default_factory=lambda: np.zeros(3))
+    """Meters."""
     distance: float = 0.0
     """Meters within which nine of ten contacts lie off the surface once it is undone."""
     stated: str = ""
     """Words of a file that says so; then `axes` is any rotation."""
 
-    def undo(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts 3"]:
-        """Return where the contacts were meant, float64."""
-        return self.factor * contacts.double() @ self.axes.T + self.shift
+    def undo(self, contacts: Float64[np.ndarray, "contacts 3"]) -> Float64[np.ndarray, "contacts 3"]:
+        """Return where the contacts were meant."""
+        return self.factor * contacts @ self.axes.T + self.shift
 
     @property
     def turned(self) -> bool:
         """Whether the axes are others, or mirrored."""
-        return not torch.equal(self.axes, _IDENTITY)
+        return not np.array_equal(self.axes, np.eye(3))
 
     @property
     def unit_only(self) -> bool:
         """Whether the unit alone is wrong."""
-        return not self.turned and not bool(self.shift.any())
+        return not self.turned and not self.shift.any()
 
     @property
     def unit(self) -> str | None:
         """Name of the unit that one of the two counts by mistake; None for another factor."""
-        size = min(self.factor, 1 / self.factor)
-        return next((name for meters, name in UNITS.items() if abs(size / meters - 1) < 1e-6), None)
+        return None if self.factor == 1 else unit_named(min(self.factor, 1 / self.factor))
 
     def __str__(self) -> str:
         within, steps = f"they lie within {_length(self.distance)} of it", []
         if self.stated:
             return f"{within} once moved as {self.stated} says that the object was: give both in one frame"
         if self.factor != 1:
-            whose = "the surface's unit" if self.factor > 1 else "their unit"
-            unit = f" (is {whose} {self.unit}?)" if self.unit else ""
-            done = "multiplied" if self.factor > 1 else "divided"
-            steps.append(f"{done} by {max(self.factor, 1 / self.factor):.4g}{unit}")
+            whose = "the surface's" if self.factor > 1 else "their"
+            steps.append(f"multiplied by {self.factor:.4g}" + (f" (is {whose} unit {self.unit}?)" if self.unit else ""))
         if self.turned:
-            columns = enumerate(self.axes.abs().argmax(1).tolist())
-            names = ", ".join("-" * bool(self.axes[row, column] < 0) + "xyz"[column] for row, column in columns)
-            mirrored = " (are they mirrored?)" if float(torch.linalg.det(self.axes)) < 0 else ""
-            steps.append(f"with (x, y, z) taken as ({names}){mirrored}")
+            names = ["-" * bool(row.min() < 0) + "xyz"[int(np.abs(row).argmax())] for row in self.axes]
+            mirrored = " (are they mirrored?)" if np.linalg.det(self.axes) < 0 else ""
+            steps.append(f"with (x, y, z) taken as ({', '.join(names)}){mirrored}")
         if self.shift.any():
-            steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift.tolist())}) m")
+            steps.append(f"moved by ({', '.join(f'{value:.3g}' for value in self.shift)}) m")
         return f"{', '.join(steps)}, {within}"
 
 
@@ -110,8 +106,8 @@ class FrameMismatch:
 class Placement:
     """How contacts lie to a surface."""
 
-    distances: Float[Tensor, " contacts"]
-    """From each contact to the surface's nearest point, meters, float64."""
+    distances: Float64[np.ndarray, " contacts"]
+    """From each contact to the surface's nearest point, meters."""
     diagonal: float
     """Of the object's bounding box, meters."""
     spread: float
@@ -124,8 +120,8 @@ class Placement:
     @cached_property
     def off(self) -> tuple[int, ...]:
         """Rows of the contacts off the surface, the farthest first."""
-        rows = torch.argsort(self.distances, descending=True)
-        return tuple(row for row in rows.tolist() if float(self.distances[row]) > self.tolerance)
+        rows = np.argsort(-self.distances, kind="stable")
+        return tuple(rows[self.distances[rows] > self.tolerance].tolist())
 
     @property
     def mostly_off(self) -> bool:
@@ -155,29 +151,25 @@ class Placement:
     @property
     def misplaced(self) -> bool:
         """Whether no shape can be used as it lies: turned, mirrored, of another size, or with most contacts off."""
-        mismatch = self.mismatch
-        if float(self.distances.median()) > self.tolerance:
-            return True
-        resized = mismatch is not None and abs(math.log(mismatch.factor)) > _BOUNDS.log_size
-        return mismatch is not None and (mismatch.turned or self.mostly_off or resized)
+        if self.mismatch is None or float(np.median(self.distances)) > self.tolerance:
+            return float(np.median(self.distances)) > self.tolerance
+        return self.mismatch.turned or self.mostly_off or abs(math.log(self.mismatch.factor)) > _BOUNDS.log_size
 
     def describe(self, names: Sequence[str] = (), *, what: str = "surface") -> str:
         """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
         if self.on_surface:
             return ""
         count, farthest = len(self.distances), float(self.distances.max())
-        few = self.mismatch is None and not self.shrunken and 2 * len(self.off) < count
+        few = self.mismatch is None and 0 < 2 * len(self.off) < count
         which = f"{len(self.off)} of {count} contacts lie" if few else "the contacts lie"
         found = f"{which} up to {_length(farthest)} ({farthest / self.diagonal:.3g} object diagonals) off the {what}"
-        if not self.off and self.shrunken:
+        if self.shrunken and not self.off:
             found = f"the contacts lie within {_length(self.spread)} on an object {_length(self.diagonal)} across"
         if self.mismatch is not None:
             return f"{found}; {self.mismatch}"
         if few:
-            shown = ", ".join(names[row] if names else f"row {row}" for row in self.off[:8])
-            return f"{found}, the others on it; check {shown}{', …' * (len(self.off) > 8)}"
-        if not self.off:
-            return f"{found}; check that both are in one frame and unit"
+            shown = listed([names[row] if names else f"row {row}" for row in self.off])
+            return f"{found}, the others on it; check {shown}"
         return (
             f"{found}, and no change of unit, axes or origin explains it: the {what} and the contacts are in different "
             "frames; give both in one (structure from motion chooses its own: see docs/visual-inputs.md; nerfstudio "
@@ -202,16 +194,17 @@ def check_placement(
         got = f"{len(cloud)} at one position"
         raise CaptureError.expected("points of an object with an extent", diagonal, got=got, name="points")
     tree = cKDTree(cloud)
-    some = _some(cloud, MOST_POINTS)
     # Between points that lie far apart, a contact on the surface is far from all of them.
-    spacing = float(np.quantile(tree.query(some, k=min(2, len(cloud)))[0].reshape(len(some), -1)[:, -1], 0.95))
+    nearest = tree.query(_evenly(cloud, MOST_POINTS), k=[min(2, len(cloud))])[0]
+    spacing = float(np.quantile(nearest, 0.95))
     placement = Placement(
-        distances=torch.from_numpy(tree.query(places)[0]),
+        distances=tree.query(places)[0],
         diagonal=diagonal,
         spread=float(np.linalg.norm(np.ptp(places, axis=0))),
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
-    search = _Search(tree, _some(places, _BOUNDS.max_contacts), placement, spacing=spacing)
+    resolution = max(spacing, _BOUNDS.resolution * diagonal)
+    search = _Search(tree, _evenly(places, _BOUNDS.max_contacts), placement, resolution)
     return replace(placement, mismatch=search.find(stated))
 
 
@@ -225,25 +218,33 @@ def expect_placed(
     message.
     """
     placement = check_placement(contacts, points)
-    if not placement.misplaced:
-        return
-    raise FitError(
-        f"expected contacts on the surface for elastic mode shapes, but {placement.describe(names)}. Bring both into "
-        "one frame and unit (unit, surface_unit in capture.toml), or use a gain model without elastic mode shapes",
-        name="contacts",
-        value=float(placement.distances.max()),
-    )
+    if placement.misplaced:
+        raise FitError.expected(
+            "contacts on the surface for elastic mode shapes",
+            float(placement.distances.max()),
+            got=placement.describe(names),
+            name="contacts",
+            advice="bring both into one frame and unit (unit, surface_unit in capture.toml), or use a gain model "
+            "without elastic mode shapes",
+        )
 
 
+@dataclass(frozen=True, eq=False)
 class _Search:
     """The similarity of the least description length."""
 
-    def __init__(self, tree: cKDTree, contacts: np.ndarray, placement: Placement, *, spacing: float) -> None:
-        self.tree, self.contacts, self.placement = tree, torch.from_numpy(contacts), placement
-        self.resolution = max(spacing, _BOUNDS.resolution * placement.diagonal)
-        widest = max(2 * self.resolution, float(placement.distances.max()))
+    tree: cKDTree
+    contacts: Float64[np.ndarray, "contacts 3"]
+    placement: Placement
+    resolution: float
+    """Meters below which contacts lie equally well."""
+
+    @cached_property
+    def deviations(self) -> Float64[np.ndarray, "steps 1"]:
+        """Standard deviations of distances to choose from, by half as much more each, meters."""
+        widest = max(2 * self.resolution, float(self.placement.distances.max()))
         steps = math.ceil(math.log(widest / self.resolution, 1.5)) + 1
-        self.deviations = np.geomspace(self.resolution, widest, steps)[:, None]
+        return np.geomspace(self.resolution, widest, steps)[:, None]
 
     def find(self, stated: Sequence[FrameMismatch]) -> FrameMismatch | None:
         """Return the best similarity; None where that changes nothing.
@@ -259,8 +260,8 @@ class _Search:
             if near <= tolerance and math.log(2) + self.nats(each) < present:
                 return replace(each, distance=far)
         starts = sorted(self.starts(), key=lambda start: start[0] + self.nats(start[1]))[: _BOUNDS.max_starts]
-        fitted = [(code, self.fit(start, scaled, shifted)) for code, start, scaled, shifted in starts]
-        for nats, each in sorted(((code + self.nats(each), each) for code, each in fitted), key=lambda pair: pair[0]):
+        fitted = [(nats, self.fit(*start)) for nats, *start in starts]
+        for nats, each in sorted(((nats + self.nats(each), each) for nats, each in fitted), key=lambda pair: pair[0]):
             far = float(np.quantile(self.distances(each), 0.9))
             # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
             spread = each.factor * self.placement.spread or math.inf
@@ -268,8 +269,8 @@ class _Search:
                 return replace(each, distance=far)
         return None
 
-    def distances(self, mismatch: FrameMismatch) -> Float[np.ndarray, " contacts"]:
-        return self.tree.query(mismatch.undo(self.contacts).numpy())[0]
+    def distances(self, mismatch: FrameMismatch) -> Float64[np.ndarray, " contacts"]:
+        return self.tree.query(mismatch.undo(self.contacts))[0]
 
     def nats(self, mismatch: FrameMismatch) -> float:
         """Return the nats of the distances that a similarity leaves.
@@ -277,63 +278,60 @@ class _Search:
         Each is normal, with a standard deviation chosen for the similarity, or the contact is a mistake of its own and
         lies anywhere. Distances over the scale make what is shrunk no better than what it was.
         """
-        if not mismatch.factor > 0:
+        diagonal, factor = self.placement.diagonal, mismatch.factor
+        if not factor > 0:
             return math.inf
         distances = np.maximum(self.distances(mismatch), self.resolution)
-        spread, diagonal = mismatch.factor * self.placement.spread, self.placement.diagonal
-        near = np.square(distances / self.deviations) / 2 + np.log(self.deviations / min(mismatch.factor, 1.0))
+        near = np.square(distances / self.deviations) / 2 + np.log(self.deviations / min(factor, 1.0))
         anywhere = math.log(max(diagonal, self.placement.spread)) + _BOUNDS.outlier_nats
         # Contacts within a spot of an object are as unlikely as the spot is small.
-        spot = max(0.0, math.log(_BOUNDS.spot * diagonal / spread)) if spread else 0.0
+        spot = max(0.0, math.log(_BOUNDS.spot * diagonal / (factor * self.placement.spread or math.inf) or 1.0))
         return float(np.minimum(near, anywhere).sum(axis=1).min()) + len(distances) * spot
 
     def starts(self) -> Iterator[tuple[float, FrameMismatch, bool, bool]]:
         """Yield similarities, the nats of their parameters, and whether their scale and their shift are fitted."""
         spread, diagonal, count = self.placement.spread, self.placement.diagonal, len(self.contacts)
+        least, most = _BOUNDS.least_spread * diagonal, _BOUNDS.most_spread * diagonal
         # What is symmetric but for errors of this size does not show which way it lies.
         off = float(self.placement.distances.max()) > self.placement.tolerance / 2
-        least, ratio = _BOUNDS.least_spread * diagonal, diagonal / spread if spread else 1.0
-        fits = [each for each in FACTORS if each == 1 or not spread or least <= each * spread <= 1.2 * diagonal]
-        scales, shifts = [(factor, False) for factor in fits], [False]
+        fitting = (factor for factor in FACTORS if factor == 1 or not spread or least <= factor * spread <= most)
+        scales, shifts = [(factor, False) for factor in fitting], [False]
         if count >= _BOUNDS.fit_contacts:
-            scales, shifts = scales + [(factor, True) for factor in (1.0, 0.8 * ratio, ratio)], [False, True]
-        # A copy, for the tree's points cannot be written to, which torch warns of.
-        points = torch.from_numpy(self.tree.data.copy())
-        middle, own = (each.amin(0) + each.amax(0) for each in (points, self.contacts))
-        for rarity, axes in _axes() if off and count >= _BOUNDS.axes_contacts else [(0.0, _IDENTITY)]:
+            scales += [(factor, True) for factor in (1.0, 0.8 * diagonal / spread, diagonal / spread) if spread]
+            shifts = [False, True]
+        middle, own = ((each.min(axis=0) + each.max(axis=0)) / 2 for each in (self.tree.data, self.contacts))
+        for rarity, axes in _signed_permutations() if off and count >= _BOUNDS.axes_contacts else [(1, np.eye(3))]:
             for (factor, scaled), shifted in itertools.product(scales, shifts):
-                # From box to box.
-                start = FrameMismatch(factor, axes, (middle - factor * axes @ own) / 2 if shifted else _ORIGIN)
+                start = FrameMismatch(factor, axes, (middle - factor * axes @ own) * shifted)
                 # Nothing in meters takes two units.
                 units = 2 if scaled or (factor != 1 and start.unit is None) else int(factor != 1)
-                nats = rarity + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
+                nats = math.log(rarity) + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
                 yield nats, start, scaled, shifted
 
     def fit(self, start: FrameMismatch, scaled: bool, shifted: bool) -> FrameMismatch:
         """Return the similarity with the scale and the shift that iterated closest points find from a start."""
         found, source = start, self.contacts @ start.axes.T
-        old = source.mean(0) if shifted else _ORIGIN
-        size = float((source - old).square().sum())
+        old = source.mean(axis=0) * shifted
+        size = float(np.square(source - old).sum())
         for _ in range(_BOUNDS.max_steps if scaled or shifted else 0):
-            target = torch.from_numpy(self.tree.data[self.tree.query(found.undo(self.contacts).numpy())[1]])
-            new = target.mean(0) if shifted else old
+            target = self.tree.data[self.tree.query(found.undo(self.contacts))[1]]
+            new = target.mean(axis=0) * shifted
             factor = float(((source - old) * (target - new)).sum()) / size if scaled and size else found.factor
             last, found = found, replace(found, factor=factor, shift=new - factor * old)
-            if factor == last.factor and torch.equal(found.shift, last.shift):
+            if factor == last.factor and np.array_equal(found.shift, last.shift):
                 break
         return found
 
 
-def _axes() -> list[tuple[float, Float[Tensor, "3 3"]]]:
-    """Return the 48 signed permutations, each with the nats of its rarity: none, y-up for z-up, turns, mirrors."""
-    turns = torch.from_numpy(Rotation.create_group("O").as_matrix().round()) + 0.0
-    # A quarter turn about x takes y to z.
-    rarities = [1 if turn.trace() == 3 else 4 if turn[0, 0] == 1 and turn.trace() == 1 else 24 for turn in turns]
-    found = [(math.log(rarity), turn) for rarity, turn in zip(rarities, turns, strict=True)]
-    return found + [(math.log(48), 0.0 - turn) for turn in turns]
+def _signed_permutations() -> Iterator[tuple[int, Float64[np.ndarray, "3 3"]]]:
+    """Yield the 48 signed permutations of the axes, each with how rare it is: none, y-up for z-up, turns, mirrors."""
+    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
+        axes = np.diag(signs) @ np.eye(3)[list(order)]
+        about_x = axes[0, 0] == 1 and axes.trace() == 1
+        yield 48 if np.linalg.det(axes) < 0 else 1 if axes.trace() == 3 else 4 if about_x else 24, axes
 
 
-def _some(places: np.ndarray, most: int) -> np.ndarray:
+def _evenly(places: np.ndarray, most: int) -> np.ndarray:
     return places[:: -(-len(places) // most)]
 
 

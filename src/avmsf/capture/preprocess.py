@@ -5,9 +5,8 @@ Where the sounds start in their files is decided for all recordings of a capture
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,10 +14,11 @@ import torch
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import RecordingReport, measure
+from avmsf.capture.issues import Issues
+from avmsf.capture.measure import measure
 from avmsf.capture.prepare import MIN_MARGIN, Prepared, margin_length, prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.table import Impact, Row
+from avmsf.capture.table import Impact
 from avmsf.errors import CaptureError, CaptureWarning
 
 START_LEVEL = 10**-2.0
@@ -40,38 +40,6 @@ MAX_RANGE_DB = 140.0
 loudest in float32 (144 dB), in which they are fitted."""
 
 
-@dataclass
-class Issues:
-    """What is wrong with a capture's recordings, and what was measured in them."""
-
-    collect: bool = False
-    """Whether errors are collected, and recordings that have one left out; else the first is raised."""
-    errors: list[CaptureError] = field(default_factory=list)
-    """Of the capture as a whole."""
-    failures: list[tuple[str, int, CaptureError]] = field(default_factory=list)
-    """Names and lines of the recordings that cannot be used, with their errors."""
-    warnings: list[CaptureWarning] = field(default_factory=list)
-    reports: list[RecordingReport] = field(default_factory=list)
-    """On the recordings that can be used."""
-    sounds: dict[str, tuple[bytes, float]] = field(default_factory=dict)
-    """Digest and peak of each of these from its impact to the file's end, by its name."""
-    uncut: bool = False
-    """Whether all recordings start with the impact, and are not cut."""
-
-    @contextmanager
-    def keep(self, impact: Row | Impact | None = None) -> Iterator[None]:
-        """Collect or raise an error of one impact, or without it of the capture."""
-        try:
-            yield
-        except CaptureError as error:
-            if not self.collect:
-                raise
-            if impact is None:
-                self.errors.append(error)
-            else:
-                self.failures.append((impact.file, impact.line, error))
-
-
 def preprocess(
     recordings: Iterable[tuple[Impact, Recording]],
     settings: CaptureSettings,
@@ -90,7 +58,7 @@ def preprocess(
     issues = Issues() if issues is None else issues
     used = []
     for impact, recording in recordings:
-        with issues.keep(impact):
+        with issues.keep((impact.file, impact.line)):
             prepared = prepare(recording, settings, newtons=impact.newtons)
             if measured:
                 issues.reports.append(measure(recording, prepared, settings=settings, line=impact.line))

@@ -21,13 +21,13 @@ from avmsf._utils.text import read_toml
 from avmsf.capture.audio import Recording
 from avmsf.capture.checks import NARROWEST, WIDEST, find_surface, fitting_units_of
 from avmsf.capture.folder import read_recordings
+from avmsf.capture.issues import Issues
 from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
 from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import prepare, remove_rumble
-from avmsf.capture.preprocess import Issues
-from avmsf.capture.settings import METRES, SETTINGS, CaptureSettings, settings_of
-from avmsf.capture.table import Impact, Row, read_rows, valid_rows
+from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of, unit_named
+from avmsf.capture.table import Impact, Row, parse_rows, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh.surface import surface_points
 
@@ -86,7 +86,7 @@ def propose_settings(
     chosen |= {key for key, value in vars(settings).items() if value != defaults[key]}
 
     def recordings(settings: CaptureSettings) -> Iterator[tuple[Impact, Recording]]:
-        return read_recordings(folder, valid_rows(rows, settings), Issues(collect=True))
+        return read_recordings(folder, parse_rows(rows, settings, Issues(collect=True)), Issues(collect=True))
 
     steps: list[tuple[set[str], Callable[[CaptureSettings], list[Proposal]]]] = [
         ({"unit", "surface_unit"}, lambda changed: _units(folder, rows, changed, factor)),
@@ -128,14 +128,9 @@ def settings_text(proposals: Sequence[Proposal]) -> str:
 
 
 def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tensor, "contacts 3"]:
-    """Return the contacts of all rows that can be read, meters, also those too far from the origin for the unit."""
-    contacts = [each.contact for each in valid_rows(rows, replace(settings, unit="mm"))]
-    return torch.tensor(contacts, dtype=torch.float64).reshape(-1, 3) * settings.meters / METRES["mm"]
-
-
-def unit_named(meters: float) -> str | None:
-    """Return the unit of a length, meters, if it is one."""
-    return next((unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6), None)
+    """Return the contacts of all rows that can be read, meters, float64."""
+    contacts = [each.contact for each in parse_rows(rows, settings, Issues(collect=True))]
+    return torch.tensor(contacts, dtype=torch.float64).reshape(-1, 3)
 
 
 def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor: float | None) -> list[Proposal]:

@@ -161,6 +161,11 @@ def _typed(key: str, value: Any, known: Mapping[str, tuple[object, ...]]) -> Any
     return value
 
 
+def unit_named(meters: float) -> str | None:
+    """Return the unit of a length, meters, if it is one."""
+    return next((unit for unit, length in METRES.items() if abs(length / meters - 1) < 1e-6), None)
+
+
 def settings_of(folder: Path) -> CaptureSettings:
     """Read the folder's `capture.toml`, or return the defaults where there is none."""
     path = folder / SETTINGS

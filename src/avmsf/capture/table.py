@@ -5,20 +5,20 @@ import io
 import math
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text import listed, read_text
-from avmsf.capture.filenames import files_in, missing_recording
+from avmsf.capture.filenames import files_in, similar_name
+from avmsf.capture.issues import TABLE, Issues
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning
 
-TABLE = "impacts.csv"
 REQUIRED = ("file", "x", "y", "z")
 DIRECTION = ("nx", "ny", "nz")
 FORCE = "force_newtons"
@@ -46,6 +46,8 @@ class Row:
     """Text of each known column, without spaces around it."""
     decimal_comma: bool
     """Whether numbers may be written 0,75: so in tables whose columns are not separated by commas."""
+    table: Path | str = TABLE
+    """What errors call the table."""
 
     @property
     def file(self) -> str:
@@ -54,7 +56,21 @@ class Row:
 
     def error(self, wanted: str, value: Any, *, name: str, got: str | None = None, advice: str = "") -> CaptureError:
         """Return an error about a value in this row."""
-        return CaptureError.expected(wanted, value, got=got, file=TABLE, row=self.line, name=name, advice=advice)
+        return CaptureError.expected(wanted, value, got=got, file=self.table, row=self.line, name=name, advice=advice)
+
+    def number(self, name: str) -> float:
+        """Return the finite number in a column. Raises `CaptureError` for another text."""
+        text = self.cells[name]
+        try:
+            # Spreadsheets of some languages write the typographic minus.
+            plain = text.replace("\N{MINUS SIGN}", "-")
+            value = float(plain.replace(",", ".") if self.decimal_comma else plain)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            advice = "separate the columns by semicolons where numbers have decimal commas" if "," in text else ""
+            raise self.error(f"a number as {name}", text, name=name, advice=advice)
+        return value
 
 
 @dataclass(frozen=True)
@@ -100,12 +116,45 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     return [(line, cells) for line, cells in lines if any(cells)], separator
 
 
+def read_table(
+    path: Path, required: Sequence[str], optional: Sequence[str], *, advice: str, shown: Path | str | None = None
+) -> tuple[list[Row], list[str]]:
+    """Return the rows of a table, and the columns that are not used.
+
+    Commas, semicolons and tabs separate; a byte-order mark, Windows line ends, blank lines, upper case and spaces in
+    the header do no harm. Errors about rows call the table `shown`. `CaptureError` where there is no row, a column is
+    missing or double, or a row is of another length than the header.
+    """
+    lines, separator = read_cells(path)
+    if not lines:
+        raise CaptureError.expected("a table", "", got="an empty file", file=path, advice=advice)
+    (first, names), known = lines[0], (*required, *optional)
+    header = [name.lower() for name in names]
+    missing = [name for name in required if name not in header]
+    double = sorted({name for name in header if name in known and header.count(name) > 1})
+    if missing:
+        numbers = "vertex numbers have to become positions: " if any("vert" in name for name in header) else ""
+        wanted, got, advice = f"the columns {', '.join(missing)}", f"only {', '.join(header)}", numbers + advice
+        raise CaptureError.expected(wanted, header, got=got, file=path, row=first, name=missing[0], advice=advice)
+    if double:
+        got, wanted = f"more than one {', '.join(double)}", "different names of columns"
+        raise CaptureError.expected(wanted, header, got=got, file=path, row=first, name=double[0])
+    rows = []
+    for line, cells in lines[1:]:
+        if len(cells) != len(header):
+            wanted, got = f"{len(header)} cells as in the header", f"{len(cells)}: {separator.join(cells)}"
+            name = header[len(cells)] if len(cells) < len(header) else None
+            raise CaptureError.expected(wanted, len(cells), got=got, file=path, row=line, name=name)
+        rows.append(Row(line, dict(zip(header, cells, strict=True)), separator != ",", shown or path))
+    if not rows:
+        raise CaptureError.expected("rows below the header", 0, got="none", file=path, advice=advice)
+    return rows, [name or "(no name)" for name in header if name not in known]
+
+
 def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
     """Read the rows of the folder's `impacts.csv`, and warnings of columns that are not used.
 
-    Commas, semicolons and tabs separate; a byte-order mark, Windows line ends, blank lines, upper case and spaces in
-    the header do no harm. `CaptureError` where there is no table, no row, a column is missing or double, or a row is
-    of another length than the header.
+    `CaptureError` as `read_table`, where there is no table, and where one column of a direction is missing.
     """
     path = folder / TABLE
     if not folder.is_dir():
@@ -113,22 +162,14 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
         raise CaptureError.expected("a capture folder", got=kind, file=folder, advice="check the path")
     if not path.is_file():
         raise CaptureError.expected("a table", file=path, advice=HOW_TO_WRITE)
-    lines, separator = read_cells(path)
-    if not lines:
-        raise CaptureError.expected("a table", "", got="an empty file", file=path, advice=HOW_TO_WRITE)
-    header = [name.lower() for name in lines[0][1]]
-    remarks = _check_header(header, path)
-    rows = []
-    for line, cells in lines[1:]:
-        if len(cells) != len(header):
-            wanted, got = f"{len(header)} cells as in the header", f"{len(cells)}: {separator.join(cells)}"
-            raise CaptureError.expected(wanted, len(cells), got=got, file=path, row=line)
-        named = dict(zip(header, cells, strict=True))
-        named["file"] = _as_on_disk(folder, named["file"])
-        rows.append(Row(line, named, separator != ","))
-    if not rows:
-        raise CaptureError.expected("rows below the header", 0, got="none", file=path, advice=HOW_TO_WRITE)
-    return rows, remarks
+    rows, unused = read_table(path, REQUIRED, (*DIRECTION, FORCE), advice=HOW_TO_WRITE, shown=TABLE)
+    directions = [name for name in DIRECTION if name in rows[0].cells]
+    if 0 < len(directions) < 3:
+        absent, got = next(name for name in DIRECTION if name not in directions), f"only {', '.join(directions)}"
+        raise CaptureError.expected("all of nx, ny, nz or none", directions, got=got, file=path, name=absent)
+    rows = [replace(row, cells={**row.cells, "file": _as_on_disk(folder, row.file)}) for row in rows]
+    message = f"{path}: columns that are not used: {', '.join(unused)}"
+    return rows, [CaptureWarning(message, file=path, value=unused)] if unused else []
 
 
 def _as_on_disk(folder: Path, file: str) -> str:
@@ -136,7 +177,7 @@ def _as_on_disk(folder: Path, file: str) -> str:
     if file.isascii():
         return file
     path = folder / file.replace("\\", "/")
-    if is_missing(path) and path.parent.is_dir():
+    if _is_missing(path) and path.parent.is_dir():
         wanted = unicodedata.normalize("NFC", path.name)
         same = [each for each in path.parent.iterdir() if unicodedata.normalize("NFC", each.name) == wanted]
         return same[0].relative_to(folder).as_posix() if same else file
@@ -145,14 +186,10 @@ def _as_on_disk(folder: Path, file: str) -> str:
 
 def parse_row(row: Row, settings: CaptureSettings) -> Impact:
     """Turn one row into a contact in meters, a unit direction and a force; `CaptureError` names the row and value."""
-    x, y, z = written = [_number(row, name) for name in REQUIRED[1:]]
-    farthest, direction, newtons = max(map(abs, written)), None, None
-    if farthest * settings.meters > FARTHEST:
-        got = f"({', '.join(row.cells[name] for name in REQUIRED[1:])}) {settings.unit}"
-        wanted, advice = f"a contact within {FARTHEST:g} m of the origin", fitting_units(farthest)
-        raise row.error(wanted, written, got=got, name="unit", advice=advice)
+    x, y, z = (row.number(name) * settings.meters for name in REQUIRED[1:])
+    direction, newtons = None, None
     if DIRECTION[0] in row.cells:
-        vector = [_number(row, name) for name in DIRECTION]
+        vector = [row.number(name) for name in DIRECTION]
         length = math.hypot(*vector)
         if length == 0:
             wanted, advice = "a direction as nx,ny,nz", "give a direction or remove the columns"
@@ -161,25 +198,30 @@ def parse_row(row: Row, settings: CaptureSettings) -> Impact:
         scale = 1.0 if abs(length - 1) < 1e-6 else 1 / length
         direction = (vector[0] * scale, vector[1] * scale, vector[2] * scale)
     if FORCE in row.cells:
-        newtons = _number(row, FORCE)
+        newtons = row.number(FORCE)
         if not MIN_FORCE_NEWTONS <= newtons <= MAX_FORCE_NEWTONS:
             wanted = f"{FORCE}, a peak force, of {MIN_FORCE_NEWTONS:g} to {MAX_FORCE_NEWTONS:g} N"
             raise row.error(wanted, newtons, name=FORCE)
     path = PurePosixPath(row.file.replace("\\", "/"))
     # A capture is one folder that can be moved, sent and read by others, so nothing outside it belongs to it.
-    if not path.parts or path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
-        raise row.error(
-            "a path inside the capture folder", row.file, got=row.file or "nothing", name="file", advice="copy it there"
-        )
-    meters = settings.meters
-    return Impact(str(path), (x * meters, y * meters, z * meters), direction, newtons, line=row.line)
+    if not is_inside(path):
+        wanted, got = "a path inside the capture folder", row.file or "nothing"
+        raise row.error(wanted, row.file, got=got, name="file", advice="copy it there")
+    return Impact(str(path), (x, y, z), direction, newtons, line=row.line)
 
 
-def valid_rows(rows: Iterable[Row], settings: CaptureSettings) -> Iterator[Impact]:
-    """Yield the rows that can be parsed."""
+def parse_rows(rows: Iterable[Row], settings: CaptureSettings, issues: Issues) -> list[Impact]:
+    """Return the rows that can be parsed; `issues` raise or collect the errors of the others."""
+    impacts = []
     for row in rows:
-        with suppress(CaptureError):
-            yield parse_row(row, settings)
+        with issues.keep((row.file, row.line)):
+            impacts.append(parse_row(row, settings))
+    return impacts
+
+
+def is_inside(path: PurePosixPath) -> bool:
+    """Return whether a path names something that lies in the folder which it is taken from."""
+    return bool(path.parts) and not (path.is_absolute() or ".." in path.parts or ":" in path.parts[0])
 
 
 @contextmanager
@@ -196,51 +238,73 @@ def in_folder(folder: Path) -> Iterator[None]:
         raise type(error)(f"{place}{error}", **{**error.attributes, "file": file}) from error
 
 
-def read_impacts(folder: Path, settings: CaptureSettings) -> tuple[list[Impact], list[CaptureWarning]]:
-    """Return the parsed rows of the folder's `impacts.csv`, and warnings of columns that are not used.
+def read_impacts(folder: Path, settings: CaptureSettings, issues: Issues) -> list[Impact]:
+    """Return the rows of the folder's `impacts.csv` that can be used.
 
-    Raises `CaptureError` as `read_rows` and `parse_row`, for two rows of one file, and where several are missing.
+    `issues` raise or collect the errors of the others, and of two rows that name one file.
     """
-    with in_folder(folder):
-        rows, remarks = read_rows(folder)
-        impacts = [parse_row(row, settings) for row in rows]
-        check_files_differ(impacts)
-        check_files_exist(folder, impacts)
-    return impacts, remarks
+    rows, warnings = read_rows(folder)
+    issues.warnings += warnings
+    impacts = parse_rows(rows, settings, issues)
+    with issues.keep(*((each.file, each.line) for each in impacts if _extent(each) > FARTHEST)):
+        check_distances(impacts, settings)
+    impacts = [each for each in impacts if _extent(each) <= FARTHEST]
+    with issues.keep():
+        _check_files_differ(impacts)
+    return impacts
 
 
-def check_files_differ(impacts: Sequence[Impact]) -> None:
+def present_impacts(folder: Path, impacts: Sequence[Impact], issues: Issues) -> list[Impact]:
+    """Return the impacts whose recordings exist; `issues` raise or collect the error of the others."""
+    missing = {each.file: each.line for each in impacts if _is_missing(folder / each.file)}
+    if missing:
+        with issues.keep(*missing.items()):
+            raise _missing_error(folder, {each.file for each in impacts}, list(missing))
+    return [each for each in impacts if each.file not in missing]
+
+
+def _extent(impact: Impact) -> float:
+    """Return the largest of a contact's coordinates in magnitude, meters."""
+    return max(map(abs, impact.contact))
+
+
+def check_distances(impacts: Sequence[Impact], settings: CaptureSettings) -> None:
+    """Raise `CaptureError` for contacts too far from the origin, with the units in which they would not be."""
+    far = [each for each in impacts if _extent(each) > FARTHEST]
+    if far:
+        worst, which = max(far, key=_extent), f", the farthest of {len(far)}" if len(far) > 1 else ""
+        written = [value / settings.meters for value in worst.contact]
+        got = f"({', '.join(f'{value:g}' for value in written)}) {settings.unit}{which}"
+        wanted, advice = f"a contact within {FARTHEST:g} m of the origin", fitting_units(max(map(abs, written)))
+        raise CaptureError.expected(wanted, written, got=got, file=TABLE, row=worst.line, name="unit", advice=advice)
+
+
+def _check_files_differ(impacts: Sequence[Impact]) -> None:
     """Raise `CaptureError` where two rows name one file: one of the two contacts must be wrong."""
     lines: dict[str, int] = {}
     for impact in impacts:
-        if impact.file in lines:
-            wanted, got = "a different recording for each row", f"{impact.file} as in row {lines[impact.file]}"
+        first = lines.setdefault(impact.file, impact.line)
+        if first != impact.line:
+            wanted, got = "a different recording for each row", f"{impact.file} as in row {first}"
             raise CaptureError.expected(wanted, impact.file, got=got, file=TABLE, row=impact.line, name="file")
-        lines[impact.file] = impact.line
 
 
-def check_files_exist(folder: Path, impacts: Sequence[Impact]) -> None:
-    """Raise one `CaptureError` where recordings are missing; for a single one with the file that may be meant."""
-    files = [impact.file for impact in impacts]
-    missing = [file for file in files if is_missing(folder / file)]
-    if not missing:
-        return
-    unlisted = (path.relative_to(folder).as_posix() for path in reversed(files_in(folder)) if path.name in missing)
-    below = {PurePosixPath(path).name: path for path in unlisted if path not in files}
-    moved, single = next((file for file in missing if file in below), None), len(missing) == 1
-    if single and moved is None:
-        advice, used = f"copy it there, or remove its row from {TABLE}", {folder / each for each in files}
-        raise missing_recording(folder / missing[0], missing[0], advice=advice, used=used)
-    advice = f"write {below[moved]} in place of {moved}" if moved else "copy them there, or correct their names"
-    got, value = (
-        f"none for {len(missing)} of {len(impacts)} ({listed(missing)})",
-        below[moved] if single and moved else missing,
-    )
-    path = folder / (missing[0] if single else TABLE)
-    raise CaptureError.expected("a file for each row", value, got=got, file=path, name="file", advice=advice)
+def _missing_error(folder: Path, files: Collection[str], missing: Sequence[str]) -> CaptureError:
+    """Return the error of recordings that do not exist, with the file that may be meant by one of them."""
+    others = [path.relative_to(folder).as_posix() for path in files_in(folder)]
+    others = [name for name in others if name not in files]
+    below = {PurePosixPath(name).name: name for name in reversed(others)}
+    file, single = next((each for each in missing if each in below), missing[0]), len(missing) == 1
+    near = below.get(file) or (similar_name(file, others) if single else None)
+    advice = f"write {near} in place of {file}" if near else f"copy it there, or remove its row from {TABLE}"
+    if single:
+        return CaptureError(f"{file}: expected a sound file, got none; {advice}", file=file, value=near)
+    got = f"none for {len(missing)} of {len(files)} ({listed(missing)})"
+    advice = advice if near else "copy them there, or correct their names"
+    return CaptureError.expected("a file for each row", missing, got=got, file=TABLE, name="file", advice=advice)
 
 
-def is_missing(path: Path) -> bool:
+def _is_missing(path: Path) -> bool:
     """Return whether nothing is at a path; a name that no file can have is left to the reader of sound files."""
     try:
         return not path.exists()
@@ -255,39 +319,3 @@ def fitting_units(written: float) -> str:
         return "no unit fits an object of 1 cm to 5 m, so correct the row"
     choices = " or ".join(f'unit = "{unit}" ({meters:.3g} m)' for unit, meters in fitting)
     return f"write the unit in capture.toml: {choices}"
-
-
-def _check_header(header: Sequence[str], path: Path) -> list[CaptureWarning]:
-    known = (*REQUIRED, *DIRECTION, FORCE)
-    missing = [name for name in REQUIRED if name not in header]
-    directions = [name for name in DIRECTION if name in header]
-    double = sorted({name for name in header if name in known and header.count(name) > 1})
-    if missing:
-        numbers = "vertex numbers have to become positions: " if any("vert" in name for name in header) else ""
-        wanted, name, advice = f"the columns {', '.join(missing)}", missing[0], numbers + HOW_TO_WRITE
-        raise CaptureError.expected(
-            wanted, list(header), got=f"only {', '.join(header)}", file=path, name=name, advice=advice
-        )
-    if 0 < len(directions) < 3:
-        absent, got = next(name for name in DIRECTION if name not in header), f"only {', '.join(directions)}"
-        raise CaptureError.expected("all of nx, ny, nz or none", directions, got=got, file=path, name=absent)
-    if double:
-        got = f"more than one {', '.join(double)}"
-        raise CaptureError.expected("different names of columns", list(header), got=got, file=path, name=double[0])
-    extra = [name or "(no name)" for name in header if name not in known]
-    unused = CaptureWarning(f"{path}: columns that are not used: {', '.join(extra)}", file=path, value=extra)
-    return [unused] if extra else []
-
-
-def _number(row: Row, name: str) -> float:
-    text = row.cells[name]
-    try:
-        # Spreadsheets of some languages write the typographic minus.
-        plain = text.replace("\N{MINUS SIGN}", "-")
-        value = float(plain.replace(",", ".") if row.decimal_comma else plain)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        advice = "separate the columns by semicolons where numbers have decimal commas" if "," in text else ""
-        raise row.error(f"a number as {name}", text, name=name, advice=advice)
-    return value

@@ -8,7 +8,7 @@ from rich.console import Console
 from avmsf._utils.text import counted
 from avmsf.capture import CaptureReport, CaptureSettings, Impacts
 from avmsf.capture.folder import check_and_read
-from avmsf.capture.measure import shared_problems
+from avmsf.capture.issues import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.heartbeat import doing
@@ -115,8 +115,9 @@ def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -
     delays = {} if aligned is None else aligned.delays
     left = [] if aligned is None else aligned.not_aligned
     doubtful = [] if aligned is None else [*left, *aligned.inverted, *aligned.rate_factors, *aligned.gain_changes_db]
-    levels = ["peak dBFS", "noise dB re peak"]
-    columns = ["recording", "state", "length s", "rate Hz", *levels, "clipped", "onset s", "2nd impact s"]
+    # Short lines leave the width to the names of the recordings.
+    levels = ["peak\ndBFS", "noise dB\nre peak"]
+    columns = ["recording", "state", "length\ns", "rate\nHz", *levels, "clipped", "onset\ns", "second\nimpact s"]
     rows = [
         (
             row.file,
@@ -132,7 +133,7 @@ def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -
         )
         for row in report.recordings[:MAX_PRINTED]
     ]
-    return table(title, [*columns, "delay smp"] if delays else columns, rows, words=2)
+    return table(title, [*columns, "delay\nsamples"] if delays else columns, rows, words=2)
 
 
 def _check_dataset(options: Options) -> int:

@@ -1,26 +1,22 @@
 """Contacts to render, from the command line or from a table, each with the name of its sound."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture.settings import METRES
-from avmsf.capture.table import read_cells
+from avmsf.capture.table import DIRECTION, REQUIRED, Row, is_inside, read_table
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Unit
 from avmsf.cli.printing import say
-from avmsf.errors import CaptureError, PositionError
+from avmsf.errors import PositionError
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.sound_field import SoundField
-
-_COLUMNS = ("x", "y", "z")
-_NORMALS = ("nx", "ny", "nz")
-"""Direction of an impact, into the object, as in impacts.csv."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,38 +81,27 @@ def read_contacts(path: Path, *, meters: float, recordings: bool = False) -> Con
     files to write in an output folder. With `recordings` they are files to read, in any folder, and every row must name
     one. Raises `CaptureError` with the line at fault as `row`, counted from 1 with the header, as in all tables.
     """
-    lines, separator = read_cells(path)
-    header = [name.lower() for name in lines[0][1]] if lines else []
-    missing = [name for name in ("file", *_COLUMNS)[not recordings :] if name not in header]
-    if missing or len(lines) < 2:
-        lacking = "no row" if not missing else f"only {', '.join(header)}" if header else "an empty file"
-        columns = "file,x,y,z" if recordings else "x,y,z (and optionally file)"
-        raise CaptureError(
-            f"{path}: expected a header with {columns} and one row for each impact, got {lacking}",
-            file=path,
-            row=lines[0][0] if lines else None,
-            name=missing[0] if missing else None,
-            value=header,
-        )
-    places, names, normals = [], [], []
-    for line, cells in lines[1:]:
-        row = dict(zip(header, cells, strict=False))
-        places.append([_number(row.get(name, ""), path, line, name, separator) for name in _COLUMNS])
-        normals.append([_number(row.get(name) or "0", path, line, name, separator) for name in _NORMALS])
-        if recordings or "file" in row:
-            names.append(_wav_name(row.get("file", ""), path, line, anywhere=recordings))
-        else:
-            names.append(f"{len(places):03d}.wav")
-    repeated = next((place for place, name in enumerate(names) if name in names[:place]), None)
-    if repeated is not None:
-        line, name = lines[1 + repeated][0], names[repeated]
-        raise _cell_error(path, line, "file", "a name that no other row has", name)
-    directions = torch.tensor(normals, dtype=torch.float64)
-    known = directions if bool(directions.any()) else None
-    numbers = tuple(line for line, _ in lines[1:])
-    located = torch.tensor(places, dtype=torch.float64) * meters
-    unused = tuple(name or "(no name)" for name in header if name not in ("file", *_COLUMNS, *_NORMALS))
-    return Contacts(located, tuple(names), known, table=path, lines=numbers, unused=unused)
+    file, *axes = REQUIRED
+    required = (file, *axes) if recordings else axes
+    advice = f"give one row for each impact, below the header {','.join(required)}"
+    rows, unused = read_table(path, required, (file, *DIRECTION), advice=advice)
+    places = [[row.number(name) for name in axes] for row in rows]
+    # A direction that is not given is zero.
+    normals = [[row.number(name) if row.cells.get(name) else 0.0 for name in DIRECTION] for row in rows]
+    names = list[str]()
+    for number, row in enumerate(rows, start=1):
+        name = _wav_name(row, anywhere=recordings) if file in row.cells else f"{number:03d}.wav"
+        if name in names:
+            raise row.error("a name that no other row has", name, name=file)
+        names.append(name)
+    return Contacts(
+        torch.tensor(places, dtype=torch.float64) * meters,
+        tuple(names),
+        torch.tensor(normals, dtype=torch.float64) if np.any(normals) else None,
+        table=path,
+        lines=tuple(row.line for row in rows),
+        unused=tuple(unused),
+    )
 
 
 def rows_of(contacts: Contacts, recording: Path) -> list[int]:
@@ -152,34 +137,13 @@ def note_off(contacts: Contacts, field: SoundField) -> None:
         say(f"note: {contacts.label(row)} is {where}; {off_surface_gains(field.gain_field)}")
 
 
-def _number(text: str, path: Path, line: int, column: str, separator: str) -> float:
-    try:
-        # Tables that are not separated by commas may write 0,75.
-        value = float(text if separator == "," else text.replace(",", "."))
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise _cell_error(path, line, column, "a number", text)
-    return value
-
-
-def _wav_name(text: str, path: Path, line: int, *, anywhere: bool) -> str:
-    sound = PurePosixPath(text.replace("\\", "/"))
-    if not sound.name or not (anywhere or _is_inside(sound)):
+def _wav_name(row: Row, *, anywhere: bool) -> str:
+    sound = PurePosixPath(row.file.replace("\\", "/"))
+    if not sound.name or not (anywhere or is_inside(sound)):
         wanted = "the name of a recording" if anywhere else "the name of a wav file inside the output folder"
-        raise _cell_error(path, line, "file", wanted, text)
+        raise row.error(wanted, row.file, name="file")
     return str(_with_suffix(sound))
-
-
-def _is_inside(sound: PurePosixPath) -> bool:
-    """Return whether a path, which is not empty, stays in the folder that it is taken from."""
-    return not (sound.is_absolute() or ".." in sound.parts or ":" in sound.parts[0])
 
 
 def _with_suffix(sound: PurePosixPath) -> PurePosixPath:
     return sound if sound.suffix.lower() == ".wav" else sound.with_name(f"{sound.name}.wav")
-
-
-def _cell_error(path: Path, line: int, column: str, wanted: str, text: str) -> CaptureError:
-    message = f"{path}, row {line}: {column}: expected {wanted}, got {text!r}"
-    return CaptureError(message, file=path, row=line, name=column, value=text)

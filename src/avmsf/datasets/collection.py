@@ -7,9 +7,10 @@ import soundfile
 
 from avmsf.capture.filenames import find_surface_file, shows_object
 from avmsf.capture.folder import Capture, read_capture
+from avmsf.capture.issues import Issues
 from avmsf.capture.preprocess import common_rate
 from avmsf.capture.settings import settings_of
-from avmsf.capture.table import TABLE, read_impacts
+from avmsf.capture.table import TABLE, present_impacts, read_impacts
 from avmsf.datasets.dataset import Dataset, DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.detect import detect_dataset
 from avmsf.datasets.numbering import in_order, refuse_unknown
@@ -105,7 +106,8 @@ class CaptureCollection:
         facts = self.facts(identifier)
         try:
             settings = settings_of(folder)
-            files = [strike.file for strike in read_impacts(folder, settings)[0]]
+            impacts = read_impacts(folder, settings, Issues())
+            files = [each.file for each in present_impacts(folder, impacts, Issues())]
             common_rate([float(soundfile.info(str(folder / file)).samplerate) for file in files], files)
             surface = find_surface_file(folder, settings)
             if surface is not None and not surface.is_file():

@@ -9,9 +9,9 @@ import soundfile
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.measure import shared_problems, shortened
+from avmsf.capture.issues import Issues, shared_problems, shortened
 from avmsf.capture.placement import check_placement
-from avmsf.capture.preprocess import Issues, preprocess
+from avmsf.capture.preprocess import preprocess
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
 from avmsf.errors import CaptureError, CaptureWarning, DatasetError
@@ -40,8 +40,9 @@ def build_capture(
     """
     try:
         impacts, issues = preprocess(recordings, settings, Issues(collect=True), measured=recorded)
-        remarks = [*remarks, *(f"left out: {error}" for _, _, error in issues.failures)]
-        remarks += shared_problems(issues.reports)
+        left_out = [each for each in issues.reports if not each.readable]
+        remarks = [*remarks, *(f"left out: {problem}" for each in left_out for problem in each.problems)]
+        remarks += shared_problems([each for each in issues.reports if each.readable])
         for error in issues.errors:
             raise error
         refuse_few(0 if impacts is None else len(impacts), origin=origin, reasons=remarks)

@@ -99,13 +99,11 @@ def stated_moves(folder: Path, *, meters: float = 1.0) -> list[FrameMismatch]:
             continue
         determinant = float(np.linalg.det(matrix[:, :3]))
         stretch = determinant ** (1 / 3) if determinant > 0 else math.nan
-        factor, shift = scale * stretch * meters, torch.from_numpy(scale * meters * matrix[:, 3])
+        factor, shift = scale * stretch * meters, scale * meters * matrix[:, 3]
         moved = factor != 1 or not np.allclose(matrix, np.eye(4)[:3])
         if 0 < factor < math.inf and np.isfinite(matrix).all() and moved:
             words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
-            found.append(
-                FrameMismatch(factor, torch.from_numpy(matrix[:, :3] / stretch), shift, stated=f"{name} ({words})")
-            )
+            found.append(FrameMismatch(factor, matrix[:, :3] / stretch, shift, stated=f"{name} ({words})"))
     return found
 
 

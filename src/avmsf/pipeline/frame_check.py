@@ -12,8 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from avmsf.capture.placement import FACTORS, WRONG_ROWS, FrameMismatch, check_placement
-from avmsf.capture.proposals import unit_named
-from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import CaptureSettings, unit_named
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.gaussians.points import farthest_points
 from avmsf.mesh.surface import Surface

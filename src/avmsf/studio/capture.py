@@ -23,7 +23,8 @@ from avmsf._utils.processes import write_lock
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, SoundBytes, decode_recording, read_recording, wav_bytes
 from avmsf.capture.folder import check
-from avmsf.capture.measure import RecordingReport, measure
+from avmsf.capture.issues import RecordingReport
+from avmsf.capture.measure import measure
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import (
@@ -33,6 +34,7 @@ from avmsf.capture.table import (
     TABLE,
     Impact,
     Row,
+    check_distances,
     parse_row,
     read_cells,
     read_rows,
@@ -60,12 +62,14 @@ def read_contact(query: Mapping[str, str]) -> Impact:
     if "newtons" in query:
         cells[FORCE] = query["newtons"]
     try:
-        return parse_row(Row(0, cells, decimal_comma=False), CaptureSettings())
+        impact = parse_row(Row(0, cells, decimal_comma=False), CaptureSettings())
+        check_distances([impact], CaptureSettings())
     except CaptureError as error:
         reason = str(error).partition(": ")[2]
         raise RequestError(
             400, f"contact: {reason[:200]}; click the object", name=error.name, value=error.value
         ) from error
+    return impact
 
 
 def read_upload(content: bytes) -> Recording:
@@ -256,6 +260,7 @@ class CaptureEditor:
         digest = None
         try:
             impact = parse_row(row, settings)
+            check_distances([impact], settings)
             values |= {"file": impact.file, "contact": impact.contact, "direction": impact.direction}
             path = (self.folder / impact.file).resolve()
             if not path.is_relative_to(self.folder):

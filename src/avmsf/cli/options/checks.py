@@ -4,8 +4,9 @@ from pathlib import Path
 
 from avmsf._utils.files import temporary_path, unwritable
 from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.issues import Issues
 from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.table import read_impacts
+from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.errors import AvmsfError, CaptureError, ExtractionError
 
 DEVICES = ("cpu", "cuda")
@@ -71,7 +72,7 @@ def expect_capture(folder: Path, settings: Path | None) -> None:
 
 def expect_rows(folder: Path, settings: CaptureSettings) -> None:
     """Raise `CaptureError` for a capture folder whose table cannot be used, or whose .ply has no such header."""
-    read_impacts(folder, settings)
+    present_impacts(folder, read_impacts(folder, settings, Issues()), Issues())
     surface = find_surface_file(folder, settings)
     if surface is None or surface.suffix.lower() != ".ply" or not surface.is_file():
         return
