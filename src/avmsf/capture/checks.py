@@ -12,9 +12,9 @@ import torch
 
 from avmsf._utils.text import listed
 from avmsf.capture.filenames import find_surface_file
-from avmsf.capture.issues import TABLE, Issues
+from avmsf.capture.issues import Issues
 from avmsf.capture.placement import Placement, check_placement
-from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.capture.settings import METRES, TABLE, CaptureSettings
 from avmsf.capture.table import Impact, fitting_units, parse_rows, read_rows
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points

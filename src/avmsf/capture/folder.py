@@ -15,9 +15,9 @@ from avmsf.capture.audio import Recording, read_recording, wav_bytes
 from avmsf.capture.checks import check_contacts, check_surface, find_surface
 from avmsf.capture.filenames import files_in, number_key
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.issues import TABLE, Issues, RecordingReport, shared_problems, shortened
+from avmsf.capture.issues import Issues, RecordingReport, shared_problems, shortened
 from avmsf.capture.preprocess import check_levels, preprocess
-from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
+from avmsf.capture.settings import SETTINGS, TABLE, CaptureSettings, settings_of
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, Impact, in_folder, present_impacts, read_impacts
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, write_surface

@@ -4,10 +4,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from avmsf.capture.settings import TABLE
 from avmsf.errors import CaptureError, CaptureWarning
-
-TABLE = "impacts.csv"
-"""Name of the table in a capture folder."""
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,7 @@ class _Search:
             if near <= tolerance and math.log(2) + self.nats(each) < present:
                 return replace(each, distance=far)
         starts = sorted(self.starts(), key=lambda start: start[0] + self.nats(start[1]))[: _BOUNDS.max_starts]
-        fitted = [(nats, self.fit(*start)) for nats, *start in starts]
+        fitted = [(nats, self.fit(start, scaled, shifted)) for nats, start, scaled, shifted in starts]
         for nats, each in sorted(((nats + self.nats(each), each) for nats, each in fitted), key=lambda pair: pair[0]):
             far = float(np.quantile(self.distances(each), 0.9))
             # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.

@@ -11,8 +11,8 @@ from typing import Any, get_args
 from avmsf._utils.text import read_toml
 from avmsf.errors import CaptureError
 
-SETTINGS = "capture.toml"
-"""Name of the file in a capture folder."""
+SETTINGS, TABLE = "capture.toml", "impacts.csv"
+"""Names of the files in a capture folder."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
 USUAL_SECONDS = 3.0
 TIME_ZEROS = ("onset", "peak")

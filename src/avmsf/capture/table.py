@@ -15,8 +15,8 @@ from typing import Any
 from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text import listed, read_text
 from avmsf.capture.filenames import files_in, similar_name
-from avmsf.capture.issues import TABLE, Issues
-from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.capture.issues import Issues
+from avmsf.capture.settings import METRES, TABLE, CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning
 
 REQUIRED = ("file", "x", "y", "z")

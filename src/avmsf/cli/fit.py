@@ -15,7 +15,8 @@ from avmsf._utils.files import copy_whole, write_whole
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.checks import check_one_unit, find_surface
-from avmsf.capture.table import TABLE, in_folder, parse_row, read_rows
+from avmsf.capture.settings import TABLE
+from avmsf.capture.table import in_folder, parse_row, read_rows
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.alignment import describe_alignment
 from avmsf.cli.heartbeat import doing

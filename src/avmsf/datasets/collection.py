@@ -9,8 +9,8 @@ from avmsf.capture.filenames import find_surface_file, shows_object
 from avmsf.capture.folder import Capture, read_capture
 from avmsf.capture.issues import Issues
 from avmsf.capture.preprocess import common_rate
-from avmsf.capture.settings import settings_of
-from avmsf.capture.table import TABLE, present_impacts, read_impacts
+from avmsf.capture.settings import TABLE, settings_of
+from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.datasets.dataset import Dataset, DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.detect import detect_dataset
 from avmsf.datasets.numbering import in_order, refuse_unknown

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from avmsf._utils.text import listed
-from avmsf.capture.table import TABLE
+from avmsf.capture.settings import TABLE
 from avmsf.errors import DatasetError
 
 Kind = Literal["captures", "ObjectFolder Real", "RealImpact"]

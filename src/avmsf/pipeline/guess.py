@@ -9,8 +9,8 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf.capture.checks import NARROWEST, WIDEST
-from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.table import TABLE, read_cells
+from avmsf.capture.settings import TABLE, CaptureSettings
+from avmsf.capture.table import read_cells
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_meshes import HollowShape

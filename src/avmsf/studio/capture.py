@@ -26,12 +26,11 @@ from avmsf.capture.folder import check
 from avmsf.capture.issues import RecordingReport
 from avmsf.capture.measure import measure
 from avmsf.capture.prepare import prepare
-from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.capture.table import (
     DIRECTION,
     FORCE,
     REQUIRED,
-    TABLE,
     Impact,
     Row,
     check_distances,

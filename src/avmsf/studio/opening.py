@@ -8,8 +8,7 @@ from pathlib import Path
 
 from avmsf._utils.files import copy_whole
 from avmsf.capture.filenames import SPLATS, find_surface_file
-from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.table import TABLE
+from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.errors import StudioError
 from avmsf.gaussians.ply import holds_gaussians
 from avmsf.pipeline.config import CACHE

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.capture.settings import SETTINGS
-from avmsf.capture.table import TABLE, read_rows
+from avmsf.capture.settings import SETTINGS, TABLE
+from avmsf.capture.table import read_rows
 from avmsf.cli.options.checks import read_settings
 from avmsf.cli.options.common import Flag, Printing
 from avmsf.cli.options.paths import Existing, SettingsFile

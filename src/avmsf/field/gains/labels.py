@@ -25,7 +25,7 @@ from torch import Tensor
 
 from avmsf._utils.text import counted
 from avmsf.capture.filenames import number_key
-from avmsf.capture.table import TABLE
+from avmsf.capture.settings import TABLE
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, total_evidence
 from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.outliers import CHANCE, WIDE_NOISE_SHARES, PredictiveRatios
