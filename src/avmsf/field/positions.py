@@ -52,11 +52,10 @@ def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainModel) -> lis
         distances = gains.length * body.distances(places / gains.length)
     else:
         few = len(places) <= _FEW
-        nearest = None if few else cKDTree(known.numpy()).query(places.numpy())[0]
-        distances = torch.cdist(places, known).amin(1) if nearest is None else torch.from_numpy(nearest)
+        found = torch.cdist(places, known).amin(1).numpy() if few else cKDTree(known.numpy()).query(places.numpy())[0]
+        distances = torch.from_numpy(found)
         if bool((distances > limit).any()):
-            neighbors, _ = cKDTree(known.numpy()).query(known.numpy(), k=2)
-            limit = max(limit, 2.0 * float(neighbors[:, -1].max()))
+            limit = max(limit, 2.0 * float(cKDTree(known.numpy()).query(known.numpy(), k=2)[0][:, -1].max()))
     return [(row, float(distances[row])) for row in torch.nonzero(distances > limit).flatten().tolist()]
 
 

@@ -24,7 +24,7 @@ def refined(shift: float = 0.0) -> RefinedGains:
 
 @cache
 def direction() -> torch.Tensor:
-    return draw(CONTACTS, MODES, 2, seed=4).float()
+    return draw(2 * MODES, CONTACTS, 1, seed=4).float()
 
 
 def read(gains: RefinedGains) -> torch.Tensor:
@@ -53,8 +53,8 @@ def test_a_shift_reads_as_the_model_of_the_moved_values():
 def test_a_shift_of_one_two_hundredth_moves_a_value_by_its_standard_error():
     gains = refined()
     with torch.no_grad():
-        gains.shift[6, 1, 0] = 1.0 / 200.0
-        gains.shift[2, 3, 1] = -1.0 / 200.0
+        gains.shift[1, 6] = 1.0 / 200.0
+        gains.shift[MODES + 3, 2] = -1.0 / 200.0
     moved = torch.view_as_real(gains.finished(torch.arange(MODES)).values - model().values)
     expected = torch.zeros_like(moved)
     expected[6, 1, 0], expected[2, 3, 1] = model().noise()[1, 0], -model().noise()[3, 1]
@@ -78,8 +78,8 @@ def test_a_shift_costs_its_squares_by_the_modes_energy():
     gains = refined(0.01)
     with torch.no_grad():
         # The second mode has nearly all of the energy.
-        gains.shift[:, 1] = 0.0
-    squares = (200.0 * gains.shift.detach().double()).square().mean((0, 2))
+        gains.shift[[1, MODES + 1]] = 0.0
+    squares = (200.0 * gains.shift.detach().double()).square().reshape(2, MODES, -1).mean((0, 2))
     assert float(gains.penalty().detach()) == pytest.approx(float(0.05 * (squares * share).sum()), rel=1e-5)
 
 

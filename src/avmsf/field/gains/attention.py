@@ -57,36 +57,27 @@ class AttentionGains(TrainableGains, GainModel):
         self.points, self.features = nn.Buffer(features.points.float()), nn.Buffer(features.features.float())
         self.centers, self.descriptors = nn.Buffer(regions.centers.float()), nn.Buffer(regions.descriptors.float())
         self.gain_scale = nn.Buffer(gain_scale.float())
+        dim, modes = features.features.shape[1], len(gain_scale)
+        sizes = [shape.width + dim] + [shape.hidden] * shape.layers
         # Layers draw from torch's global generator as they are made, which is not ours to advance.
         with torch.random.fork_rng(devices=[]):
-            self._build(features.features.shape[1], len(gain_scale))
-        self._initialize(generator)
-
-    def _build(self, dim: int, modes: int) -> None:
-        shape = self.shape
-        encoded = shape.clusters * 3 * (1 + 2 * shape.bands)
-        self.query = nn.Linear(encoded + dim, shape.width, bias=False)
-        self.key = nn.Linear(dim, shape.width, bias=False)
-        self.value = nn.Linear(dim, shape.width, bias=False)
-        self.project = nn.Linear(shape.width, shape.width, bias=False) if shape.projection else nn.Identity()
-        sizes = [shape.width + dim] + [shape.hidden] * shape.layers
-        stack: list[nn.Module] = []
-        for before, after in pairwise(sizes):
-            stack += [nn.Linear(before, after), nn.SiLU()]
-        self.head = nn.Sequential(*stack)
-        self.to_gains = nn.Linear(sizes[-1], modes)
-        self.to_dampings = nn.Linear(sizes[-1], modes) if shape.spatial_damping else None
-
-    def _initialize(self, generator: torch.Generator) -> None:
-        for layer in self.modules():
-            if isinstance(layer, nn.Linear):
-                bound = 1 / math.sqrt(layer.in_features)
-                with torch.no_grad():
+            self.query = nn.Linear(shape.clusters * 3 * (1 + 2 * shape.bands) + dim, shape.width, bias=False)
+            self.key = nn.Linear(dim, shape.width, bias=False)
+            self.value = nn.Linear(dim, shape.width, bias=False)
+            self.project = nn.Linear(shape.width, shape.width, bias=False) if shape.projection else nn.Identity()
+            layers = [each for before, after in pairwise(sizes) for each in (nn.Linear(before, after), nn.SiLU())]
+            self.head = nn.Sequential(*layers)
+            self.to_gains = nn.Linear(sizes[-1], modes)
+            self.to_dampings = nn.Linear(sizes[-1], modes) if shape.spatial_damping else None
+        with torch.no_grad():
+            for layer in self.modules():
+                if isinstance(layer, nn.Linear):
+                    bound = 1 / math.sqrt(layer.in_features)
                     layer.weight.uniform_(-bound, bound, generator=generator)
                     if layer.bias is not None:
                         layer.bias.zero_()
-        if self.to_dampings is not None:
-            nn.init.zeros_(self.to_dampings.weight)
+            if self.to_dampings is not None:
+                self.to_dampings.weight.zero_()
 
     @property
     def feature_field(self) -> FeatureField:
@@ -177,8 +168,8 @@ class Attention(GainEstimator):
         """Return the name and the digest of the network's own features."""
         return f"attention {'' if self.features is None else self.features.digest()}"
 
-    def start(self, data: GainData) -> tuple[AttentionGains, Int[Tensor, " contacts"]]:
-        """Return an untrained network, and the points nearest to the contacts."""
+    def start(self, data: GainData, damping: str | None = None) -> tuple[AttentionGains, Int[Tensor, " contacts"]]:
+        """Return an untrained network, and the points nearest to the contacts; `damping` in place of the config's."""
         features, config = self._features(data), data.config
         scale = data.gains.square().mean(0).sqrt()
         # Never zero: the network's output is measured in it.
@@ -186,60 +177,54 @@ class Attention(GainEstimator):
         network = AttentionGains(
             features,
             gain_scale=scale.clamp_min(least),
-            shape=replace(config.shape, spatial_damping=config.damping == PER_CONTACT),
+            shape=replace(config.shape, spatial_damping=(damping or config.damping) == PER_CONTACT),
             generator=torch.Generator().manual_seed(config.seed),
         )
         return network, features.nearest(data.train.contacts)
 
     def fit(self, data: GainData, trainer: Trainer) -> FittedGains:
         """Choose what the config leaves open on held-out training contacts, then train with all."""
-        damping, steps, report = self._validated(data, trainer)
-        network, rows = self.start(_with_damping(data, damping))
+        report = self._validated(data, trainer)
+        network, rows = self.start(data, report["damping"])
+        steps = report.get("steps", data.config.steps)
         run = trainer.run("fit", network, data, rows, warmup=data.config.warmup_steps, steps=steps)
         return FittedGains(network.finished(run.order), run, range(len(data.train)), report)
 
-    def _validated(self, data: GainData, trainer: Trainer) -> tuple[str, int, dict[str, Any]]:
-        """Return the form of the dampings, the number of steps, and how they were decided."""
+    def _validated(self, data: GainData, trainer: Trainer) -> dict[str, Any]:
+        """Return the form of the dampings and the number of steps, and how they were decided."""
         config, train = data.config, data.train
         dampings = (SHARED, PER_CONTACT) if config.damping == "validated" else (config.damping,)
         held = held_out(train.contacts, config.validation)
         few = len(rows_by_place(train.contacts)) < _MIN_PLACES
-        if config.damping in dampings:
+        if len(dampings) == 1:
             reason = "as set"
         elif few:
             reason = f"fewer than {_MIN_PLACES} positions leave none to validate on"
         else:
             reason = "chosen on validation contacts" if held else "no positions are held out to validate on"
-        undecided = len(dampings) > 1 or config.patience > 0
-        if few or not held or not undecided:
-            return dampings[0], config.steps, {"damping": dampings[0], "validated": False, "damping_reason": reason}
+        if few or not held or (len(dampings) == 1 and not config.patience):
+            return {"damping": dampings[0], "validated": False, "damping_reason": reason}
         learned, unseen = data.take([row for row in range(len(train)) if row not in held]), data.take(held)
-        unseen_rows = self._features(data).nearest(unseen.train.contacts)
         outcomes = {}
         for damping in dampings:
             name = f"trial with {damping} damping"
             if name not in trainer.trials:
-                network, rows = self.start(_with_damping(learned, damping))
+                network, rows = self.start(learned, damping)
                 trainer.run(
                     name, network, learned, rows, warmup=config.warmup_steps, steps=config.steps,
-                    held=(unseen, unseen_rows),
+                    held=(unseen, self._features(data).nearest(unseen.train.contacts)),
                 )  # fmt: skip
             outcomes[damping] = trainer.trials[name]
         best = min(outcomes, key=lambda damping: outcomes[damping]["envelope"])
-        steps = outcomes[best]["steps"] if config.patience else config.steps
-        return (
-            best,
-            steps,
-            {
-                "damping": best,
-                "validated": True,
-                "damping_reason": reason,
-                "validation_contacts": [train.names[row] for row in held],
-                "validation_envelope": {damping: each["envelope"] for damping, each in outcomes.items()},
-                "validation_spectral": {damping: each["spectral"] for damping, each in outcomes.items()},
-                "steps": steps,
-            },
-        )
+        return {
+            "damping": best,
+            "validated": True,
+            "damping_reason": reason,
+            "validation_contacts": [train.names[row] for row in held],
+            "validation_envelope": {damping: each["envelope"] for damping, each in outcomes.items()},
+            "validation_spectral": {damping: each["spectral"] for damping, each in outcomes.items()},
+            "steps": outcomes[best]["steps"] if config.patience else config.steps,
+        }
 
     def _features(self, data: GainData) -> FeatureField:
         return data.features if self.features is None else self.features
@@ -253,10 +238,6 @@ def held_out(contacts: Float[Tensor, "contacts 3"], fraction: float) -> list[int
     rows = rows_by_place(contacts)
     order = farthest_points(contacts[[each[0] for each in rows]], len(rows)).tolist()
     return [row for place in order[len(rows) - round(fraction * len(rows)) :] for row in rows[place]]
-
-
-def _with_damping(data: GainData, damping: Any) -> GainData:
-    return replace(data, config=replace(data.config, damping=damping))
 
 
 def encode(offsets: Float[Tensor, "*shape 3"], bands: int) -> Float[Tensor, "*shape encoded"]:

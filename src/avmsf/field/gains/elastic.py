@@ -18,6 +18,7 @@ one or two impacts these tell which shape each mode is.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar
@@ -46,6 +47,7 @@ EQUAL_PRIOR = 0.2
 """Probability that a body is not typical, so that all profiles and remainders are equally probable."""
 REACH = 0.15
 """Length of the remainder's kernel over the object's size."""
+_PROFILES = len(PERTURBATIONS) + len(WIDTHS)
 _FAR = 1e-3
 """Least weight of a shape in a broad profile."""
 FREQUENCY_ERRORS = (0.01, 0.03, 0.08, 0.2)
@@ -134,9 +136,8 @@ class Elastic(KernelFamily):
 
     def categories(self) -> Int[Tensor, " kernels"]:
         """Return one category for each profile and remainder: the shape that is its center has a prior of its own."""
-        profiles, shapes = len(PERTURBATIONS) + len(WIDTHS), len(self.modes)
-        one = torch.arange(profiles * len(RESIDUALS)).reshape(profiles, 1, len(RESIDUALS))
-        return one.expand(-1, shapes, -1).flatten()
+        one = torch.arange(_PROFILES * len(RESIDUALS)).reshape(_PROFILES, 1, len(RESIDUALS))
+        return one.expand(-1, len(self.modes), -1).flatten()
 
     def category_prior(self) -> Float64[Tensor, " categories"]:
         """Return the probability of each profile and remainder before any measurement; one or two impacts keep it."""
@@ -158,9 +159,8 @@ class Elastic(KernelFamily):
 
         `log_frequency` is that of frequencies in Hz; see `shape_log_prior`.
         """
-        profiles = len(PERTURBATIONS) + len(WIDTHS)
         shared = self.shape_log_prior(log_frequency)[None, :, None]
-        return shared.expand(profiles, -1, len(RESIDUALS), -1).flatten(0, 2)
+        return shared.expand(_PROFILES, -1, len(RESIDUALS), -1).flatten(0, 2)
 
     def shape_log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "shapes modes"]:
         """Return the log probability that a mode is each shape, times the density of its frequency if it is.
@@ -172,23 +172,19 @@ class Elastic(KernelFamily):
         # A mode has its body's error or, as an exception, any.
         weights = (1.0 - _EXCEPTIONS) * weights + _EXCEPTIONS * weights.mean(1, keepdim=True)
         probable = torch.nonzero(weights.amax(1) > _IMPROBABLE * weights.max()).flatten()
-        batch = max(1, _MEMORY // (len(self.modes) * len(log_frequency)))
         found = torch.full((len(self.modes), len(log_frequency)), -torch.inf, dtype=torch.float64)
-        for rows in torch.split(probable, batch):
-            square, constant = self._apart(FACTORS[rows], log_frequency, log_frequency)
-            for error, weight in zip(FREQUENCY_ERRORS, weights[rows].T, strict=True):
-                logs = constant + (weight / (error * math.sqrt(2.0 * math.pi))).log()
-                each = torch.logsumexp(square * (-0.5 / error**2) + logs[:, None, None], dim=0)
-                found = torch.logaddexp(found, each)
+        for rows in torch.split(probable, max(1, _MEMORY // found.numel())):
+            densities = self._densities(FACTORS[rows], log_frequency, log_frequency)
+            for logs, weight in zip(densities, weights[rows].T, strict=True):
+                found = torch.logaddexp(found, torch.logsumexp(logs + weight.log()[:, None, None], dim=0))
         return found
 
     def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
         """Return the log evidence of each shape as center, over profiles and remainders by their `category_prior`."""
-        noises = evidence.shape[1]
-        shape = (len(PERTURBATIONS) + len(WIDTHS), len(self.modes), len(RESIDUALS), noises, -1)
-        prior = self.category_prior().log().reshape(shape[0], 1, shape[2], 1, 1)
-        each = (evidence.reshape(shape) + prior).transpose(0, 1).flatten(1, 3)
-        return torch.logsumexp(each, dim=1) - math.log(noises)
+        noises, shapes = evidence.shape[1], len(self.modes)
+        prior = self.category_prior().log()[self.categories()][:, None, None]
+        each = (evidence + prior).reshape(_PROFILES, shapes, len(RESIDUALS) * noises, -1).transpose(0, 1)
+        return torch.logsumexp(each.flatten(1, 2), dim=1) - math.log(noises)
 
     @property
     def factor(self) -> float:
@@ -200,30 +196,29 @@ class Elastic(KernelFamily):
     ) -> Float64[Tensor, "pairs shapes some"]:
         """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes."""
         chosen = log_frequency if modes is None else log_frequency[modes]
-        square, constant = self._apart(FACTORS, chosen, log_frequency)
-        own = [square * (-0.5 / error**2) - math.log(error * math.sqrt(2.0 * math.pi)) for error in FREQUENCY_ERRORS]
-        densities = torch.stack(own, dim=1)
+        densities = torch.stack(list(self._densities(FACTORS, chosen, log_frequency)), dim=1)
         # A mode has its body's error or, as an exception, any.
         exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
-        found = torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception)
-        return (found + constant[:, None, None, None]).flatten(0, 1)
+        return torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception).flatten(0, 1)
 
-    def _apart(
+    def _densities(
         self,
         factors: Float64[Tensor, " factors"],
         log_frequency: Float64[Tensor, " some"],
         measured: Float64[Tensor, " modes"],
-    ) -> tuple[Float64[Tensor, "factors shapes some"], Float64[Tensor, " factors"]]:
-        """Return squared distances of log frequencies from the nominal ones times factors, and log constants.
+    ) -> Iterator[Float64[Tensor, "factors shapes some"]]:
+        """Yield for each error the log probability of each shape, times the density of a log frequency if it is that.
 
-        The constants are the log probability of each shape within the range of the measured modes, over the density of
-        a frequency of which nothing is known.
+        Shapes within the range of the measured modes are equally probable, and the density is over that of a frequency
+        of which nothing is known.
         """
         low, high = float(measured.min()) - _MARGIN, float(measured.max()) + _MARGIN
         nominal = torch.log(factors[:, None] * self.modes.frequency)
         inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
+        constant = (math.log(high - low) - inside.log())[:, None, None]
         square = (log_frequency - nominal[..., None]).square_()
-        return square, math.log(high - low) - inside.log()
+        for error in FREQUENCY_ERRORS:
+            yield square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
 
     @cached_property
     def _known(self) -> Float64[Tensor, "contacts shapes"]:

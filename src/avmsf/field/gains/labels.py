@@ -71,27 +71,7 @@ def order_advice(
     *,
     directional: bool,
 ) -> str | None:
-    """Return the changes of the table by which the recordings agree with the contacts far better; None without any."""
-    found = better_order(names, families, rows, measured, points, directional=directional)
-    if found is None:
-        return None
-    changed = [f"{names[new]} for {names[row]}" for row, new in enumerate(found[1].tolist()) if new != row]
-    return (
-        f"the recordings do not agree with the contacts, but would far better in another order, {found[0]}: in "
-        f"{TABLE} write {', '.join(changed[:_SHOWN])}{', ...' * (len(changed) > _SHOWN)} and fit again"
-    )
-
-
-def better_order(
-    names: Sequence[str],
-    families: Sequence[KernelFamily],
-    rows: Int[Tensor, " rows"],
-    measured: MeasuredGains,
-    points: Float32[Tensor, "points 3"],
-    *,
-    directional: bool,
-) -> tuple[str, Int[Tensor, " contacts"]] | None:
-    """Return the candidate order of highest evidence if it surely predicts contacts better, and what it is.
+    """Return the changes of the table after which the recordings surely agree better with the contacts; None for none.
 
     Student's test of the log predictive ratios' differences over contacts, with Bonferroni's correction. `families` are
     of the contacts `rows`; `names` and `measured` are all recordings', `points` the object's.
@@ -109,7 +89,13 @@ def better_order(
     more = ratios(orders[best]) - ratios(torch.arange(len(names)))
     mean, error = float(more.mean()), float(more.std()) / math.sqrt(len(more))
     chance = float(scipy.special.stdtr(len(more) - 1, -mean / max(error, torch.finfo(torch.float64).tiny)))
-    return (best, orders[best]) if chance < CHANCE / len(orders) else None
+    if chance >= CHANCE / len(orders):
+        return None
+    changed = [f"{names[new]} for {names[row]}" for row, new in enumerate(orders[best].tolist()) if new != row]
+    return (
+        f"the recordings do not agree with the contacts, but would far better in another order, {best}: in "
+        f"{TABLE} write {', '.join(changed[:_SHOWN])}{', ...' * (len(changed) > _SHOWN)} and fit again"
+    )
 
 
 def level_advice(names: Sequence[str], families: Sequence[KernelFamily], measured: MeasuredGains) -> str | None:

@@ -124,11 +124,6 @@ class MixtureGains(GainModel):
         """Return the standard deviation of the noise in both parts of a measured gain."""
         return _parts(self.mixture.standard_error()[None])[0]
 
-    def smoother(self) -> Float64[Tensor, "modes 2 contacts contacts"]:
-        """Return the matrices by which the mean at the contacts is linear in the gains there."""
-        found = self.mixture.smoother()
-        return found.reshape(2, -1, *found.shape[1:]).transpose(0, 1)
-
     def leave_one_out(self) -> Complex128[Tensor, "contacts modes"]:
         """Return the gains at each contact as the measured ones at all other places predict them."""
         return complex_of(self._left_out.mean)

@@ -1,23 +1,22 @@
 """Training contacts whose label (place and direction) contradicts the others, and whether a body is credible.
 
-For contact i, given contacts S that are set aside, the leave-one-out log predictive ratio is
+The log Bayes factor of "places" against "no places", under which gains are independent, is for the values y of the n
+contacts of a set, of the evidence of `mixture` and with w_s the share of a series' mode in the energy,
 
-    L_i(S) = sum_s w_s [log p(y_is | y_Rs, places) - log p(y_is | y_Rs, no places)],
+    M = sum_s w_s [n/2 log(y_s' y_s) - n/2 log Q_s - 1/2 log|C_s|],   Q_s = y_s' P_s y_s,   P_s = C_s^-1.
 
-R being all contacts but S and i; the sum is over all series (each part of each mode's gains), w_s being the mode's
-share of the energy. Both densities are Student t with as many degrees of freedom as R has contacts, the scale
-integrated out (`mixture`); without places gains are independent of each other. So L_i > 0 where the other contacts'
-gains and places predict contact i, and L_i < 0 where its gains are less probable there than anywhere. In closed form,
-with n contacts in all (R and i), P = C^-1 of them, a = P y and Q = y' a,
+The leave-one-out log predictive ratio of contact i, given contacts S that are set aside, is what i adds to it,
 
-    log p(y_i | y_R) = -n/2 log Q + (n-1)/2 log(Q - a_i^2 / P_ii) + 1/2 log P_ii + constant of n
+    L_i(S) = M(all but S) - M(all but S and i),
 
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2), and without j as well
+above 0 where the other contacts predict contact i, and below where its gains are less probable there than anywhere.
+Without the contacts of a block B, with a = P y (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006,
+section 5.4.2, for blocks),
 
-    P_ii -> P_ii - P_ij^2 / P_jj,   a_i -> a_i - P_ij a_j / P_jj,   Q -> Q - a_j^2 / P_jj.
+    Q -> Q - a_B' P_BB^-1 a_B,   log|C| -> log|C| + log|P_BB|,
 
-Standardized leave-one-out errors do not serve: those of the kernels' misfit are as large as a wrong label's, while the
-ratio to gains without places measures both on one scale.
+of one contact or of two in closed form. Standardized leave-one-out errors do not serve: those of the kernels' misfit
+are as large as a wrong label's, while the ratio to gains without places measures both on one scale.
 
 The contacts S that are set aside maximize
 
@@ -106,8 +105,8 @@ class PredictiveRatios:
     @cached_property
     def covariance(self) -> Float64[Tensor, "series contacts contacts"]:
         """C of each series between all contacts, noise included."""
-        noise = self._noise[:, None, None] * torch.eye(len(self.sites), dtype=torch.float64)
-        return self._kernels(self.sites, self.sites) + noise
+        kernels = self._each(lambda family: family.between(self.sites, self.sites))
+        return kernels + self._noise[:, None, None] * torch.eye(len(self.sites), dtype=torch.float64)
 
     def without(
         self, aside: frozenset[int]
@@ -115,19 +114,26 @@ class PredictiveRatios:
         """Return L_i(S), and L_i(S and j) [i, j]; NaN for contacts in S and for i = j."""
         rows = others(self.sites, aside)
         values, inverse, solved, quadratic = self._solved(rows)
-        own, power = torch.diagonal(inverse, dim1=1, dim2=2), values.square().sum(1)
-        known = _log_student(solved / own, 1.0 / own, quadratic[:, None], len(rows))
+        own, squares, count = torch.diagonal(inverse, dim1=1, dim2=2), values.square(), len(rows)
+        power, scaled = squares.sum(1, keepdim=True), solved / own
+        one = quadratic[:, None] - solved * scaled
+        shared = own[:, :, None] - inverse.square() / own[:, None]
+        two = one[:, None] - (solved[:, :, None] - inverse * scaled[:, None]).square() / shared
+        both = power[:, None] - squares[:, :, None] - squares[:, None]
+        whole = self._log_density(count, quadratic[:, None]) - self._log_density(count, power)
+        less = self._log_density(count - 1, one, own) - self._log_density(count - 1, power - squares)
+        least = self._log_density(count - 2, two, shared * own[:, None]) - self._log_density(count - 2, both)
         single, pairs = torch.full((2, len(self.sites), len(self.sites)), torch.nan, dtype=torch.float64)
-        single[rows, 0] = self.weight @ (known - _log_student(values, torch.ones(()), power[:, None], len(rows)))
-        shared = inverse / own[:, None]
-        variance = 1.0 / (own[..., None] - shared * inverse).clamp_min(_TINY)
-        error = (solved[..., None] - shared * solved[:, None]) * variance
-        known = _log_student(error, variance, (quadratic[:, None] - solved.square() / own)[:, None], len(rows) - 1)
-        less = (power[:, None] - values.square())[:, None]
-        unknown = _log_student(values[..., None], torch.ones(()), less, len(rows) - 1)
-        both = torch.einsum("s,scd->cd", self.weight, known - unknown).fill_diagonal_(torch.nan)
-        pairs[rows[:, None], rows] = both
+        single[rows, 0] = whole - less
+        pairs[rows[:, None], rows] = (less - least).fill_diagonal_(torch.nan)
         return single[:, 0], pairs
+
+    def _log_density(self, count: int, quadratic: Tensor, factor: Tensor | None = None) -> Tensor:
+        """Return the weighted log evidence of `count` contacts; `factor` is their |C| over that of all contacts."""
+        logs = count * quadratic.clamp_min(_TINY).log()
+        if factor is not None:
+            logs = logs + factor.clamp_min(_TINY).log()
+        return torch.tensordot(self.weight, -0.5 * logs, dims=1)
 
     def elsewhere(
         self, row: int, aside: frozenset[int], places: Sites, factors: Sequence[float] = (1.0, -1.0)
@@ -138,18 +144,19 @@ class PredictiveRatios:
         """
         rows = others(self.sites, aside | {row})
         values, inverse, solved, quadratic = self._solved(rows)
-        cross, gain = self._kernels(places, self.sites.take(rows)), self.values[row][:, None]
-        mean = (cross @ solved[..., None])[..., 0]
-        variance = self._own(places) + self._noise[:, None] - ((cross @ inverse) * cross).sum(2)
+        known, gain = self.sites.take(rows), self.values[row][:, None]
+        cross = self._each(lambda family: family.between(places, known))
+        mean, count = (cross @ solved[..., None])[..., 0], len(rows)
+        own = self._each(lambda family: family.own(places)) + self._noise[:, None]
+        variance = own - ((cross @ inverse) * cross).sum(2)
         power = values.square().sum(1, keepdim=True)
+        before, unplaced = (self._log_density(count, each) for each in (quadratic[:, None], power))
         found, nowhere = [], []
         for factor in factors:
             scaled, jacobian = gain / factor, self.weight.sum() * math.log(abs(factor))
-            error = scaled - mean
-            whole = quadratic[:, None] + error.square() / variance
-            found.append(self.weight @ _log_student(error, variance, whole, len(rows) + 1) - jacobian)
-            unplaced = _log_student(scaled, torch.ones(()), power + scaled.square(), len(rows) + 1)
-            nowhere.append(self.weight @ unplaced - jacobian)
+            whole = quadratic[:, None] + (scaled - mean).square() / variance
+            found.append(self._log_density(count + 1, whole, variance) - before - jacobian)
+            nowhere.append(self._log_density(count + 1, power + scaled.square()) - unplaced - jacobian)
         return torch.stack(found) - torch.stack(nowhere).amax(0)
 
     def _solved(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -168,25 +175,10 @@ class PredictiveRatios:
         variance = self.model.mixture.noise_variance
         return variance.gather(0, (self._best % len(variance))[None])[0]
 
-    def _kernels(self, sites: Sites, others: Sites) -> Float64[Tensor, "series sites others"]:
-        return self._each(lambda family: family.between(sites, others))
-
-    def _own(self, sites: Sites) -> Float64[Tensor, "series sites"]:
-        return self._each(lambda family: family.own(sites))
-
     def _each(self, kernels: Callable[[KernelFamily], Tensor]) -> Tensor:
         """Return what each series's most probable kernel gives."""
         used, series = torch.unique(self._best // len(self.model.mixture.noise_shares), return_inverse=True)
         return torch.cat([kernels(each) for each in self.model.families_of(used)])[series]
-
-
-def _log_student(error: Tensor, variance: Tensor, whole: Tensor, count: int) -> Tensor:
-    """Return the log density of one of `count` values given the others, up to a constant of their number.
-
-    `whole` is y' C^-1 y of all of them, error and variance (over the scale) those of the prediction from the others.
-    """
-    rest = (whole - error.square() / variance).clamp_min(_TINY)
-    return -0.5 * (count * whole.clamp_min(_TINY).log() - (count - 1) * rest.log() + variance.log())
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Complex128, Float, Float64, Int
+from jaxtyping import Complex128, Float, Int
 from torch import Tensor, nn
 
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.model import Gains
+from avmsf.field.gains.model import Gains, complex_of
 from avmsf.field.training import TrainableGains
 from avmsf.modal.modes import ModalBank, turned_like
 
@@ -28,21 +28,22 @@ class RefinedGains(TrainableGains):
         """Start from the model of the modes of `bank`, whose energies say how much a gain matters."""
         super().__init__()
         self.model = model
-        smoother, values = model.smoother(), torch.view_as_real(model.values)
-        self.smoother, self.noise = nn.Buffer(smoother.float()), nn.Buffer(model.noise().float())
-        self.start = nn.Buffer(_applied(smoother, values).float())
-        energy = values.square().sum((0, 2)) / bank.damping
+        # All tensors are [series, contacts, 1], series as in the mixture.
+        smoother, values = model.mixture.smoother(), model.mixture.values.T[..., None]
+        self.smoother, self.start = nn.Buffer(smoother.float()), nn.Buffer((smoother @ values).float())
+        self.noise = nn.Buffer(model.mixture.standard_error().float()[:, None, None])
+        energy = values.reshape(2, len(bank), -1).square().sum((0, 2)) / bank.damping
         self.share = nn.Buffer((energy / energy.sum().clamp_min(torch.finfo(torch.float64).tiny)).float())
         self.shift = nn.Parameter(torch.zeros_like(self.start))
 
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return the gains at some of the model's contacts."""
-        parts = (self.start + _applied(self.smoother, self.noise * _STEP * self.shift))[rows]
-        return Gains(torch.complex(parts[..., 0], parts[..., 1]))
+        smoothed = self.start + self.smoother @ (self.noise * _STEP * self.shift)
+        return Gains(complex_of(smoothed[:, rows, 0].T.contiguous()))
 
     def penalty(self) -> Float[Tensor, ""]:
         """Return the squared shifts over the squared standard errors, each mode by its part of the energy."""
-        squares = (_STEP * self.shift).square().mean((0, 2))
+        squares = (_STEP * self.shift).square().reshape(2, len(self.share), -1).mean((0, 2))
         return 0.5 * _STRENGTH * (squares * self.share).sum()
 
     def finished(
@@ -53,13 +54,6 @@ class RefinedGains(TrainableGains):
         It judges itself by the `measured` gains that these modes, in order, have in the recordings. Frequencies that
         moved end to end have turned their modes, which says nothing of the gains.
         """
-        moved = (self.noise * _STEP * self.shift).detach().double()
-        model = self.model.with_values(self.model.values + torch.view_as_complex(moved.contiguous())).take(order)
-        if measured is None:
-            return model
-        return replace(model, measured=turned_like(measured, model.values))
-
-
-def _applied(smoother: Tensor, values: Float64[Tensor, "contacts modes 2"] | Tensor) -> Tensor:
-    """Return the smoothed values, part by part and mode by mode; both values are [contacts, modes, 2]."""
-    return (smoother @ values.permute(1, 2, 0)[..., None]).squeeze(-1).permute(2, 0, 1)
+        moved = (self.noise * _STEP * self.shift).detach().double()[..., 0].T
+        model = self.model.with_values(self.model.values + complex_of(moved)).take(order)
+        return model if measured is None else replace(model, measured=turned_like(measured, model.values))
