@@ -35,6 +35,10 @@ class ModalBank:
         """Return the modes of these rows or of this mask."""
         return ModalBank(self.frequency[rows], self.damping[rows])
 
+    def join(self, other: "ModalBank") -> "ModalBank":
+        """Return these modes and then the others."""
+        return ModalBank(torch.cat([self.frequency, other.frequency]), torch.cat([self.damping, other.damping]))
+
 
 # A hammer's push takes time and sound takes time to the microphone, so that no recording starts as pure sines. The
 # contact decides a mode's strength and sign; what shifts its phase, pulse and path to the microphone, stays.

@@ -14,6 +14,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
+from avmsf.modal.modes import ModalBank
 
 PERIOD = 131_072
 """Samples after which the sequence repeats: 3 s at 44.1 kHz."""
@@ -116,6 +117,28 @@ def noise_power(
     white = torch.randn(rows, sounds.shape[1], generator=torch.Generator().manual_seed(0)).to(sounds)
     found = _quietest_power(sounds, bins=bins, quietest=quietest)
     return found / _quietest_power(white, bins=bins, quietest=quietest).mean()
+
+
+def noise_bins(samples: int) -> int:
+    """Return how many noise bands the length allows: of 23 Hz in 3 s at 48 kHz, wider in shorter sounds."""
+    return max(16, 1 << round(math.log2(samples / 64))) // 2 + 1
+
+
+def noise_at(
+    noise: Float[Tensor, "contacts bins"], bank: ModalBank, sample_rate: float
+) -> Float64[Tensor, "contacts modes"]:
+    """Return the noise's power at each mode: the most of the three bins there, for its spectrum may be steep."""
+    padded = torch.nn.functional.pad(noise, (1, 1))
+    highest = torch.maximum(torch.maximum(padded[:, :-2], padded[:, 2:]), noise)
+    place = torch.round(bank.frequency * (2 * (noise.shape[1] - 1) / sample_rate)).long()
+    return highest[:, place].to(torch.float64)
+
+
+def background_power(
+    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
+) -> Float64[Tensor, "contacts modes"]:
+    """Return the power of each sound's background noise at each mode, in the sounds' unit."""
+    return noise_at(noise_power(sounds, bins=noise_bins(sounds.shape[1])), bank, sample_rate)
 
 
 def _quietest_power(

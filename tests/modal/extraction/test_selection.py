@@ -10,14 +10,13 @@ from torch import Tensor
 from avmsf.modal.extraction.esprit import candidates
 from avmsf.modal.extraction.forward import choose
 from avmsf.modal.extraction.least_squares import NormalEquations
-from avmsf.modal.extraction.selection import Candidates, chance_ratio, merge, prune, select
+from avmsf.modal.extraction.selection import Selection, chance_ratio, merge
 from avmsf.modal.inner_products import gram, poles_of
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 RATE = 8000.0
 SAMPLES = 6000
-SIFTING = {"sample_rate": RATE, "significance": 6.0, "range_db": 60.0}
 
 
 def bank_of(frequency: list[float], damping: list[float]) -> ModalBank:
@@ -34,14 +33,18 @@ def record(bank: ModalBank, *, noise: float = 0.0, contacts: int = 4, seed: int 
     return sounds + noise * torch.randn(contacts, SAMPLES, generator=generator, dtype=torch.float64)
 
 
-def flat(level: float, bank: ModalBank, contacts: int = 4) -> Tensor:
-    return torch.full((contacts, len(bank)), level**2, dtype=torch.float64)
+def selection(sounds: Tensor, *, noise: float = 1e-3) -> Selection:
+    return Selection(sounds, torch.full((len(sounds), 33), noise**2, dtype=torch.float64), RATE, 6.0, 50)
 
 
-def sift(sounds: Tensor, found: ModalBank, *, known: ModalBank | None = None, noise: float = 1e-3, count: int = 50):
-    given = bank_of([], []) if known is None else known
-    both = [Candidates.of(sounds, bank, flat(noise, bank), sample_rate=RATE) for bank in (given, found)]
-    return select(*both, samples=SAMPLES, count=count, **SIFTING)
+def select(sounds: Tensor, found: ModalBank, *, noise: float = 1e-3) -> ModalBank:
+    chosen = selection(sounds, noise=noise)
+    return chosen.select(bank_of([], []), chosen.candidates(found), range_db=60.0)
+
+
+def with_others(frequency: list[float], damping: list[float]) -> ModalBank:
+    """Return the true modes and others, by frequency."""
+    return merge(TRUTH.join(bank_of(frequency, damping)), duration=0.75)
 
 
 def contains(bank: ModalBank, frequency: float, *, within: float = 1e-9) -> bool:
@@ -57,9 +60,9 @@ def test_chance_is_the_tail_of_chi_squared(contacts: int):
 @pytest.mark.parametrize("noise", [1e-5, 1e-2])
 def test_every_mode_is_among_the_candidates(noise: float):
     sounds = record(TRUTH, noise=noise).float()
-    frequency, damping = candidates(
-        sounds, torch.full((4, 33), noise**2), sample_rate=RATE, lowest=20.0, significance=3.0
-    )
+    level = torch.full((4, 33), noise**2)
+    found = candidates(sounds, level, sample_rate=RATE, lowest=20.0, significance=3.0)
+    frequency, damping = found.frequency, found.damping
     for pitch, decay in zip(TRUTH.frequency.tolist(), TRUTH.damping.tolist(), strict=True):
         near = (frequency - pitch).abs() < 0.05 * decay
         assert near.any()
@@ -70,67 +73,42 @@ def test_every_mode_is_among_the_candidates(noise: float):
 
 
 def test_doubles_are_merged_and_neighbors_kept():
-    bank = merge(
-        torch.tensor([700.0, 300.0, 700.0001, 703.0, 700.0], dtype=torch.float64),
-        torch.tensor([6.0, 5.0, 6.001, 7.0, 60.0], dtype=torch.float64),
-        duration=1.0,
-    )
+    bank = merge(bank_of([700.0, 300.0, 700.0001, 703.0, 700.0], [6.0, 5.0, 6.001, 7.0, 60.0]), duration=1.0)
     assert bank.frequency.tolist() == [300.0, 700.0, 700.0, 703.0]
     assert sorted(bank.damping.tolist()) == [5.0, 6.0, 7.0, 60.0]
 
 
-def test_selection_takes_the_modes_from_among_the_rest():
-    sounds = record(TRUTH, noise=1e-3)
-    decoys = bank_of([120.0, 500.0, 1100.0, 2000.0, 3500.0], [5.0, 8.0, 30.0, 9.0, 50.0])
-    mixed = merge(
-        torch.cat([TRUTH.frequency, decoys.frequency]), torch.cat([TRUTH.damping, decoys.damping]), duration=0.75
-    )
-    chosen = sift(sounds, mixed)
+# What the sounds do not have, and what only leaks from a neighbor.
+@pytest.mark.parametrize(
+    ("others", "noise"),
+    [
+        (([120.0, 500.0, 1100.0, 2000.0, 3500.0], [5.0, 8.0, 30.0, 9.0, 50.0]), 1e-3),
+        (([302.0, 1510.0], [8.0, 50.0]), 0.03),
+    ],
+)
+def test_selection_takes_the_modes_from_among_the_rest(others: tuple[list[float], list[float]], noise: float):
+    chosen = select(record(TRUTH, noise=noise), with_others(*others), noise=noise)
     assert chosen.frequency.tolist() == TRUTH.frequency.tolist()
     assert chosen.damping.tolist() == TRUTH.damping.tolist()
 
 
-def test_selection_refuses_what_only_leaks_from_a_neighbor():
-    sounds = record(TRUTH, noise=0.03)
-    leaked = merge(
-        torch.cat([TRUTH.frequency, torch.tensor([302.0, 1510.0], dtype=torch.float64)]),
-        torch.cat([TRUTH.damping, torch.tensor([8.0, 50.0], dtype=torch.float64)]),
-        duration=0.75,
-    )
-    assert sift(sounds, leaked, noise=0.03).frequency.tolist() == TRUTH.frequency.tolist()
-
-
 def test_selection_among_hundreds_spans_its_chunks():
-    sounds = record(TRUTH, noise=1e-3)
-    decoys = torch.linspace(100, 3900, 400, dtype=torch.float64) + 0.5
-    mixed = merge(
-        torch.cat([TRUTH.frequency, decoys]),
-        torch.cat([TRUTH.damping, torch.full((400,), 4.0, dtype=torch.float64)]),
-        duration=0.75,
-    )
-    chosen = sift(sounds, mixed)
+    chosen = select(record(TRUTH, noise=1e-3), with_others(torch.linspace(100.5, 3900.5, 400).tolist(), [4.0] * 400))
     for pitch in TRUTH.frequency.tolist():
         assert contains(chosen, pitch)
 
 
 def test_pruning_takes_one_of_two_that_are_equal():
-    sounds = record(TRUTH, noise=1e-3)
-    twice = merge(
-        torch.cat([TRUTH.frequency, torch.tensor([300.0, 1500.0], dtype=torch.float64)]),
-        torch.cat([TRUTH.damping, torch.tensor([5.4, 33.0], dtype=torch.float64)]),
-        duration=0.75,
-    )
-    kept = prune(sounds, twice, flat(1e-3, twice), count=50, **SIFTING)
-    assert len(kept) == len(TRUTH)
+    chosen = selection(record(TRUTH, noise=1e-3))
+    kept = chosen.prune(with_others([300.0, 1500.0], [5.4, 33.0]), range_db=60.0)
     torch.testing.assert_close(kept.frequency, TRUTH.frequency)
-    same = bank_of([300.0, 300.0], [5.0, 5.0])
-    assert len(prune(sounds, same, flat(1e-3, same), count=50, **SIFTING)) == 1
+    assert len(chosen.prune(bank_of([300.0, 300.0], [5.0, 5.0]), range_db=60.0)) == 1
 
 
 def test_pruning_leaves_no_cancelling_modes():
     sounds = record(bank_of([700.0], [30.0]), noise=1e-4)
     crowd = bank_of([699.0, 700.0, 701.0, 702.0], [28.0, 30.0, 35.0, 31.0])
-    kept = prune(sounds, crowd, flat(1e-6, crowd), count=50, **SIFTING)
+    kept = selection(sounds, noise=1e-6).prune(crowd, range_db=60.0)
     _, apart = NormalEquations.of(sounds, poles_of(kept, RATE)).lost_without()
     assert float(apart.min()) >= 0.01
     assert contains(kept, 700.0)
@@ -140,23 +118,14 @@ def test_range_leaves_faint_modes_out():
     gains = torch.tensor([[1.0, 10 ** (-50 / 20), 10 ** (-70 / 20)]], dtype=torch.float64)
     bank = bank_of([300.0, 900.0, 2000.0], [10.0, 10.0, 10.0])
     sounds = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
-    for keep in (
-        lambda: prune(sounds, bank, flat(1e-9, bank, 1), count=9, **SIFTING),
-        lambda: select_one(sounds, bank),
-    ):
-        assert keep().frequency.tolist() == [300.0, 900.0]
-
-
-def select_one(sounds: Tensor, bank: ModalBank) -> ModalBank:
-    none = bank_of([], [])
-    known, found = (Candidates.of(sounds, part, flat(1e-9, part, 1), sample_rate=RATE) for part in (none, bank))
-    return select(known, found, samples=SAMPLES, count=9, **SIFTING)
+    for kept in (selection(sounds, noise=1e-9).prune(bank, range_db=60.0), select(sounds, bank, noise=1e-9)):
+        assert kept.frequency.tolist() == [300.0, 900.0]
 
 
 def test_pruning_nothing_but_noise_leaves_nothing():
     sounds = torch.randn(4, SAMPLES, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    assert len(prune(sounds, TRUTH, flat(1.0, TRUTH), count=9, **SIFTING)) == 0
-    assert len(prune(sounds, bank_of([], []), flat(1.0, bank_of([], [])), count=9, **SIFTING)) == 0
+    for bank in (TRUTH, bank_of([], [])):
+        assert len(selection(sounds, noise=1.0).prune(bank, range_db=60.0)) == 0
     assert math.isfinite(chance_ratio(1, trials=1))
 
 
@@ -168,7 +137,7 @@ def explained(sounds: Tensor, bank: ModalBank) -> float:
 def test_what_the_chosen_explain_one_after_another_is_what_they_explain_together(known: list[int]):
     sounds = record(TRUTH, noise=1e-3)
     bank = bank_of([299.0, 300.0, 700.0, 703.0, 704.0, 1500.0, 2900.0], [4.0, 5.0, 6.0, 7.0, 9.0, 30.0, 80.0])
-    both = Candidates.of(sounds, bank, flat(1e-3, bank), sample_rate=RATE)
+    both = selection(sounds).candidates(bank)
     given = torch.zeros(len(bank), dtype=torch.bool)
     given[known] = True
     inner = gram(poles_of(bank, RATE), SAMPLES, power=0)
@@ -179,10 +148,6 @@ def test_what_the_chosen_explain_one_after_another_is_what_they_explain_together
     together = bank.take(taken)
     assert float(energy.sum()) == pytest.approx(explained(sounds, together) - explained(sounds, alone), rel=1e-7)
     # The first to go explains most beside those given, of all.
-    gained = [
-        explained(sounds, ModalBank(torch.cat([alone.frequency, f]), torch.cat([alone.damping, d])))
-        - explained(sounds, alone)
-        for f, d in zip(bank.frequency[~given].split(1), bank.damping[~given].split(1), strict=True)
-    ]
+    gained = [explained(sounds, alone.join(bank.take(row))) - explained(sounds, alone) for row in torch.nonzero(~given)]
     assert float(energy.max()) == pytest.approx(max(gained), rel=1e-7)
     assert int(energy[~given].argmax()) == gained.index(max(gained))

@@ -37,10 +37,10 @@ from avmsf.modal.extraction.phase_likelihood import (
     FIRST_SPREAD,
     DelayPrior,
     MeasuredPhases,
-    background_power,
     occam_factor,
 )
 from avmsf.modal.modes import ModalBank
+from avmsf.modal.residual_noise import background_power
 
 _MODES = 32
 """Modes to align by, the strongest: more cost time and hardly narrow the posterior."""
@@ -179,7 +179,7 @@ def align(impacts: Impacts) -> Alignment | None:
     bank = strongest_modes(impacts)
     if len(bank) == 0:
         return None
-    reach, background = _reach(impacts), background_power(impacts, bank)
+    reach, background = _reach(impacts), background_power(impacts.sounds, bank, impacts.sample_rate)
     measured = MeasuredPhases.of(impacts, bank, reach=reach, background=background)
     before = after = coherence(measured.amplitude, bank.damping)
     delays, agreement, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
@@ -277,7 +277,7 @@ def _reach(impacts: Impacts) -> float:
 
 def _delays_alone(impacts: Impacts, phases: Phases, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
     """Return the delays by which recordings agree with known phases; `usual` for one that surely does not."""
-    background = background_power(impacts, phases.bank)
+    background = background_power(impacts.sounds, phases.bank, impacts.sample_rate)
     measured = MeasuredPhases.of(impacts, phases.bank, reach=reach, background=background)
     doubled = phases.doubled.expand(len(impacts), -1)
     prior = DelayPrior(torch.tensor([usual], dtype=torch.float64), phases.jitter)

@@ -50,8 +50,8 @@ def candidates(
     sample_rate: float,
     lowest: float,
     significance: float,
-) -> tuple[Float64[Tensor, " candidates"], Float64[Tensor, " candidates"]]:
-    """Return frequencies (Hz) and dampings (1/s) of everything that may be a mode between `lowest` and half the rate.
+) -> ModalBank:
+    """Return everything that may be a mode between `lowest`, Hz, and half the rate.
 
     More than the object has: one mode may appear at several lengths, noise may look like modes, and steady hum
     appears as a mode that falls by a tenth of a neper over the whole sound. `noise` is its
@@ -68,7 +68,7 @@ def candidates(
         found.append(exponents[exponents.real <= -slowest])
         samples //= _SHORTENING
     exponents = torch.cat(found)
-    return exponents.imag / (2 * math.pi), -exponents.real
+    return ModalBank(exponents.imag / (2 * math.pi), -exponents.real)
 
 
 def _search(

@@ -25,10 +25,10 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError, FieldFileError
 from avmsf.modal.extraction.alignment import Alignment, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
-from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency, noise_bins
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual, estimate_residual
+from avmsf.modal.residual_noise import Residual, estimate_residual, noise_bins
 from avmsf.modal.synthesis import synthesize
 
 _KIND = FileKind("avmsf-modes", "modes", "find them again", FieldFileError)

@@ -8,10 +8,8 @@ from jaxtyping import Complex128, Float32, Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.modal.extraction.finders import noise_at, noise_bins
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import noise_power
 
 _CANDIDATES = 8
 """Highest peaks of the density among which a delay is chosen."""
@@ -231,12 +229,6 @@ class MeasuredPhases:
         falls = torch.nn.functional.pad(score[:, :-1] >= score[:, 1:], (0, 1), value=True)
         peaks = torch.where(rises & falls, score, -math.inf)
         return self.grid[torch.topk(peaks, min(_CANDIDATES, len(self.grid)), dim=1).indices]
-
-
-def background_power(impacts: Impacts, bank: ModalBank) -> Float64[Tensor, "contacts modes"]:
-    """Return the power of each recording's background noise at each mode, in the recordings' unit."""
-    noise = noise_power(impacts.sounds, bins=noise_bins(impacts.sounds.shape[1]))
-    return noise_at(noise, bank, impacts.sample_rate)
 
 
 def _agreement(

@@ -33,11 +33,10 @@ from torch import Tensor
 
 from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.finders import noise_at, noise_bins
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.inner_products import poles_of
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import noise_power
+from avmsf.modal.residual_noise import background_power
 
 _FALSE_MODES = 0.1
 """Expected number of wrong decisions in a capture, by each of the two tests: as for selection (`chance_ratio`)."""
@@ -80,8 +79,7 @@ def measure_quality(
     energy = (amplitudes.abs().square() / bank.damping).sum(0)
     # Loud recordings count no more than others for phases and shapes.
     amplitudes = amplitudes[audible] / level[audible, None]
-    noise = noise_at(noise_power(scaled, bins=noise_bins(sounds.shape[1])), bank, sample_rate)
-    pitched = bank.damping < bank.frequency
+    pitched, noise = bank.damping < bank.frequency, background_power(scaled, bank, sample_rate)
     standing = torch.nonzero(pitched & _stands_out(explained, moves.unexplained(), noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
     part = bank.take(standing)
