@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from avmsf.errors import CaptureError, ExportError
-from avmsf.export.geometry import DisplayGeometry, read_display_geometry
+from avmsf.export.geometry import read_display_geometry
 from avmsf.export.gltf import write_gltf
-from avmsf.mesh.textured_mesh import TexturedMesh
+from avmsf.gaussians.ply import write_splats
+from avmsf.mesh.surface import Surface
+from factories.clouds import random_cloud
 from factories.made_tables import MODES, POINTS, apart, summed, table
 from factories.raising import raises
 
@@ -132,14 +135,10 @@ def test_phases_alone_change_the_waveform_and_hardly_the_spectrum(tmp_path):
 
 def test_viewers_show_the_mesh_or_the_points(tmp_path):
     box = trimesh.creation.box((0.2, 0.1, 0.3))
-    vertices, faces = torch.from_numpy(np.array(box.vertices)).float(), torch.from_numpy(np.array(box.faces))
-    red = torch.zeros(len(faces), 3, 3)
-    red[..., 0] = 1.0
-    write_gltf(
-        table(),
-        tmp_path / "mesh.glb",
-        geometry=DisplayGeometry.of_mesh(TexturedMesh.build(vertices, faces, colors=red)),
-    )
+    box.visual.vertex_colors = np.tile([255, 0, 0, 255], (8, 1)).astype(np.uint8)
+    box.export(tmp_path / "box.ply")
+    field = replace(table(), points=0.2 * table().points)
+    write_gltf(field, tmp_path / "mesh.glb", object=tmp_path / "box.ply")
     shown = trimesh.load(tmp_path / "mesh.glb", process=False).dump()[0]
     assert len(shown.faces) == 12
     assert shown.volume == pytest.approx(0.2 * 0.1 * 0.3, rel=1e-5)
@@ -152,40 +151,45 @@ def test_viewers_show_the_mesh_or_the_points(tmp_path):
     np.testing.assert_allclose([bounds["min"], bounds["max"]], [[-0.1, -0.05, -0.15], [0.1, 0.05, 0.15]], atol=1e-7)
     assert "extensionsRequired" not in document
     assert document["extensionsUsed"] == ["KHR_audio_rigid_bodies"]
-    field = table()
     write_gltf(field, tmp_path / "points.glb")
     (cloud,) = trimesh.load(tmp_path / "points.glb", process=False).geometry.values()
     np.testing.assert_allclose(cloud.vertices, field.points.numpy(), atol=1e-7)
 
 
+def test_gaussians_are_shown_by_their_centers_and_lie_beside_the_file(tmp_path):
+    cloud = random_cloud(table().points)
+    write_splats(cloud, tmp_path / "thing.ply")
+    written = write_gltf(table(), tmp_path / "a.glb", object=tmp_path / "thing.ply")
+    (shown,) = trimesh.load(tmp_path / "a.glb", process=False).geometry.values()
+    np.testing.assert_allclose(shown.vertices, cloud.centers, atol=1e-7)
+    assert set(written.sizes) == {tmp_path / "a.glb", tmp_path / "a.gaussians.ply"}
+    assert (tmp_path / "a.gaussians.ply").read_bytes() == (tmp_path / "thing.ply").read_bytes()
+
+
 @pytest.mark.parametrize(("words", "axis"), [({}, 2), ({"up": "x"}, 0), ({"up": "y"}, 1), ({"up": "z"}, 2)])
 def test_the_objects_axis_points_up_and_coordinates_stay_in_its_frame(tmp_path, words, axis):
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box = trimesh.creation.box((0.6, 0.6, 0.6))
     box.apply_translation(np.eye(3)[axis])
-    vertices, faces = torch.from_numpy(np.array(box.vertices)).float(), torch.from_numpy(np.array(box.faces))
-    field = table()
-    write_gltf(
-        field, tmp_path / "a.glb", geometry=DisplayGeometry.of_mesh(TexturedMesh.build(vertices, faces)), **words
-    )
+    surface = Surface.of(np.array(box.vertices), np.array(box.faces))
+    field = replace(table(), points=table().points + surface.vertices.mean(0))
+    write_gltf(field, tmp_path / "a.glb", object=surface, **words)
     scene = trimesh.load(tmp_path / "a.glb", process=False)
     shown = scene.dump()[0]
     np.testing.assert_allclose(shown.centroid, [0.0, 1.0, 0.0], atol=1e-6)
-    assert shown.volume == pytest.approx(1e-3, rel=1e-4)
+    assert shown.volume == pytest.approx(0.6**3, rel=1e-4)
     (stored,) = scene.geometry.values()
     np.testing.assert_allclose(stored.centroid, np.eye(3)[axis], atol=1e-6)
     np.testing.assert_array_equal(modal(*read(tmp_path / "a.glb"))["positions"], field.points.numpy())
 
 
-def test_a_texture_becomes_the_corners_colors():
-    picture = torch.zeros(2, 2, 3, dtype=torch.uint8)
+def test_a_texture_becomes_the_corners_colors(tmp_path):
+    picture = np.zeros((2, 2, 3), dtype=np.uint8)
     picture[0, 0, 1] = 255  # the upper left is green, all else black
-    mesh = TexturedMesh.build(
-        torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
-        torch.tensor([[0, 1, 2]]),
-        coordinates=torch.tensor([[[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]]]),
-        textures=[picture],
-    )
-    geometry = DisplayGeometry.of_mesh(mesh)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
+    visual = trimesh.visual.TextureVisuals([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]], material=material)
+    triangle = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    trimesh.Trimesh(triangle, [[0, 1, 2]], visual=visual, process=False).export(tmp_path / "thing.glb")
+    geometry, _ = read_display_geometry(tmp_path / "thing.glb", table())
     upper = int((geometry.vertices[:, 1] == 1).nonzero()[0])
     assert geometry.colors[upper].tolist() == [0.0, 1.0, 0.0]
     assert geometry.colors.sum() == 1.0

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from avmsf.errors import ExportError
-from avmsf.export.writing import Written, write_file, write_folder
+from avmsf.export.writing import Written, write_files, write_folder
 from factories.raising import raises
 
 
@@ -65,11 +65,11 @@ def test_a_folder_behind_a_link_is_written_to_and_the_link_stays(tmp_path):
 
 
 def test_a_file_that_exists_is_replaced_only_if_asked(tmp_path):
-    write_file(tmp_path / "a.ply", b"ours")
+    write_files({tmp_path / "a.ply": b"ours"})
     with raises(ExportError, file="a.ply", name="--overwrite"):
-        write_file(tmp_path / "a.ply", b"other")
-    assert (tmp_path / "a.ply").read_bytes() == b"ours"
-    write_file(tmp_path / "a.ply", b"other", overwrite=True)
+        write_files({tmp_path / "b.ply": b"", tmp_path / "a.ply": b"other"})
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.ply", b"ours")]
+    write_files({tmp_path / "a.ply": b"other"}, overwrite=True)
     assert (tmp_path / "a.ply").read_bytes() == b"other"
 
 
@@ -78,4 +78,4 @@ def test_files_and_folders_are_told_apart(tmp_path):
     with raises(ExportError, file=tmp_path / "file", value="file"):
         write_folder(tmp_path / "file", named("a.txt"), {}, overwrite=True)
     with raises(ExportError, file=tmp_path, value="folder"):
-        write_file(tmp_path, b"avmsf", overwrite=True)
+        write_files({tmp_path: b"avmsf"}, overwrite=True)

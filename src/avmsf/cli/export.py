@@ -2,7 +2,6 @@
 
 import shlex
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,14 @@ from avmsf.cli.printing import next_step, print_result, say
 from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, fitted, write_faust
-from avmsf.export.geometry import read_display_geometry, read_gaussians
+from avmsf.export.geometry import read_gaussians
 from avmsf.export.gltf import write_gltf
 from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField, spread_rows
 from avmsf.export.samples import INSTRUMENT, Layer, hertz_layers, write_grid
 from avmsf.export.uff import write_universal
 from avmsf.export.web import write_webpage
-from avmsf.export.writing import POINTS, SUFFIXES, Written, check_free, write_file
+from avmsf.export.writing import POINTS, SUFFIXES, Written
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
@@ -201,17 +200,7 @@ def _recordings(field: SoundField, capture: Path | None) -> Impacts | None:
 def _gltf(field: SoundField, options: Options) -> Written:
     sampled = _sampled(field, options)
     source, meters = _object(field, options)
-    copied: dict[Path, bytes] = {}
-    if isinstance(source, Path) and holds_gaussians(source):
-        copied = {options.output.with_suffix(".gaussians.ply"): source.read_bytes()}
-    for path in copied:
-        check_free(path, overwrite=options.overwrite)
-    shown, remarks = read_display_geometry(source, sampled, meters=meters)
-    written = write_gltf(sampled, options.output, geometry=shown, up=options.up, overwrite=options.overwrite)
-    sizes = {**written.sizes}
-    for path, content in copied.items():
-        sizes |= write_file(path, content, overwrite=options.overwrite)
-    return replace(written, sizes=sizes, remarks=remarks + written.remarks)
+    return write_gltf(sampled, options.output, object=source, meters=meters, up=options.up, overwrite=options.overwrite)
 
 
 def _faust(field: SoundField, options: Options) -> Written:

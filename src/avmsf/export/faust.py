@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Written, check_free, check_suffix, generator, write_file
+from avmsf.export.writing import SUFFIXES, Written, check_suffix, generator, write_files
 
 _MIN_POINTS = 16
 """Number of points below which the noise is left out so that more points fit."""
@@ -46,12 +46,9 @@ def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, ov
     rows = (
         ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
     )
-    table, contacts = contacts_path(path), "\n".join(["contact,x,y,z", *rows, ""])
-    check_free(table, overwrite=overwrite)
-    sizes = write_file(path, text.encode(), overwrite=overwrite) | write_file(
-        table, contacts.encode(), overwrite=overwrite
-    )
-    return Written(sizes, tuple(remarks))
+    contacts = "\n".join(["contact,x,y,z", *rows, ""])
+    contents = {path: text.encode(), contacts_path(path): contacts.encode()}
+    return Written(write_files(contents, overwrite=overwrite), tuple(remarks))
 
 
 def contacts_path(path: Path) -> Path:

@@ -147,22 +147,6 @@ class DisplayGeometry:
     colors: Float[Tensor, "vertices 3"] | None = None
     """Red, green, blue as displayed (sRGB), 0 to 1; None for gray."""
 
-    @classmethod
-    def of_points(cls, sampled: SampledField) -> "DisplayGeometry":
-        """Return the field's points."""
-        return cls(sampled.points, torch.zeros(0, 3, dtype=torch.int64), sampled.normals)
-
-    @classmethod
-    def of_mesh(cls, mesh: TexturedMesh) -> "DisplayGeometry":
-        """Return a mesh; a vertex is split if its normal or color differs between faces.
-
-        Textures become vertex colors.
-        """
-        corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
-        table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
-        kept = torch.from_numpy(table).float()
-        return cls(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
-
 
 def read_display_geometry(
     source: Path | Surface | None, sampled: SampledField, *, meters: float = 1.0
@@ -170,22 +154,24 @@ def read_display_geometry(
     """Read a mesh whose coordinates count `meters` each, and notes on differences from the file.
 
     A `Surface` is in meters, as are Gaussians, of which the centers are shown in their colors; without a source the
-    field's points are shown. Meshes of more than `MAX_FACES` triangles are reduced. Raises `ExportError` for one that
-    is huge, or not in the field's unit, and `CaptureError` for a file that is not a mesh.
+    field's points are shown. Textures become vertex colors, and meshes of more than `MAX_FACES` triangles are reduced.
+    Raises `ExportError` for one that is huge, or not in the field's unit, and `CaptureError` for a file that is not a
+    mesh.
     """
+    nowhere = torch.zeros(0, 3, dtype=torch.int64)
     if source is None:
-        return DisplayGeometry.of_points(sampled), ()
+        return DisplayGeometry(sampled.points, nowhere, sampled.normals), ()
     if isinstance(source, Surface):
         mesh = TexturedMesh.plain(source)
     elif (cloud := read_gaussians(source, sampled.points)) is not None:
         normals = sampled.normals[sampled.nearest(cloud.centers)]
-        return DisplayGeometry(cloud.centers, torch.zeros(0, 3, dtype=torch.int64), normals, cloud.colors), ()
+        return DisplayGeometry(cloud.centers, nowhere, normals, cloud.colors), ()
     else:
         mesh = read_textured_mesh(source, meters=meters)
     _check_fits(mesh.vertices.double().numpy(), sampled.points, source)
     faces = len(mesh.faces)
     if faces <= MAX_FACES:
-        return DisplayGeometry.of_mesh(mesh), ()
+        return _of_corners(mesh), ()
     corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
     painted = (255.0 * _corner_colors(mesh)).round().byte().reshape(-1, 3).numpy()
     solid = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=painted, process=False)
@@ -194,8 +180,16 @@ def read_display_geometry(
     corner_rows = torch.from_numpy(np.array(small.faces, dtype=np.int64))
     shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0
     vertices = torch.from_numpy(np.array(small.vertices)).float()
-    geometry = DisplayGeometry.of_mesh(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows]))
+    geometry = _of_corners(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows]))
     return geometry, (_too_fine(source, faces, len(corner_rows)),)
+
+
+def _of_corners(mesh: TexturedMesh) -> DisplayGeometry:
+    """Return a mesh whose vertices are split where normals or colors differ between faces."""
+    corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
+    table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
+    kept = torch.from_numpy(table).float()
+    return DisplayGeometry(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
 
 
 def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:

@@ -18,10 +18,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf.export.geometry import DisplayGeometry
+from avmsf.export.geometry import DisplayGeometry, read_display_geometry
 from avmsf.export.one_phase import approximation_error, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Axis, Written, check_suffix, generator, no_modes, pack, write_file
+from avmsf.export.writing import SUFFIXES, Axis, Written, check_suffix, generator, no_modes, pack, write_files
+from avmsf.gaussians.ply import holds_gaussians
+from avmsf.mesh.surface import Surface
 
 EXTENSION = "KHR_audio_rigid_bodies"
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -41,24 +43,29 @@ def write_gltf(
     sampled: SampledField,
     path: str | Path,
     *,
-    geometry: DisplayGeometry | None = None,
+    object: Path | Surface | None = None,
+    meters: float = 1.0,
     up: Axis = "z",
     overwrite: bool = False,
 ) -> Written:
-    """Write the object, or its points, and one modal model, with the modes sorted by energy.
+    """Write an object, or the field's points, and one modal model, with the modes sorted by energy.
 
-    All coordinates are in the object's frame; the node rotates its axis `up` to glTF's +y. Raises
-    `ExportError` for a name that does not end in .glb, and a field without modes.
+    `object` is a mesh with coordinates in units of `meters`, or Gaussians, of which the file has the centers and a copy
+    beside it the rest. All coordinates are in the object's frame; the node rotates its axis `up` to glTF's +y. Raises
+    `ExportError` for a name that does not end in .glb, a field without modes, and as `read_display_geometry`.
     """
     path = Path(path)
     check_suffix(path, SUFFIXES["gltf"])
     if not len(sampled.frequency):
         raise no_modes(path)
     damping, gains = shared_dampings(sampled), signed_amplitudes(sampled)
-    document, content = _document(sampled, geometry or DisplayGeometry.of_points(sampled), up, gains, damping)
-    sizes = write_file(path, _glb(document, content), overwrite=overwrite)
+    geometry, remarks = read_display_geometry(object, sampled, meters=meters)
+    contents = {path: _glb(*_document(sampled, geometry, up, gains, damping))}
+    if isinstance(object, Path) and holds_gaussians(object):
+        contents[path.with_suffix(".gaussians.ply")] = object.read_bytes()
+    sizes = write_files(contents, overwrite=overwrite)
     error = approximation_error(sampled, torch.complex(gains, torch.zeros_like(gains)), damping)
-    return Written(sizes, _remarks(sampled), *error)
+    return Written(sizes, remarks + _remarks(sampled), *error)
 
 
 def _document(

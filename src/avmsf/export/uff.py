@@ -21,7 +21,7 @@ from torch import Tensor
 from avmsf.errors import ExportError
 from avmsf.export.one_phase import shared_dampings
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Written, check_suffix, generator, write_file
+from avmsf.export.writing import SUFFIXES, Written, check_suffix, generator, write_files
 
 _NORMAL_MODE, _COMPLEX_MODE = 2, 3
 _TRANSLATION = 2
@@ -68,7 +68,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     if leaning > _STRAIGHT:
         axis = f"their reference direction is the nearest axis, up to {leaning:.0f} degrees off"
         remarks.append(f"response functions are of impacts against the normal; {axis}")
-    return Written(write_file(path, content, overwrite=overwrite), tuple(remarks))
+    return Written(write_files({path: content}, overwrite=overwrite), tuple(remarks))
 
 
 def response_frequencies(field: SampledField) -> Float64[np.ndarray, " lines"]:

@@ -22,7 +22,7 @@ from typing import Any
 from avmsf.errors import ExportError
 from avmsf.export.bundle import Bundle, make_bundle
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Written, generator, write_file, write_folder
+from avmsf.export.writing import SUFFIXES, Written, generator, write_files, write_folder
 from avmsf.field.sound_field import SoundField
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
@@ -62,7 +62,7 @@ def write_webpage(
     """
     output, bundle = Path(output), make_bundle(field, **options)
     if output.suffix.lower() in SUFFIXES["web"]:
-        return Written(write_file(output, single_file(bundle).encode(), overwrite=overwrite), bundle.remarks)
+        return Written(write_files({output: single_file(bundle).encode()}, overwrite=overwrite), bundle.remarks)
     content = {**_needed(page_files(), bundle), **bundle.files}
     html = _titled(content["index.html"].decode(), bundle)
     content["index.html"] = with_policy(html, directives_of(html)).encode()
@@ -94,7 +94,6 @@ def single_file(bundle: Bundle, page: Mapping[str, bytes] | None = None) -> str:
     carried = {"manifest.json": json.dumps(bundle.manifest).encode(), "page/bank.js": page["page/bank.js"]}
     inlined = {name: _carried(name, content) for name, content in {**carried, **bundle.files}.items()}
     data = f"<script>globalThis.avmsfInlined = {json.dumps(inlined)};</script>\n"
-    # The generator at the beginning is how a later export recognizes the file.
     html = html.replace("<!doctype html>\n", f"<!doctype html>\n<!-- {generator()} -->\n", 1)
     begin = '<script type="module">import "avmsf/{}";</script>'
     html = _once(_START, html, lambda found: data + begin.format(found[1]), "script that starts the page")

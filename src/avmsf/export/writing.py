@@ -86,11 +86,13 @@ def pack(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[s
     return bytes(content), records
 
 
-def write_file(path: Path, content: bytes, *, overwrite: bool = False) -> dict[Path, int]:
-    """Write one file atomically and return its size. Raises `ExportError` if it exists, unless `overwrite` is set."""
-    check_free(path, overwrite=overwrite)
-    write_whole(path, content, raising=ExportError)
-    return {path: len(content)}
+def write_files(contents: Mapping[Path, bytes], *, overwrite: bool = False) -> dict[Path, int]:
+    """Write files, each atomically, and return the sizes. Raises `ExportError` if one exists, unless `overwrite`."""
+    for path in contents:
+        check_free(path, overwrite=overwrite)
+    for path, content in contents.items():
+        write_whole(path, content, raising=ExportError)
+    return {path: len(content) for path, content in contents.items()}
 
 
 def write_folder(
@@ -113,7 +115,7 @@ def write_folder(
 
 
 def check_free(path: Path, *, folder: bool = False, overwrite: bool = False) -> None:
-    """Raise `ExportError` if `write_file`, or `write_folder`, would for what exists there."""
+    """Raise `ExportError` if `write_files`, or `write_folder`, would for what exists there."""
     if not path.exists():
         return
     if path.is_dir() != folder:
