@@ -68,12 +68,10 @@ def estimate_cameras(
         names, unreadable = _stage_images(images, begun)
         job = {"names": names, "seed": seed or 0, "features": features, "threads": threads}
         (begun / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        registered = _run_worker(begun, timeout=timeout)
-        numbers = sorted(registered, key=lambda number: -len(registered[number]))
-        groups = [registered[number] for number in numbers] or [[]]
-        remarks = _check_groups(groups, unreadable, sorted([*names.values(), *unreadable]), images)
+        groups = _run_worker(begun, timeout=timeout)
+        remarks = _check_groups(list(groups.values()), unreadable, sorted([*names.values(), *unreadable]), images)
         model.parent.mkdir(exist_ok=True)
-        os.rename(begun / "models" / numbers[0], model)
+        os.rename(begun / "models" / next(iter(groups)), model)
     except OSError as error:
         raise unwritable(output, error, raising=CaptureError) from error
     finally:
@@ -140,7 +138,7 @@ def _stage_mask(images: Path, pixels: np.ndarray, name: str, staged: Path) -> No
 
 
 def _run_worker(begun: Path, *, timeout: float) -> dict[str, list[str]]:
-    """Return the names of the images in each of the worker's models; raises CaptureError where it fails."""
+    """Return the images of each of the worker's models, the largest first; raises CaptureError where it fails."""
     log, result = begun / "worker.log", begun / "result.json"
     # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
     command = [sys.executable, "-P", str(WORKER), str(begun / "job.json")]
@@ -165,7 +163,7 @@ def _run_worker(begun: Path, *, timeout: float) -> dict[str, list[str]]:
         wanted = "structure from motion to end without an error"
         raise CaptureError.expected(wanted, ending, got=ending, name=stage, advice=advice)
     registered: dict[str, list[str]] = json.loads(result.read_text(encoding="utf-8"))
-    return registered
+    return dict(sorted(registered.items(), key=lambda model: -len(model[1])))
 
 
 def _stage_and_lines(log: Path, count: int = 6) -> tuple[str, str]:
@@ -183,7 +181,7 @@ def _check_groups(
 
     `groups` are the images of each model, the largest first. Raises CaptureError where that has less than half of all.
     """
-    largest = set(groups[0])
+    largest = set(groups[0]) if groups else set()
     if len(largest) < max(MIN_IMAGES, MIN_REGISTERED_RATIO * len(everything)):
         lacking = [name for name in everything if name not in largest]
         apart = f" in {len(groups)} groups that could not be joined" if len(groups) > 1 else ""
@@ -191,21 +189,17 @@ def _check_groups(
         advice = "take sharp photographs 10 to 15 degrees apart, with a patterned, fixed ground in view"
         wanted = "cameras of most photographs"
         raise CaptureError.expected(wanted, lacking, got=got, file=images, name="cameras", advice=advice)
-    remarks = []
-    if unreadable:
-        message = f"{counted(len(unreadable), 'image')} not used, as they cannot be read: {listed(unreadable, most=8)}"
-        remarks.append(Remark(message, name="unreadable images", value=unreadable))
     # Groups overlap: an image may belong to several that could not be joined.
     others = [rest for group in groups[1:] if (rest := [name for name in group if name not in largest])]
-    if others:
-        message = (
-            f"the photographs form {len(groups)} groups that could not be joined; only the largest, of {len(largest)} "
-            f"images, is used, without {'; '.join(listed(names, most=8) for names in others)}"
-        )
-        remarks.append(Remark(message, name="groups", value=others))
     named = largest.union(unreadable, *others)
     unseen = [name for name in everything if name not in named]
-    if unseen:
-        message = f"no camera was found for {counted(len(unseen), 'image')}: {listed(unseen, most=8)}"
-        remarks.append(Remark(message, name="cameras", value=unseen))
-    return remarks
+    split = f"the photographs form {len(groups)} groups that could not be joined; only the largest, of {len(largest)}"
+    lost = "; ".join(listed(names, most=8) for names in others)
+    unread = f"{counted(len(unreadable), 'image')} not used, as they cannot be read: {listed(unreadable, most=8)}"
+    alone = f"no camera was found for {counted(len(unseen), 'image')}: {listed(unseen, most=8)}"
+    remarks = [
+        Remark(unread, "unreadable images", unreadable),
+        Remark(f"{split} images, is used, without {lost}", "groups", others),
+        Remark(alone, "cameras", unseen),
+    ]
+    return [remark for remark in remarks if remark.value]

@@ -28,7 +28,8 @@ def main(job_path: Path) -> None:
     names, seed, threads = job["names"], job["seed"], job["threads"]
     database, images, masks, models = (folder / name for name in ("database.db", "images", "masks", "models"))
     pycolmap.set_random_seed(seed)
-    _log_stage("features")
+    # By these lines the parent knows how far the work is.
+    print("stage features", flush=True)
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
     if masks.is_dir():
         reader.mask_path = str(masks)
@@ -43,13 +44,13 @@ def main(job_path: Path) -> None:
         extraction_options=extraction,
         device=pycolmap.Device.cpu,
     )
-    _log_stage("matches")
+    print("stage matches", flush=True)
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     match = pycolmap.match_exhaustive if len(names) <= MAX_ALL_PAIRS else pycolmap.match_sequential
     match(database, matching_options=matching, verification_options=verification, device=pycolmap.Device.cpu)
-    _log_stage("cameras")
+    print("stage cameras", flush=True)
     models.mkdir()
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed, min_model_size=3)
     options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -61,11 +62,6 @@ def main(job_path: Path) -> None:
         # An image that a model merely knows of has no pose in it.
         registered[number] = sorted(image.name for image in model.images.values() if image.has_pose)
     (folder / "result.json").write_text(json.dumps(registered), encoding="utf-8")
-
-
-def _log_stage(stage: str) -> None:
-    """Write a line by which the parent knows how far the work is."""
-    print(f"stage {stage}", flush=True)
 
 
 def _end_with_parent() -> None:
