@@ -45,16 +45,16 @@ def read_transforms(path: Path) -> CameraFile:
     for row, frame in enumerate(frames):
         file = _text(frame, "file_path", Location(path, row, f"frame {row}"))
         where = Location(path, row, f"frame {row} ({file})")
-        pose, scale = _rigid(_matrix(frame, where), where)
+        pose, scale = _rigid_pose(frame, where)
         image = _with_suffix(path.parent / file)
         name = _name(file, image)
         if abs(scale - 1) > MAX_SCALE_DEVIATION:
             scaled.append(f"{name} ({scale:.4g})")
         settings = ChainMap(frame, common)
         mask = path.parent / _text(frame, "mask_path", where) if frame.get("mask_path") else None
-        _is_fisheye(settings, where)
+        lens_of = partial(_lens, settings, where, _is_fisheye(settings, where))
         world_to_camera = torch.from_numpy(np.linalg.inv(pose @ OPENCV_FROM_OPENGL))
-        photographs.append(Photograph(name, image, world_to_camera, partial(_lens, settings, where), mask))
+        photographs.append(Photograph(name, image, world_to_camera, lens_of, mask))
     message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
     remarks = (Remark(message, name="transform_matrix", value=scaled),) if scaled else ()
     return CameraFile(path, path.parent, tuple(photographs), remarks)
@@ -119,9 +119,8 @@ def _load_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def _lens(settings: Mapping[str, Any], where: Location, image_width: int, image_height: int) -> Lens:
+def _lens(settings: Mapping[str, Any], where: Location, fisheye: bool, image_width: int, image_height: int) -> Lens:
     """Return a frame's lens; the image's size is used where the file has none."""
-    fisheye = _is_fisheye(settings, where)
     sized = "w" in settings and "h" in settings
     width = int(_number(settings, "w", where)) if sized else image_width
     height = int(_number(settings, "h", where)) if sized else image_height
@@ -192,8 +191,12 @@ def _name(file: str, image: Path) -> str:
     return "/".join([*(parts[1:] if parts[:1] == ["images"] else parts), image.name])
 
 
-def _matrix(frame: dict[str, Any], where: Location) -> Float[np.ndarray, "rows 4"]:
-    """Return a frame's pose, of 4 rows, or 3 without the last."""
+def _rigid_pose(frame: dict[str, Any], where: Location) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Return a frame's camera-to-world matrix, of 4 rows or 3, made exactly rigid, and the scale of its rotation.
+
+    A scale that is the same along all axes does not move the camera and is removed; the caller warns of it. Raises
+    CaptureError, at `where`, for anything else that is not a rotation with a position.
+    """
     key, wanted = "transform_matrix", "the camera-to-world pose as 4 rows of 4 numbers"
     written = frame.get(key)
     try:
@@ -203,16 +206,6 @@ def _matrix(frame: dict[str, Any], where: Location) -> Float[np.ndarray, "rows 4
     if matrix.shape not in ((4, 4), (3, 4)):
         got = None if written is None else f"the shape {matrix.shape}"
         raise where.expected(wanted, written, got=got, name=key)
-    return matrix
-
-
-def _rigid(matrix: Float[np.ndarray, "rows 4"], where: Location) -> tuple[Float[np.ndarray, "4 4"], float]:
-    """Return a camera-to-world matrix made exactly rigid, and the scale that its rotation had.
-
-    A scale that is the same along all axes does not move the camera and is removed; the caller warns of it. Raises
-    CaptureError, at `where`, for anything else that is not a rotation with a position.
-    """
-    key = "transform_matrix"
     if not np.isfinite(matrix).all():
         value = float(matrix[~np.isfinite(matrix)][0])
         raise where.expected("a finite pose", value, name=key, advice="estimate this camera again")
