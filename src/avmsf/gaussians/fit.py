@@ -19,7 +19,7 @@ from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.densify import Density
-from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.prune import keep_object
 from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering
@@ -79,8 +79,10 @@ def splat(
     began = time.monotonic()
     background = choose_background(views, config)
     photographs = comparable_views(views, background)
+    if start is None:
+        start = visual_hull(views, points=config.start_points, wrong_fraction=config.wrong_masks)
     cloud = starting_cloud(
-        _hull_points(views, config) if start is None else start,
+        start,
         degree=config.degree,
         scale=config.start_scale,
         opacity=config.start_opacity,
@@ -121,12 +123,6 @@ def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfi
     for values in vars(cloud).values():
         digest.update(values.contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-def _hull_points(views: Sequence[View], config: SplatConfig) -> StartPoints:
-    hull = visual_hull(views, points=config.start_points, wrong_fraction=config.wrong_masks)
-    colors = photographed_colors(hull.points, views, spacing=hull.spacing)
-    return StartPoints(hull.points, colors, hull.normals)
 
 
 def _device(device: torch.device | str | None, rasterizer: Rasterizer | None) -> torch.device:

@@ -2,76 +2,61 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy import ndimage
-from torch import Tensor
 
+from avmsf.gaussians.initialize import StartPoints, photographed_colors
 from avmsf.photographs.cameras import View
 from avmsf.photographs.visual_hull import Grid, count_votes, masked_views, no_common_point, object_extent, touches_edge
 
-_ROUGH = 48
+_COARSE_CELLS = 48
 """Voxels along the longest side of the first carving, which finds where the object is."""
-_FINEST = 320
+_MAX_CELLS = 320
 """Voxels along the longest side at most: 130 MB of votes in a cube."""
 
 
-@dataclass(frozen=True, eq=False)
-class Hull:
-    """The surface of what the masks leave."""
+def visual_hull(views: Sequence[View], *, points: int, wrong_fraction: float = 0.05) -> StartPoints:
+    """Carve the object out of its masks, and return the middles of about `points` voxels at the surface.
 
-    points: Float[Tensor, "points 3"]
-    """Middles of the voxels at the surface, meters."""
-    normals: Float[Tensor, "points 3"]
-    """Unit normals, outwards, as well as voxels tell them."""
-    spacing: float
-    """Edge of a voxel, meters."""
-
-
-def visual_hull(views: Sequence[View], *, points: int, wrong_fraction: float = 0.05) -> Hull:
-    """Carve the object out of its masks, finely enough for about `points` voxels at the surface.
-
-    A view has a say where it sees: what lies beyond its image's edge it leaves to the others. A voxel goes when more
-    than `wrong_fraction` of the views that see it say so, so that a few wrong masks among many views carve nothing
-    away, and when fewer than half as many views see it as see the middle of the object. Views without a mask are passed
-    over, and those whose mask is empty, with a `CaptureWarning`. Raises `SceneError` where fewer than 3 masks remain,
-    or masks that have nothing in common.
+    With normals outwards, as well as voxels tell them, and the colors of the photographs. A view has a say where it
+    sees: what lies beyond its image's edge it leaves to the others. A voxel goes when more than `wrong_fraction` of the
+    views that see it say so, so that a few wrong masks among many views carve nothing away, and when fewer than half as
+    many views see it as see the middle of the object. Views without a mask are passed over, and those whose mask is
+    empty, with a `CaptureWarning`. Raises `SceneError` where fewer than 3 masks remain, or masks that have nothing in
+    common.
     """
     masked = masked_views(views)
     middle, reach = object_extent(masked)
-    # The rough box is a guess: where the object touches its edge, it grows.
+    # The first box is a guess: where the object touches its edge, it grows.
     for _ in range(4):
-        spacing = 2 * reach / _ROUGH
-        grid = Grid(middle - reach + 0.5 * spacing, spacing, (_ROUGH,) * 3)
+        spacing = 2 * reach / _COARSE_CELLS
+        grid = Grid(middle - reach + 0.5 * spacing, spacing, (_COARSE_CELLS,) * 3)
         solid = _carve(masked, grid, wrong_fraction)
-        if not solid.any() or not touches_edge(solid):
+        if not touches_edge(solid):
             break
         reach *= 1.5
     for _ in range(2):
-        if not solid.any():
-            raise no_common_point(len(masked))
         # The surface's voxels grow with the square of the fineness.
         finer = grid.spacing * math.sqrt(max(int(_surface(solid).sum()), 1) / points)
         # From the edge of a voxel beyond the solid ones on either side.
         low, high = grid.box(solid)
         low, extent = low - 1.5 * grid.spacing, high - low + 3 * grid.spacing
-        spacing = max(finer, float(extent.max()) / _FINEST)
+        spacing = max(finer, float(extent.max()) / _MAX_CELLS)
         x, y, z = (np.ceil(extent / spacing).astype(int) + 4).tolist()
         grid = Grid(low - 1.5 * spacing, spacing, (x, y, z))
         solid = _carve(masked, grid, wrong_fraction)
-    if not solid.any():
-        raise no_common_point(len(masked))
     rows = np.argwhere(_surface(solid))
-    normals = torch.from_numpy(_normals(solid, rows)).float()
-    return Hull(torch.from_numpy(grid.centers(rows)).float(), normals, grid.spacing)
+    centers = torch.from_numpy(grid.centers(rows)).float()
+    colors = photographed_colors(centers, views, spacing=grid.spacing)
+    return StartPoints(centers, colors, torch.from_numpy(_normals(solid, rows)).float())
 
 
 def _carve(views: Sequence[View], grid: Grid, wrong_fraction: float) -> Bool[np.ndarray, "x y z"]:
-    """Return which voxels of a grid the views leave."""
+    """Return which voxels of a grid the views leave; raises SceneError where they leave none."""
     masks, middle = [], grid.centers((np.array(grid.shape) - 1) / 2)
     for view in views:
         pose, mask = view.camera.world_to_camera.numpy(), view.foreground
@@ -85,7 +70,10 @@ def _carve(views: Sequence[View], grid: Grid, wrong_fraction: float) -> Bool[np.
     seen, agreed = votes.seen, votes.seen - votes.inside <= wrong_fraction * votes.seen
     counts = seen[agreed & (seen > 0)]
     enough = 0.5 * float(np.quantile(counts, 0.9)) if len(counts) else 1.0
-    return agreed & (seen >= max(1.0, enough))
+    solid = agreed & (seen >= max(1.0, enough))
+    if not solid.any():
+        raise no_common_point(len(views))
+    return solid
 
 
 def _surface(solid: np.ndarray) -> Bool[np.ndarray, "x y z"]:
