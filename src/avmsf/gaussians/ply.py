@@ -14,18 +14,9 @@ from jaxtyping import Float, Shaped
 from avmsf._utils.files import write_whole
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.ply_header import (
-    CENTER,
-    COLOR,
-    HIGHER,
-    NEEDED,
-    OPACITY,
-    ROTATION,
-    SCALES,
-    Header,
-    expect_count,
-    read_header,
-)
+from avmsf.gaussians.ply_header import HIGHER, NEEDED, PROPERTIES, expect_count, read_header
+
+_CENTER, _COLOR, _OPACITY, _SCALES, _ROTATION = PROPERTIES.values()
 
 
 def write_splats(cloud: GaussianCloud, path: str | Path) -> None:
@@ -39,7 +30,7 @@ def splat_bytes(cloud: GaussianCloud) -> bytes:
     higher = cloud.harmonics[:, 1:].mT.reshape(count, -1)
     columns = [cloud.centers, torch.zeros(count, 3), cloud.harmonics[:, 0], higher, cloud.logit_opacities[:, None]]
     table = torch.cat([*columns, cloud.log_scales, cloud.rotations], dim=1).numpy().astype("<f4")
-    names = [*CENTER, "nx", "ny", "nz", *COLOR, *HIGHER[: higher.shape[1]], *OPACITY, *SCALES, *ROTATION]
+    names = [*_CENTER, "nx", "ny", "nz", *_COLOR, *HIGHER[: higher.shape[1]], *_OPACITY, *_SCALES, *_ROTATION]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
     return "\n".join(header).encode("ascii") + table.tobytes()
@@ -61,8 +52,7 @@ def read_splats(path: str | Path) -> GaussianCloud:
     or truncated, or holds numbers that are not finite.
     """
     path = Path(path)
-    header = read_header(path)
-    columns = _read_columns(path, header)
+    columns = _read_columns(path)
     higher = HIGHER[: len(columns.keys() & set(HIGHER))]
     for name in (*NEEDED, *higher):
         # Text and float64 hold numbers that are infinite as float32, in which Gaussians are computed.
@@ -76,26 +66,26 @@ def read_splats(path: str | Path) -> GaussianCloud:
         values = np.stack([columns[name] for name in names], axis=1)
         return torch.from_numpy(values.astype(np.float32, order="C"))
 
-    rotations = stacked(*ROTATION)
+    rotations = stacked(*_ROTATION)
     still = torch.nonzero((rotations == 0).all(1))
     if len(still):
         wanted = "a quaternion as the rotation of each vertex"
-        raise SceneError.expected(wanted, [0.0] * 4, file=path, row=int(still[0]), name=ROTATION[0])
+        raise SceneError.expected(wanted, [0.0] * 4, file=path, row=int(still[0]), name=_ROTATION[0])
     above = len(higher) // 3
-    by_channel = [(name, *higher[place * above : (place + 1) * above]) for place, name in enumerate(COLOR)]
+    by_channel = [(name, *higher[place * above : (place + 1) * above]) for place, name in enumerate(_COLOR)]
     harmonics = torch.stack([stacked(*names) for names in by_channel], dim=2)
-    return GaussianCloud(stacked(*CENTER), rotations, stacked(*SCALES), stacked(*OPACITY)[:, 0], harmonics)
+    return GaussianCloud(stacked(*_CENTER), rotations, stacked(*_SCALES), stacked(*_OPACITY)[:, 0], harmonics)
 
 
-def _read_columns(path: Path, header: Header) -> Mapping[str, Shaped[np.ndarray, " points"]]:
+def _read_columns(path: Path) -> Mapping[str, Shaped[np.ndarray, " points"]]:
     """Return the values of each property of the Gaussians. Raises SceneError for words and missing rows in a text."""
-    vertices = header.vertices
-    if header.order:
-        kind = np.dtype([(name, header.order + kind) for name, kind in vertices.properties.items()])
-        table = np.fromfile(path, kind, vertices.count, offset=header.start)
+    vertices, order, start = read_header(path)
+    if order:
+        kind = np.dtype([(name, order + kind) for name, kind in vertices.properties.items()])
+        table = np.fromfile(path, kind, vertices.count, offset=start)
         return {name: table[name] for name in vertices.properties}
     width = len(vertices.properties)
-    words = path.read_bytes().split()[header.start : header.start + vertices.count * width]
+    words = path.read_bytes().split()[start : start + vertices.count * width]
     expect_count(path, vertices.count, len(words) // width)
     try:
         rows = np.array(words, dtype="S").astype(np.float64).reshape(vertices.count, width)

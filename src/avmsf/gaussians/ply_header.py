@@ -17,9 +17,14 @@ _MAX_HEADER_BYTES = 1 << 16
 """A file whose header has not ended by then is no .ply of Gaussians."""
 _MAX_DIGITS = 18
 """Digits of a count, which then fits into 64 bits."""
-CENTER, COLOR, OPACITY = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("opacity",)
-SCALES, ROTATION = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
-NEEDED = (*CENTER, *COLOR, *OPACITY, *SCALES, *ROTATION)
+PROPERTIES = {
+    "center": ("x", "y", "z"),
+    "color": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacity": ("opacity",),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "rotation": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+NEEDED = tuple(name for names in PROPERTIES.values() for name in names)
 """Properties that every vertex has."""
 HIGHER = tuple(f"f_rest_{place}" for place in range(45))
 """Properties of harmonics above degree 0, of which a vertex has the first 0, 9, 24 or 45."""
@@ -36,23 +41,12 @@ class Element:
     """Numpy type of each property without its byte order, in the order of the file; "list" for a list."""
 
 
-@dataclass(frozen=True)
-class Header:
-    """Where a `.ply` holds its Gaussians, and how."""
+def read_header(path: Path) -> tuple[Element, str, int]:
+    """Return a file's Gaussians, the byte order as numpy writes it, and where they start, from the header alone.
 
-    order: str
-    """Byte order as numpy writes it; empty for a text file."""
-    start: int
-    """What comes before the first vertex: bytes, or in a text file words."""
-    vertices: Element
-    """The Gaussians."""
-
-
-def read_header(path: Path) -> Header:
-    """Return where a file's Gaussians are, from its header alone.
-
-    Raises `SceneError` for a file that is missing or no `.ply` of Gaussians, saying what it is, and for a binary one
-    that ends before its last vertex; the length of a text file is not known from its header.
+    The order of a text file is empty, and its start counts words, else bytes. Raises `SceneError` for a file that is
+    missing or no `.ply` of Gaussians, saying what it is, and for a binary one that ends before its last vertex; the
+    length of a text file is not known from its header.
     """
     try:
         with path.open("rb") as file:
@@ -74,11 +68,11 @@ def read_header(path: Path) -> Header:
         raise SceneError.expected(wanted, got="lists", file=path, name="list", advice=advice)
     if not order:
         words = sum(element.count * len(element.properties) for element in before)
-        return Header(order, len(content[:length].split()) + words, vertices)
+        return vertices, order, len(content[:length].split()) + words
     *others, width = (sum(int(kind[1:]) for kind in element.properties.values()) for element in (*before, vertices))
     start = length + sum(element.count * each for element, each in zip(before, others, strict=True))
     expect_count(path, vertices.count, max(0, size - start) // width)
-    return Header(order, start, vertices)
+    return vertices, order, start
 
 
 def expect_count(path: Path, expected: int, found: int) -> None:
@@ -121,18 +115,19 @@ def _find_gaussians(path: Path, elements: Sequence[Element]) -> Element:
     """Return the element that holds the Gaussians. Raises SceneError, which describes the file, for other files."""
     named = {element.name: element for element in elements}
     vertices, faces = (named.get(name, Element(name, 0)) for name in ("vertex", "face"))
-    missing = [name for name in NEEDED if name not in vertices.properties]
+    properties = vertices.properties.keys()
+    missing = [name for name in NEEDED if name not in properties]
     value: object
     if any(name.startswith("packed_") for element in elements for name in element.properties):
         got, name, value, advice = "compressed ones", "compression", list(named), "export them uncompressed"
     elif not missing:
         return vertices
-    elif {"opacity", "f_dc_0"} & vertices.properties.keys():
+    elif {"opacity", "f_dc_0"} & properties:
         got, name, value, advice = f"Gaussians without {', '.join(missing)}", missing[0], missing, ""
     elif faces.count:
         got, name, value = f"a mesh of {faces.count} faces", "face", faces.count
         advice = "use it as the capture's surface"
-    elif {"x", "y", "z"} <= vertices.properties.keys():
+    elif {"x", "y", "z"} <= properties:
         got, name, value = f"a point cloud of {vertices.count} points", "vertex", vertices.count
         advice = "use it as the capture's surface, or as initial points"
     else:
