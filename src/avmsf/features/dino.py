@@ -1,6 +1,6 @@
 """DINOv2 through transformers (extra `vision`): by name, from the hub or its cache, or from a local folder."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,13 +17,14 @@ MODELS: Final = tuple(
     f"facebook/dinov2{registers}-{size}" for registers in ("", "-with-registers") for size in ("small", "base", "large")
 )
 """Names under which the hub has them; small, base and large give 384, 768 and 1024 features."""
-IMAGENET_MEAN: Final = (0.485, 0.456, 0.406)
-IMAGENET_DEVIATION: Final = (0.229, 0.224, 0.225)
+IMAGENET: Final = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+"""Mean and standard deviation of the colors that a model was trained with, where its files do not say."""
 _FILES = _CONFIG, _WEIGHTS, _PREPROCESSOR = "config.json", "model.safetensors", "preprocessor_config.json"
 _HUB_SECONDS = 5.0
 """How long to wait for the hub's answer."""
 
 
+@dataclass(frozen=True, eq=False)
 class DinoEncoder:
     """A DINOv2 model, with or without registers, as an encoder: its patches' last hidden states.
 
@@ -32,24 +33,14 @@ class DinoEncoder:
     the middles of equal cells of the image, so that the map covers the image alone.
     """
 
-    def __init__(
-        self,
-        model: nn.Module,
-        *,
-        name: str,
-        longest: int | None = 518,
-        mean: Sequence[float] = IMAGENET_MEAN,
-        deviation: Sequence[float] = IMAGENET_DEVIATION,
-    ) -> None:
-        """Wrap a transformers model on whatever device and in whatever precision it is.
-
-        `longest`, pixels, is the resolution encoded, None for each image's own; `mean` and `deviation` are what the
-        model was trained to have colors normalized with.
-        """
-        if longest is not None and longest < 1:
-            raise SceneError.expected("the pixels of the longer side, such as 518", longest, name="longest")
-        self.model, self.name, self.longest = model.eval().requires_grad_(False), name, longest
-        self._mean, self._deviation = (torch.tensor(each)[:, None, None] for each in (mean, deviation))
+    model: nn.Module
+    """Of transformers, on whatever device and in whatever precision."""
+    name: str
+    longest: int | None
+    """Pixels of the longer side as it is encoded; None for each image's own."""
+    mean: Float[Tensor, "3 1 1"]
+    """Mean and standard deviation that the model was trained to have colors normalized with."""
+    deviation: Float[Tensor, "3 1 1"]
 
     @classmethod
     def load(
@@ -61,14 +52,14 @@ class DinoEncoder:
         rounds the factors of the first layer to TF32. Raises SceneError where transformers is missing, where the model
         is neither here nor to be downloaded, and for a folder that holds another model or a part of one.
         """
+        if longest is not None and longest < 1:
+            raise SceneError.expected("the pixels of the longer side, such as 518", longest, name="longest")
         folder, name = Path(source).expanduser(), str(source)
         if folder.is_dir():
             name = f"DINOv2 from the folder {folder.resolve().name}"
         else:
             folder = _download(name)
-        model = _load_model(folder).to(device)
-        mean, deviation = _read_normalization(folder / _PREPROCESSOR)
-        return cls(model, name=name, longest=longest, mean=mean, deviation=deviation)
+        return cls(_load_model(folder).to(device), name, longest, *_read_normalization(folder / _PREPROCESSOR))
 
     def describe(
         self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
@@ -82,7 +73,7 @@ class DinoEncoder:
         color = functional.interpolate(
             color[None], (height, width), mode="bicubic", align_corners=False, antialias=True
         ).clamp(0.0, 1.0)
-        color = (color - self._mean.to(color)) / self._deviation.to(color)
+        color = (color - self.mean.to(color)) / self.deviation.to(color)
         patch = int(self.model.config.patch_size)  # type: ignore[union-attr,arg-type]
         rows, columns = -(-height // patch), -(-width // patch)
         color = functional.pad(color, (0, columns * patch - width, 0, rows * patch - height), mode="replicate")
@@ -133,7 +124,7 @@ def _load_model(folder: Path) -> nn.Module:
         if not (folder / name).is_file():
             raise SceneError.expected("a DINOv2 model", got=f"no {name}", file=folder, name=name, advice=advice)
     kind = _read_settings(folder / _CONFIG).get("model_type")
-    if not isinstance(kind, str) or kind not in classes:
+    if kind not in list(classes):
         wanted = f"a model of type {' or '.join(classes)}"
         raise SceneError.expected(wanted, kind, file=folder / _CONFIG, name="model_type")
     try:
@@ -161,17 +152,15 @@ def _read_settings(path: Path) -> dict[str, Any]:
     return record
 
 
-def _read_normalization(path: Path) -> tuple[Sequence[float], Sequence[float]]:
+def _read_normalization(path: Path) -> list[Float[Tensor, "3 1 1"]]:
     """Return the mean and standard deviation of colors in a preprocessor's file, ImageNet's without one."""
-    record = _read_settings(path) if path.is_file() else {}
-    found = record.get("image_mean", IMAGENET_MEAN), record.get("image_std", IMAGENET_DEVIATION)
-    for each in found:
-        if not (
-            isinstance(each, Sequence) and len(each) == 3 and all(isinstance(value, float | int) for value in each)
-        ):
-            wanted = "image_mean and image_std of three numbers"
-            raise SceneError.expected(wanted, found, file=path, name="image_mean", advice="copy it again")
-    return found
+    record = IMAGENET | (_read_settings(path) if path.is_file() else {})
+    found = [record[name] for name in IMAGENET]
+    try:
+        return [torch.tensor(values, dtype=torch.float32).reshape(3, 1, 1) for values in found]
+    except (TypeError, ValueError, RuntimeError) as error:
+        wanted = "image_mean and image_std of three numbers"
+        raise SceneError.expected(wanted, found, file=path, name="image_mean", advice="copy it again") from error
 
 
 def _model_classes() -> dict[str, Any]:
