@@ -6,11 +6,11 @@ import numpy as np
 import torch
 import trimesh
 
+from avmsf.gaussians.visibility import DepthMap
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import MeshTracer, orbit_cameras, render_views
-from avmsf.reconstruction import DepthMap
 
 RADIUS, HEIGHT = 0.05, 0.06
 """Of a cup, meters."""

@@ -8,8 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from jaxtyping import UInt8
 
 from avmsf.errors import CaptureError
 from avmsf.photographs.cameras import Camera
@@ -79,38 +78,34 @@ class Lens:
             raise self.origin.expected(wanted, values, got=got, name="intrinsics", advice=advice)
 
     @property
-    def straight(self) -> bool:
-        """Whether the lens is a pinhole already."""
-        return not self.fisheye and not any(self.distortion)
+    def pinhole(self) -> Camera:
+        """The camera with these intrinsics at the origin, without the distortion."""
+        return Camera(torch.eye(4, dtype=torch.float64), self.focal, self.principal, self.width, self.height)
 
     def resized(self, width: int, height: int) -> "Lens":
         """Return the lens of the same image with another number of pixels."""
-        same = self.camera(torch.eye(4)).resized(width, height)
+        same = self.pinhole.resized(width, height)
         return replace(self, focal=same.focal, principal=same.principal, width=width, height=height)
-
-    def camera(self, world_to_camera: Float[Tensor, "4 4"]) -> Camera:
-        """Return the pinhole camera with this lens's intrinsics, its distortion left aside."""
-        return Camera(world_to_camera.to(torch.float64), self.focal, self.principal, self.width, self.height)
 
 
 def straighten(
     pixels: UInt8[np.ndarray, "height width channels"], lens: Lens
-) -> tuple[UInt8[np.ndarray, "height width channels"], Lens]:
-    """Return an image, mask included, as a pinhole would have taken it, and that pinhole.
+) -> tuple[UInt8[np.ndarray, "height width channels"], Camera]:
+    """Return an image, mask included, as a pinhole at the origin would have taken it, and that pinhole.
 
     It has the size and the principal point of the original. Its focal length is the smallest at which every pixel
     still shows something, so that nothing black is made up at the edges: a part of the outermost pixels may be lost,
     and a fisheye keeps at most what twice the width and height of its middle take in. Interpolation is bilinear.
     Raises CaptureError where the distortion folds the image over, as coefficients of another model do.
     """
-    if lens.straight:
-        return pixels, replace(lens, distortion=())
+    if not lens.fisheye and not any(lens.distortion):
+        return pixels, lens.pinhole
     pinhole = _widest_pinhole(lens)
     across, down = _sources(lens, pinhole, (pinhole.width, pinhole.height))
     return cv2.remap(pixels, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), pinhole
 
 
-def _widest_pinhole(lens: Lens) -> Lens:
+def _widest_pinhole(lens: Lens) -> Camera:
     """Return the pinhole of smallest focal length, by bisection, whose every pixel lies in the lens's image."""
     narrow, wide = 4.0, 1 / _MAX_FIELD_RATIO
     if not _covers(lens, narrow):
@@ -124,8 +119,8 @@ def _widest_pinhole(lens: Lens) -> Lens:
     return _pinhole(lens, narrow)
 
 
-def _pinhole(lens: Lens, zoom: float) -> Lens:
-    return replace(lens, focal=(lens.focal[0] * zoom, lens.focal[1] * zoom), distortion=(), fisheye=False)
+def _pinhole(lens: Lens, zoom: float) -> Camera:
+    return replace(lens.pinhole, focal=(lens.focal[0] * zoom, lens.focal[1] * zoom))
 
 
 def _covers(lens: Lens, zoom: float) -> bool:
@@ -140,7 +135,7 @@ def _covers(lens: Lens, zoom: float) -> bool:
 
 
 def _sources(
-    lens: Lens, pinhole: Lens, size: tuple[int, int], *, steps: tuple[float, float] = (1.0, 1.0), margin: int = 0
+    lens: Lens, pinhole: Camera, size: tuple[int, int], *, steps: tuple[float, float] = (1.0, 1.0), margin: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where in the lens's image the pinhole's pixels come from.
 

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -103,17 +103,18 @@ def read_view(
         findings["missing images"].append(photograph.name)
         return None
     pixels, lens = _with_lens(photograph, pixels, findings)
-    pixels, lens = straighten(_with_mask(photograph, folder, pixels, findings), lens)
+    pixels, camera = straighten(_with_mask(photograph, folder, pixels, findings), lens)
     if longest is not None and max(size_of(pixels)) > longest:
         width, height = (max(1, round(side * longest / max(size_of(pixels)))) for side in size_of(pixels))
-        pixels, lens = scale(pixels, width, height), lens.resized(width, height)
+        pixels, camera = scale(pixels, width, height), camera.resized(width, height)
     mask = torch.from_numpy(np.ascontiguousarray(pixels[..., 3])) if pixels.shape[2] == 4 else None
     if mask is not None and not mask.any():
         findings["empty masks"].append(photograph.name)
         return None
     pose = photograph.world_to_camera.clone()
     pose[:3, 3] *= meters
-    return View(photograph.name, torch.from_numpy(np.ascontiguousarray(pixels[..., :3])), lens.camera(pose), mask)
+    image = torch.from_numpy(np.ascontiguousarray(pixels[..., :3]))
+    return View(photograph.name, image, replace(camera, world_to_camera=pose), mask)
 
 
 def _with_lens(

@@ -1,15 +1,15 @@
 """From masks and depth of many views to an object's shape."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from scipy import ndimage
-from torch import Tensor
 
 from avmsf.errors import SceneError
-from avmsf.photographs.cameras import Camera, View
+from avmsf.gaussians.visibility import DepthMap
+from avmsf.photographs.cameras import View
 from avmsf.photographs.visual_hull import Grid, masked_views, no_common_point, object_extent, touches_edge
 from avmsf.reconstruction.depth_fusion import free_space
 from avmsf.reconstruction.distance import depth_in_convex_hull
@@ -17,9 +17,6 @@ from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
 from avmsf.reconstruction.visual_hull import Outline, hull_distance
-
-DepthMap = Callable[[Camera], Float[Tensor, "height width"]]
-"""What gives the depth of the first surface that each pixel of a camera sees, meters along the axis; 0 where none."""
 
 _COARSE_CELLS = 48
 """Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
