@@ -33,12 +33,7 @@ from avmsf._utils.arrays import short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.prepare import margin_length
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.extraction.phase_likelihood import (
-    FIRST_SPREAD,
-    DelayPrior,
-    MeasuredPhases,
-    occam_factor,
-)
+from avmsf.modal.extraction.phase_likelihood import FIRST_SPREAD, DelayPrior, MeasuredPhases, occam_factor
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import background_power
 
@@ -180,26 +175,24 @@ def align(impacts: Impacts) -> Alignment | None:
     if len(bank) == 0:
         return None
     reach, background = _reach(impacts), background_power(impacts.sounds, bank, impacts.sample_rate)
-    measured = MeasuredPhases.of(impacts, bank, reach=reach, background=background)
+    measured = MeasuredPhases(impacts, bank, reach=reach, background=background)
     before = after = coherence(measured.amplitude, bank.damping)
     delays, agreement, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
-        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=reach, background=background)
-        further, _, _ = _estimate(measured, earlier=delays)
-        delays = delays + further
-        measured = MeasuredPhases.of(impacts.delayed(delays), bank, reach=_CLOSE, background=background)
-        further, agreement, phases = _estimate(measured, earlier=delays, vague=0.0)
+        for reached, vague in ((reach, _VAGUE), (_CLOSE, 0.0)):
+            measured = MeasuredPhases(impacts.delayed(delays), bank, reach=reached, background=background)
+            further, agreement, phases = _estimate(measured, earlier=delays, vague=vague)
+            delays = delays + further
         # The phases are those at the recordings' common start, which moves with the offset.
-        offset = _offset(delays + further, agreement, impacts)
-        further = further + offset
-        delays = delays + further
+        offset = _offset(delays, agreement, impacts)
+        delays = delays + offset
         phases = replace(
             phases,
             start=_weighted_median(delays, agreement),
             doubled=phases.doubled * torch.exp(1j * offset * measured.turn),
         )
-        after = coherence(measured.turned(further), bank.damping)
+        after = coherence(measured.delayed_amplitude(further + offset), bank.damping)
     return Alignment(impacts.names, delays, agreement, before, after, phases, recording_keys(impacts))
 
 
@@ -278,10 +271,9 @@ def _reach(impacts: Impacts) -> float:
 def _delays_alone(impacts: Impacts, phases: Phases, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
     """Return the delays by which recordings agree with known phases; `usual` for one that surely does not."""
     background = background_power(impacts.sounds, phases.bank, impacts.sample_rate)
-    measured = MeasuredPhases.of(impacts, phases.bank, reach=reach, background=background)
-    doubled = phases.doubled.expand(len(impacts), -1)
+    measured = MeasuredPhases(impacts, phases.bank, reach=reach, background=background, power=phases.power)
     prior = DelayPrior(torch.tensor([usual], dtype=torch.float64), phases.jitter)
-    delays, odds, _ = measured.search(phases.power, phases.spread, doubled, prior)
+    delays, odds, _ = measured.search(phases.spread, phases.doubled.expand(len(impacts), -1), prior)
     return prior.median(delays, odds.sigmoid())
 
 
@@ -314,18 +306,18 @@ def _estimate(
     """
     if earlier is None:
         prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _FIRST_JITTER)
-        energy = measured.scaled.abs().square() / measured.bank.damping
+        energy = measured.squares / measured.bank.damping
         broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_REFERENCES]
         fits: list[_Fit] = []
         for reference in broadest.tolist():
             fits.append(_climb(measured, prior, reference=reference, known=fits))
         still = _unmoved(measured)
-        fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(still.delays))]
+        fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(measured))]
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
         fit = _climb(measured, DelayPrior(-earlier, _FIRST_JITTER), vague=vague)
     turned = fit.weights * measured.doubled(fit.delays)
-    _, odds, _ = measured.search(measured.power, fit.spread, turned.sum(0) - turned, fit.prior)
+    _, odds, _ = measured.search(fit.spread, turned.sum(0) - turned, fit.prior)
     agreement = odds.sigmoid()
     for _ in range(_ROUNDS):
         share = (agreement.sum() + 1) / (len(odds) + 2)
@@ -347,15 +339,15 @@ def _climb(
 
     One of `known` as soon as no delay is farther from it than a step of the grid: the climb would end there as well.
     """
-    power, spread = measured.power, torch.full_like(measured.power, FIRST_SPREAD)
-    weights = measured.concentration(power, spread)
-    delays = torch.zeros(len(weights), dtype=torch.float64)
+    spread = torch.full_like(measured.power, FIRST_SPREAD)
+    weights = measured.concentration(spread)
+    delays = torch.zeros(len(measured), dtype=torch.float64)
     if reference is not None:
-        alone = (weights[reference] * measured.doubled(delays)[reference]).expand(len(weights), -1)
-        delays, _, _ = measured.search(power, spread, alone, prior)
+        alone = (weights[reference] * measured.doubled(delays)[reference]).expand(len(measured), -1)
+        delays, _, _ = measured.search(spread, alone, prior)
     for turn in range(_ROUNDS):
         turned = weights * measured.doubled(delays)
-        found, _, spreads = measured.search(power, spread, turned.sum(0) - turned, prior)
+        found, _, spreads = measured.search(spread, turned.sum(0) - turned, prior)
         if reference is not None:
             found = found - found.median()
         for fit in known:
@@ -363,7 +355,7 @@ def _climb(
                 return fit
         moved = float((found - delays).abs().max())
         delays, spread = found, measured.spread(weights, found, vague=vague)
-        weights = measured.concentration(power, spreads)
+        weights = measured.concentration(spreads)
         if turn >= _SETTLING:
             scale = float((delays - prior.middle).abs().median())
             prior = replace(prior, scale=min(max(_LEAST_JITTER, scale), _FIRST_JITTER))
@@ -378,11 +370,10 @@ def _climb(
 
 def _unmoved(measured: MeasuredPhases) -> _Fit:
     """Return the fit without any delay."""
-    delays = torch.zeros(len(measured.scaled), dtype=torch.float64)
-    weights = measured.concentration(measured.power, torch.full_like(measured.power, FIRST_SPREAD))
+    delays, spread = torch.zeros(len(measured), dtype=torch.float64), torch.full_like(measured.power, FIRST_SPREAD)
     for _ in range(_SETTLING):
-        spread = measured.spread(weights, delays, vague=_VAGUE)
-        weights = measured.concentration(measured.power, spread)
+        spread = measured.spread(measured.concentration(spread), delays, vague=_VAGUE)
+    weights = measured.concentration(spread)
     total = (weights * measured.doubled(delays)).sum(0)
     prior = DelayPrior(delays[:1], _LEAST_JITTER)
     return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total))

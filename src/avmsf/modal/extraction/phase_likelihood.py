@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex128, Float32, Float64
+from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -64,80 +64,66 @@ class DelayPrior:
         return self.middle + torch.where(part < 1, away.sign() * torch.minimum(away.abs(), farthest), away)
 
 
-@dataclass(frozen=True, eq=False)
 class MeasuredPhases:
     """The modes' amplitudes in each recording, and what a delay makes of their phases."""
 
-    amplitude: Complex128[Tensor, "contacts modes"]
-    """Of exp((-d + 2 pi i f) t), in the recordings' unit."""
-    scaled: Complex128[Tensor, "contacts modes"]
-    """Each recording scaled to unit energy in the modes, so that loud ones count no more than faint ones."""
-    noise: Float64[Tensor, "contacts modes"]
-    """Variance of `scaled` across its phase that the background noise makes."""
-    bank: ModalBank
-    sample_rate: float
-    turn: Float64[Tensor, " modes"]
-    """Radians by which a delay of one sample turns a doubled phase."""
-    grid: Float64[Tensor, " steps"]
-    """Delays that are searched, samples."""
-    table: Float32[Tensor, "two_modes steps"]
-    """Cosines of the angles by which the delays of `grid` turn the modes' doubled phases, and their sines, negated."""
+    def __init__(
+        self,
+        impacts: Impacts,
+        bank: ModalBank,
+        *,
+        reach: float,
+        background: Float64[Tensor, "contacts modes"],
+        power: Float64[Tensor, " modes"] | None = None,
+    ) -> None:
+        """Measure them, to be aligned by delays of at most `reach` samples.
 
-    @classmethod
-    def of(
-        cls, impacts: Impacts, bank: ModalBank, *, reach: float, background: Float64[Tensor, "contacts modes"]
-    ) -> "MeasuredPhases":
-        """Return the amplitudes, to be aligned by delays of at most `reach` samples.
-
-        `background` is the noise's power at each mode (`background_power`).
+        `background` is the noise's power at each mode (`background_power`), `power` the modes' mean power in all
+        recordings, each of unit energy, if it is known from others than these.
         """
         rate, samples = impacts.sample_rate, impacts.sounds.shape[1]
-        amplitude = -1j * fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
+        self.bank, self.exponent = bank, torch.complex(-bank.damping, 2 * math.pi * bank.frequency) / rate
+        self.amplitude = -1j * fit_gains(impacts.sounds.double(), bank, sample_rate=rate)
+        """Of exp((-d + 2 pi i f) t), [contacts, modes], in the recordings' unit."""
+        scale = (self.amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()
+        scale = scale.clamp_min(torch.finfo(torch.float32).tiny)
         # The squared samples of exp(-d t) cos(2 pi f t) add up to this.
         energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
-        scale = (amplitude.abs().square() / bank.damping).sum(1, keepdim=True).sqrt()
-        scale = scale.clamp_min(torch.finfo(torch.float32).tiny)
-        step = min(0.5, rate / (2 * _GRID_PER_PERIOD * float(bank.frequency.max())))
-        steps = math.ceil(reach / step)
-        grid = step * torch.arange(-steps, steps + 1, dtype=torch.float64)
-        turn = 4 * math.pi * bank.frequency / rate
-        angles = turn[:, None] * grid
-        table = torch.cat([angles.cos(), -angles.sin()]).float()
-        noise = background / energy / scale.square()
-        return cls(amplitude, amplitude / scale, noise, bank, rate, turn, grid, table)
+        self.noise = background / energy / scale.square()
+        """Variance across its phase that the background noise makes of an amplitude, each recording of unit energy in
+        the modes, so that loud ones count no more than faint ones."""
+        scaled = self.amplitude / scale
+        self.phase, self.squares = scaled.angle(), scaled.abs().square()
+        self.power = self.squares.mean(0) if power is None else power
+        self.step = min(0.5, rate / (2 * _GRID_PER_PERIOD * float(bank.frequency.max())))
+        steps = math.ceil(reach / self.step)
+        self.grid = self.step * torch.arange(-steps, steps + 1, dtype=torch.float64)
+        """Delays that are searched, samples."""
+        self.turn = 4 * math.pi * bank.frequency / rate
+        """Radians by which a delay of one sample turns a doubled phase."""
+        angles = self.turn[:, None] * self.grid
+        # By these the delays of the grid turn the real and the imaginary parts of doubled phases.
+        self.table = torch.cat([angles.cos(), -angles.sin()]).float()
 
-    @property
-    def step(self) -> float:
-        """Distance of two delays of the grid, samples."""
-        return float(self.grid[1] - self.grid[0])
+    def __len__(self) -> int:
+        return len(self.amplitude)
 
-    @property
-    def power(self) -> Float64[Tensor, " modes"]:
-        """Mean over recordings of the squared `scaled`."""
-        return self.scaled.abs().square().mean(0)
-
-    def variance(
-        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, "*#contacts modes"]
-    ) -> Float64[Tensor, "contacts modes"]:
+    def variance(self, spread: Float64[Tensor, "*#contacts modes"]) -> Float64[Tensor, "contacts modes"]:
         """Return the variance across the phase."""
-        own = self.scaled.abs().square()
-        shared = spread * torch.sqrt(own * power)
-        return (self.noise + shared + _RELATIVE**2 * own).clamp_min(torch.finfo(torch.float64).tiny)
+        shared = spread * torch.sqrt(self.squares * self.power)
+        return (self.noise + shared + _RELATIVE**2 * self.squares).clamp_min(torch.finfo(torch.float64).tiny)
 
-    def concentration(
-        self, power: Float64[Tensor, " modes"], spread: Float64[Tensor, "*#contacts modes"]
-    ) -> Float64[Tensor, "contacts modes"]:
+    def concentration(self, spread: Float64[Tensor, "*#contacts modes"]) -> Float64[Tensor, "contacts modes"]:
         """Return the concentrations of the doubled phases."""
-        return self.scaled.abs().square() / (4 * self.variance(power, spread))
+        return self.squares / (4 * self.variance(spread))
 
-    def turned(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
+    def delayed_amplitude(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
         """Return the amplitudes with each recording starting later by its delay, samples."""
-        exponent = torch.complex(-self.bank.damping, 2 * math.pi * self.bank.frequency) / self.sample_rate
-        return self.amplitude * torch.exp(exponent * delays[:, None])
+        return self.amplitude * torch.exp(self.exponent * delays[:, None])
 
     def doubled(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
         """Return exp(2 i phase) with each recording starting later by its delay."""
-        return torch.exp(1j * (2 * self.scaled.angle() + self.turn * delays[:, None]))
+        return torch.exp(1j * (2 * self.phase + self.turn * delays[:, None]))
 
     def spread(
         self, weights: Float64[Tensor, "contacts modes"], delays: Float64[Tensor, " contacts"], *, vague: float
@@ -148,11 +134,10 @@ class MeasuredPhases:
         """
         turned = self.doubled(delays)
         mean = (weights * turned).sum(0)
-        across = self.scaled.abs().square() * (1 - (turned * torch.exp(-1j * mean.angle())).real) / 2
-        size = torch.sqrt(self.scaled.abs().square() * self.power).clamp_min(torch.finfo(torch.float64).tiny)
+        across = self.squares * (1 - (turned * torch.exp(-1j * mean.angle())).real) / 2
+        size = torch.sqrt(self.squares * self.power).clamp_min(torch.finfo(torch.float64).tiny)
         found = (across / size).median(0).values / _MEDIAN_OF_SQUARE
-        count = len(self.scaled)
-        return (count * found + vague * _USUAL_SPREAD) / (count + vague)
+        return (len(self) * found + vague * _USUAL_SPREAD) / (len(self) + vague)
 
     def log_likelihood(
         self,
@@ -161,24 +146,19 @@ class MeasuredPhases:
         doubled: Complex128[Tensor, " modes"],
     ) -> float:
         """Return the log likelihood of the amplitudes' parts across their phases, all mean phases alike."""
-        normal = -0.5 * torch.log(self.variance(self.power, spread)) - weights
+        normal = -0.5 * torch.log(self.variance(spread)) - weights
         return float(normal.sum() + log_i0(doubled.abs()).sum())
 
     def search(
-        self,
-        power: Float64[Tensor, " modes"],
-        spread: Float64[Tensor, " modes"],
-        doubled: Complex128[Tensor, "contacts modes"],
-        prior: DelayPrior,
+        self, spread: Float64[Tensor, " modes"], doubled: Complex128[Tensor, "contacts modes"], prior: DelayPrior
     ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"], Float64[Tensor, "contacts modes"]]:
         """Return each recording's likeliest delay, the log odds that its phases agree with `doubled`, and its spread.
 
         `doubled` is the sum of the others' weights times exp(2 i phase), for each recording. The odds compare phases
         about these, over all delays of the prior and both spreads, with phases that are anything.
         """
-        wide = torch.maximum(spread, (_WIDE * spread).clamp_max(FIRST_SPREAD))
-        spreads = torch.stack([spread, wide])
-        found = [self._search(self.concentration(power, each), doubled, prior) for each in spreads]
+        spreads = torch.stack([spread, torch.maximum(spread, (_WIDE * spread).clamp_max(FIRST_SPREAD))])
+        found = [self._search(self.concentration(each), doubled, prior) for each in spreads]
         delays, odds = (torch.stack(each) for each in zip(*found, strict=True))
         odds = odds + torch.tensor([[1 - _OUTLIER_SHARE], [_OUTLIER_SHARE]], dtype=torch.float64).log()
         best = odds.argmax(0)
@@ -194,24 +174,24 @@ class MeasuredPhases:
         # The others' mean phase is not known exactly: two von Mises laws in a row have about the product of the means'
         # lengths.
         pull = weights * torch.special.i1e(strength) / torch.special.i0e(strength)
-        toward = pull * torch.exp(1j * (2 * self.scaled.angle() - doubled.angle()))
-        # In single precision: this only finds the peaks' places on the grid.
+        toward, level = pull * torch.exp(1j * (2 * self.phase - doubled.angle())), log_i0(pull)
         candidates = self._candidates(toward, prior)
-        level = log_i0(pull)
         turned = toward[:, None] * torch.exp(1j * self.turn * candidates[:, :, None])
         robust = _agreement(turned, level[:, None]) + prior.log_density(candidates.T).T
         delays = candidates.gather(1, robust.argmax(1, keepdim=True))[:, 0]
-        for _ in range(_NEWTON_STEPS):
+
+        def derivatives() -> tuple[Tensor, Tensor, Tensor]:
             turned = toward * torch.exp(1j * self.turn * delays[:, None])
             likely = turned * _inlier_probability(turned, level)
-            slope = prior.slope(delays) - (self.turn * likely.imag).sum(1)
-            bend = (self.turn.square() * likely.real).sum(1)
-            step = torch.where(bend > 0, slope / bend, 0.0).clamp(-self.step, self.step)
+            return turned, -(self.turn * likely.imag).sum(1), (self.turn.square() * likely.real).sum(1)
+
+        for _ in range(_NEWTON_STEPS):
+            _, slope, bend = derivatives()
+            step = torch.where(bend > 0, (prior.slope(delays) + slope) / bend, 0.0).clamp(-self.step, self.step)
             delays = delays + step
             if float(step.abs().max()) < _EXACT:
                 break
-        turned = toward * torch.exp(1j * self.turn * delays[:, None])
-        bend = (self.turn.square() * (turned * _inlier_probability(turned, level)).real).sum(1)
+        turned, _, bend = derivatives()
         return delays, _agreement(turned, level) + occam_factor(prior, delays, bend)
 
     def _candidates(
