@@ -67,29 +67,6 @@ def gaussians(path: Path) -> GaussianCloud:
     return cloud
 
 
-def test_gaussians_lie_beside_the_glb(field_file: Path, tmp_path: Path) -> None:
-    gaussians(tmp_path / "plate.ply")
-    words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
-    assert main([*words, "--object", str(tmp_path / "plate.ply")]) == 0
-    assert (tmp_path / "a.gaussians.ply").read_bytes() == (tmp_path / "plate.ply").read_bytes()
-    shown = trimesh.load(tmp_path / "a.glb", process=False).dump()[0]
-    assert len(shown.vertices) == 40
-    assert len(np.unique(np.asarray(shown.colors), axis=0)) > 30
-    assert main([*words, "--overwrite", "--object", str(tmp_path / "plate.ply")]) == 0
-
-
-def test_a_strangers_file_beside_the_glb_is_left_alone(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    gaussians(tmp_path / "plate.ply")
-    (tmp_path / "a.gaussians.ply").write_bytes(b"theirs")
-    words = [str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
-    words += ["--object", str(tmp_path / "plate.ply")]
-    assert refused(words).file == tmp_path / "a.gaussians.ply"
-    assert (tmp_path / "a.gaussians.ply").read_bytes() == b"theirs"
-    assert not (tmp_path / "a.glb").exists()
-    assert main(["export", *words, "--overwrite"]) == 0
-    assert (tmp_path / "a.gaussians.ply").read_bytes() == (tmp_path / "plate.ply").read_bytes()
-
-
 def test_a_mesh_in_another_unit_is_refused(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     trimesh.creation.box([1000 * side for side in SIDES]).export(tmp_path / "plate.stl")
     words = [str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
@@ -158,17 +135,7 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
 
 
 def test_wavs_without_noise_are_the_modes(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    words = [
-        "export",
-        str(field_file),
-        "--to",
-        "wavs",
-        "--output",
-        str(tmp_path / "w"),
-        "--contacts",
-        "1",
-        "--no-noise",
-    ]
+    words = ["export", str(field_file), "--to", "wavs", "-o", str(tmp_path / "w"), "--contacts", "1", "--no-noise"]
     assert main(words) == 0
     assert "--no-noise" not in capsys.readouterr().err
     sampled = SampledField.of(load(field_file), limit=1)

@@ -159,9 +159,15 @@ def test_viewers_show_the_mesh_or_the_points(tmp_path):
 def test_gaussians_are_shown_by_their_centers_and_lie_beside_the_file(tmp_path):
     cloud = random_cloud(table().points)
     write_splats(cloud, tmp_path / "thing.ply")
-    written = write_gltf(table(), tmp_path / "a.glb", object=tmp_path / "thing.ply")
+    (tmp_path / "a.gaussians.ply").write_bytes(b"theirs")
+    with raises(ExportError, file=tmp_path / "a.gaussians.ply", name="--overwrite"):
+        write_gltf(table(), tmp_path / "a.glb", object=tmp_path / "thing.ply")
+    assert (tmp_path / "a.gaussians.ply").read_bytes() == b"theirs"
+    assert not (tmp_path / "a.glb").exists()
+    written = write_gltf(table(), tmp_path / "a.glb", object=tmp_path / "thing.ply", overwrite=True)
     (shown,) = trimesh.load(tmp_path / "a.glb", process=False).geometry.values()
     np.testing.assert_allclose(shown.vertices, cloud.centers, atol=1e-7)
+    assert len(np.unique(np.asarray(shown.colors), axis=0)) == POINTS
     assert set(written.sizes) == {tmp_path / "a.glb", tmp_path / "a.gaussians.ply"}
     assert (tmp_path / "a.gaussians.ply").read_bytes() == (tmp_path / "thing.ply").read_bytes()
 
