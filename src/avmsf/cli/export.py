@@ -17,15 +17,12 @@ from avmsf.cli.options.export import Options, unused_options
 from avmsf.cli.printing import next_step, print_result, say
 from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import ExportError
-from avmsf.export.faust import contacts_path, fitted, write_faust
+from avmsf.export.faust import contacts_path, fitted
 from avmsf.export.geometry import read_gaussians
-from avmsf.export.gltf import write_gltf
-from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField, spread_rows
-from avmsf.export.samples import INSTRUMENT, Layer, hertz_layers, write_grid
-from avmsf.export.uff import write_universal
-from avmsf.export.web import write_webpage
-from avmsf.export.writing import POINTS, SUFFIXES, Written
+from avmsf.export.samples import INSTRUMENT, Layer, hertz_layers
+from avmsf.export.write import WRITERS
+from avmsf.export.writing import POINTS, SUFFIXES, Format, Written
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
@@ -36,6 +33,8 @@ from avmsf.pipeline.shape import SURFACE
 
 _DEAD_DB = 40.0
 """Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""
+_Prepared = tuple[SoundField | SampledField, dict[str, Any]]
+"""What a writer writes, and its settings."""
 
 
 def run(options: Options) -> int:
@@ -43,7 +42,8 @@ def run(options: Options) -> int:
     for sentence in unused_options(options):
         say(f"note: {sentence}")
     field = load(options.field)
-    written = _WRITERS[options.to](field, options)
+    source, settings = _PREPARED[options.to](field, options)
+    written: Written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
     for remark in written.remarks:
         say(f"note: {remark}")
     if written.error:
@@ -135,13 +135,9 @@ def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None,
     if length == 1.0 or path is None:
         return path, meters
     if holds_gaussians(path):
-        raise ExportError(
-            f"{path}: expected a mesh for a field edited to {length:g} times its size, got Gaussians, which are not "
-            "scaled; name a mesh of that size by --object, or leave --capture out",
-            file=path,
-            name="--capture",
-            value=length,
-        )
+        wanted, got = f"a mesh for a field edited to {length:g} times its size", "Gaussians, which are not scaled"
+        advice = "name a mesh of that size by --object, or leave --capture out"
+        raise ExportError.expected(wanted, length, got=got, file=path, name="--capture", advice=advice)
     say(f"note: {path} is shown {length:g} times as large, as the field was edited")
     return path, meters * length
 
@@ -175,18 +171,12 @@ def _reconstructed(options: Options) -> Path | None:
     return made
 
 
-def _web(field: SoundField, options: Options) -> Written:
+def _web(field: SoundField, options: Options) -> _Prepared:
     source, meters = _object(field, options)
-    return write_webpage(
-        field,
-        options.output,
-        object=source,
-        meters=meters,
-        surface=None if isinstance(source, Surface) else field.gain_field.surface,
-        strikes=_recordings(field, options.capture),
-        limit=options.contacts or POINTS["web"],
-        overwrite=options.overwrite,
-    )
+    body = None if isinstance(source, Surface) else field.gain_field.surface
+    strikes = _recordings(field, options.capture)
+    limit = options.contacts or POINTS["web"]
+    return field, {"object": source, "meters": meters, "surface": body, "strikes": strikes, "limit": limit}
 
 
 def _recordings(field: SoundField, capture: Path | None) -> Impacts | None:
@@ -197,50 +187,41 @@ def _recordings(field: SoundField, capture: Path | None) -> Impacts | None:
     return None if capture is None else read_capture(capture).impacts
 
 
-def _gltf(field: SoundField, options: Options) -> Written:
+def _gltf(field: SoundField, options: Options) -> _Prepared:
     sampled = _sampled(field, options)
     source, meters = _object(field, options)
-    return write_gltf(sampled, options.output, object=source, meters=meters, up=options.up, overwrite=options.overwrite)
+    return sampled, {"object": source, "meters": meters, "up": options.up}
 
 
-def _faust(field: SoundField, options: Options) -> Written:
+def _faust(field: SoundField, options: Options) -> _Prepared:
     sampled, noise = _sampled(field, options), not options.no_noise
     if options.contacts is None and not options.contacts_given:
         asked = len(sampled)
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:
             say(f"note: {len(sampled)} of these are written, as many as Faust compiles in reasonable time")
-    return write_faust(sampled, options.output, noise=noise, overwrite=options.overwrite)
+    return sampled, {"noise": noise}
 
 
-def _demo(field: SoundField, options: Options) -> Written:
+def _demo(field: SoundField, options: Options) -> _Prepared:
     source, most = options.object, options.contacts or POINTS["avmsf-demo"]
-    sampled = _sampled(field, options)
-    cloud = None if source is None else read_gaussians(source, sampled.points)
-    if source is not None:
-        _note_size(field, source)
-    if cloud is None and source is not None:
-        raise ExportError(
-            f"{source}: expected a .ply of Gaussians for the demo, got another file; name one, or leave --object out "
-            "for a disc at each contact",
-            file=source,
-            name="--object",
+    settings = {"variant": options.variant, "precision": options.precision}
+    if source is None:
+        return _sampled(field, options), settings
+    cloud = read_gaussians(source, points_on_object(field.gain_field))
+    if cloud is None:
+        wanted, advice = (
+            "a .ply of Gaussians for the demo",
+            "name one, or leave --object out for a disc at each contact",
         )
-    if cloud is not None:
-        if len(cloud) > most:
-            cloud = cloud.take(spread_rows(cloud.centers, most))
-        sampled = SampledField.of(field, cloud.centers)
-    return write_demo(
-        sampled,
-        options.output,
-        cloud=cloud,
-        variant=options.variant,
-        precision=options.precision,
-        overwrite=options.overwrite,
-    )
+        raise ExportError.expected(wanted, got="another file", file=source, name="--object", advice=advice)
+    _note_size(field, source)
+    if len(cloud) > most:
+        cloud = cloud.take(spread_rows(cloud.centers, most))
+    return SampledField.of(field, cloud.centers), {**settings, "cloud": cloud}
 
 
-def _wavs(field: SoundField, options: Options) -> Written:
+def _wavs(field: SoundField, options: Options) -> _Prepared:
     forces, times = options.forces, options.contact_times
     if len(times) == 1:
         times = times * len(forces)
@@ -253,15 +234,8 @@ def _wavs(field: SoundField, options: Options) -> Written:
     sampled = _sampled(field, options)
     if not options.contacts_given:
         sampled = _loud(sampled)
-    return write_grid(
-        sampled,
-        options.output,
-        contacts=len(sampled),
-        layers=layers,
-        seconds=options.seconds,
-        noise=not options.no_noise,
-        overwrite=options.overwrite,
-    )
+    settings = {"layers": layers, "seconds": options.seconds, "noise": not options.no_noise}
+    return sampled, {**settings, "contacts": len(sampled)}
 
 
 def _loud(sampled: SampledField) -> SampledField:
@@ -274,13 +248,11 @@ def _loud(sampled: SampledField) -> SampledField:
     return sampled.take(loud)
 
 
-def _uff(field: SoundField, options: Options) -> Written:
-    return write_universal(
-        _sampled(field, options), options.output, functions=options.functions, overwrite=options.overwrite
-    )
+def _uff(field: SoundField, options: Options) -> _Prepared:
+    return _sampled(field, options), {"functions": options.functions}
 
 
-_WRITERS: dict[str, Callable[[SoundField, Options], Written]] = {
+_PREPARED: dict[Format, Callable[[SoundField, Options], _Prepared]] = {
     "web": _web,
     "gltf": _gltf,
     "faust": _faust,

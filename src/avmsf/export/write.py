@@ -1,5 +1,6 @@
 """A field in any format of other tools, by the ending of a file's name or the format's."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,13 +17,15 @@ from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 
 _FORMATS: dict[str, Format] = {suffix: name for name, suffixes in SUFFIXES.items() for suffix in suffixes}
-_WRITERS = {
+WRITERS: dict[Format, Callable[..., Written]] = {
+    "web": write_webpage,
     "gltf": write_gltf,
     "faust": write_faust,
     "avmsf-demo": write_demo,
     "wavs": write_grid,
     "uff": write_universal,
 }
+"""The writers, of a field at points of the object; the page's takes the field itself too."""
 
 
 def write(
@@ -49,8 +52,6 @@ def write(
     if kind == "web":
         return write_webpage(field, output, limit=limit, **options)
     sampled = SampledField.of(field, points_on_object(field.gain_field), limit=limit)
-    writer: Any = _WRITERS[kind]
     if kind == "wavs":
         options = {"contacts": len(sampled), **options}
-    written: Written = writer(sampled, output, **options)
-    return written
+    return WRITERS[kind](sampled, output, **options)
