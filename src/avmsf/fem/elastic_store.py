@@ -92,15 +92,14 @@ def load_modes(path: Path) -> ElasticModes:
     try:
         record = parse_json(header)
         sizes = {"nodes": len(tensors["nodes"]), "triangles": len(tensors["triangles"])}
-        expected = mode_skeleton(sizes | {"shapes": len(tensors["frequency"])}, shapes_dtype=torch.float64)
-        if "stiffness" in tensors:
-            modes, fields = len(tensors["frequency"]), len(tensors["stiffness"])
-            table, both = torch.empty(modes, modes, dtype=torch.float64, device="meta"), (fields, modes, modes)
-            expected |= {"poisson": table, "stiffness": table.expand(both), "mass": table.expand(both)}
+        modes, perturbed = len(tensors["frequency"]), "stiffness" in tensors
+        expected = mode_skeleton(sizes | {"shapes": modes}, shapes_dtype=torch.float64)
+        if perturbed:
+            table = torch.empty(modes, modes, dtype=torch.float64, device="meta")
+            both = table.expand(len(tensors["stiffness"]), modes, modes)
+            expected |= {"poisson": table, "stiffness": both, "mass": both}
         expect_tensors(tensors, expected, path, _KIND)
-        changes = None
-        if "stiffness" in tensors:
-            changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS))
+        changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS)) if perturbed else None
         material, mass = Material(**record["material"]), float(record["mass"])
         return replace(restored_modes(tensors, ""), material=material, mass=mass, perturbations=changes)
     except (ValueError, TypeError, KeyError) as error:

@@ -15,7 +15,7 @@ from avmsf.mesh.surface import Surface
 
 _FACES = torch.tensor([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 """Corners of a tetrahedron's sides, counter-clockwise from outside; side i lies opposite to corner i."""
-MIN_VOLUME_RATIO = 1e-9
+_MIN_VOLUME_RATIO = 1e-9
 """Volume of a tetrahedron over the cube of its longest edge, below which it is flat; a regular one has .118."""
 
 
@@ -36,12 +36,12 @@ class Solid:
         for coordinates that are not finite.
         """
         if not len(cells):
-            message = "expected tetrahedra, got none: the shape has no volume; give a sheet a thickness"
-            raise SimulationError(message, name="cells", value=0)
-        if int(cells.min()) < 0 or int(cells.max()) >= len(points):
-            found = int(cells.max()) if int(cells.min()) >= 0 else int(cells.min())
+            got, advice = "none: the shape has no volume", "give a sheet a thickness"
+            raise SimulationError.expected("tetrahedra", 0, got=got, name="cells", advice=advice)
+        unfit = cells[(cells < 0) | (cells >= len(points))]
+        if len(unfit):
             wanted = f"corners of tetrahedra from 0 to {len(points) - 1}"
-            raise SimulationError.expected(wanted, found, name="cells", advice="make the tetrahedra again")
+            raise SimulationError.expected(wanted, int(unfit[0]), name="cells", advice="make the tetrahedra again")
         used, rows = torch.unique(cells, return_inverse=True)
         corners = points[used]
         if not bool(torch.isfinite(corners).all()):
@@ -94,21 +94,19 @@ class Solid:
         rank[np.argsort(-size, kind="stable")] = np.arange(number)
         return torch.from_numpy(rank[label])
 
-    def expect_volume(self) -> None:
+    def expect_volume(self, *, advice: str = "make the tetrahedra with another detail") -> None:
         """Raise SimulationError where a tetrahedron is flat or inside out, naming the first."""
         longest = (self.points[self.cells][:, :, None] - self.points[self.cells][:, None]).norm(dim=-1).amax(dim=(1, 2))
-        unfit = torch.nonzero(~(self.volumes > MIN_VOLUME_RATIO * longest**3)).flatten()
+        unfit = torch.nonzero(~(self.volumes > _MIN_VOLUME_RATIO * longest**3)).flatten()
         if len(unfit):
             row = int(unfit[0])
-            volume = float(self.volumes[row])
-            raise SimulationError(
-                f"tetrahedron {row}: expected a positive volume, got {volume:.3g} m3 with edges up to "
-                f"{float(longest[row]):.3g} m ({len(unfit)} of {len(self.cells)} are flat or inverted); make the "
-                "tetrahedra with another detail",
-                row=row,
-                name="cells",
-                value=volume,
+            volume, middle = float(self.volumes[row]), self.points[self.cells[row]].mean(dim=0).tolist()
+            where = ", ".join(f"{value:.3f}" for value in middle)
+            got = (
+                f"{volume:.3g} m3 with edges up to {float(longest[row]):.3g} m at ({where}) m ({len(unfit)} of "
+                f"{len(self.cells)} are flat or inverted)"
             )
+            raise SimulationError.expected("a positive volume", volume, got=got, row=row, name="cells", advice=advice)
 
     def expect_connected(self, *, loose: float = 0.0) -> None:
         """Raise SimulationError where more than a share `loose` of the volume is not of the largest part."""

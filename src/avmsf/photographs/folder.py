@@ -145,26 +145,34 @@ def write_views(views: Sequence[View], folder: str | Path, *, replace: bool = Fa
     The folder is complete or as it was; with `replace` all that was in it is deleted then. Raises CaptureError where it
     exists and is not empty without that, where two views would have one file, and where it cannot be written.
     """
-    folder = Path(folder)
-    names = [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
+    folder, names = Path(folder), _file_names(views)
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         wanted, got = "views with different names", f"several for {repeated[0]}"
         raise CaptureError.expected(wanted, repeated, got=got, file=folder, name=repeated[0])
-    frames = []
     with new_folder(folder, raising=CaptureError, replace=replace) as begun:
-        for name, view in zip(names, views, strict=True):
-            camera = view.camera
-            pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ OPENCV_FROM_OPENGL
-            frame = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
-            frame |= {"w": camera.width, "h": camera.height, "fl_x": camera.focal[0], "fl_y": camera.focal[1]}
-            frame |= {"cx": camera.principal[0], "cy": camera.principal[1]}
-            _write_image(begun / "images" / name, view.image.cpu().numpy()[..., ::-1])
-            if view.mask is not None:
-                frame["mask_path"] = f"masks/{name}"
-                _write_image(begun / "masks" / name, view.mask.cpu().numpy())
-            frames.append(frame)
-        (begun / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1))
+        write_frames(views, begun)
+
+
+def write_frames(views: Sequence[View], folder: Path) -> None:
+    """Write what `write_views` does, of views of different names, into a folder that is there. Raises OSError."""
+    frames = []
+    for name, view in zip(_file_names(views), views, strict=True):
+        camera = view.camera
+        pose = np.linalg.inv(camera.world_to_camera.cpu().numpy()) @ OPENCV_FROM_OPENGL
+        frame = {"file_path": f"images/{name}", "transform_matrix": pose.tolist()}
+        frame |= {"w": camera.width, "h": camera.height, "fl_x": camera.focal[0], "fl_y": camera.focal[1]}
+        frame |= {"cx": camera.principal[0], "cy": camera.principal[1]}
+        _write_image(folder / "images" / name, view.image.cpu().numpy()[..., ::-1])
+        if view.mask is not None:
+            frame["mask_path"] = f"masks/{name}"
+            _write_image(folder / "masks" / name, view.mask.cpu().numpy())
+        frames.append(frame)
+    (folder / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1))
+
+
+def _file_names(views: Sequence[View]) -> list[str]:
+    return [str(PurePosixPath(view.name).with_suffix(".png")) for view in views]
 
 
 def _write_image(path: Path, pixels: np.ndarray) -> None:

@@ -20,7 +20,7 @@ _PATCHES = 16
 """Places where damping sits that couples modes."""
 _WAVES = 24
 """Plane waves of which a smooth random field is made."""
-_GRAIN = 0.4
+_MIN_WAVELENGTH = 0.4
 """Shortest wavelength of such a field, in object diagonals; the longest is five times that."""
 
 
@@ -52,7 +52,7 @@ def smooth_field(
         return torch.ones(len(places), dtype=torch.float64)
     directions = generator.standard_normal((_WAVES, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    lengths = _GRAIN * diagonal * np.exp(generator.uniform(0.0, math.log(5.0), _WAVES))
+    lengths = _MIN_WAVELENGTH * diagonal * np.exp(generator.uniform(0.0, math.log(5.0), _WAVES))
     phases = generator.uniform(0.0, 2.0 * math.pi, _WAVES)
     heights = np.cos(2.0 * math.pi * places.numpy() @ (directions / lengths[:, None]).T + phases).sum(axis=1)
     return torch.from_numpy(np.exp(spread * math.sqrt(2.0 / _WAVES) * heights))

@@ -57,7 +57,7 @@ def recorded(
 
 PINK, RUMBLE, WHITE = 0.5, 0.4, 0.1
 """Parts of the noise's power: of the room, of the building, of the recorder."""
-LOWEST = 20.0
+MIN_NOISE_HZ = 20.0
 """Hz below which the spectrum does not grow any more."""
 
 
@@ -70,7 +70,7 @@ def room_noise(
     """
     size = next_fast_len(samples, real=True)
     frequency = np.fft.rfftfreq(size, 1.0 / sample_rate)
-    bounded = np.maximum(frequency, LOWEST)
+    bounded = np.maximum(frequency, MIN_NOISE_HZ)
     power = np.zeros(len(frequency))
     for part, exponent in ((PINK, -1.0), (RUMBLE, -3.0), (WHITE, 0.0)):
         each = np.where(frequency > 0.0, bounded**exponent, 0.0)

@@ -1,6 +1,5 @@
 """A simulated object as a capture folder: what a user's own folder holds, and its truth beside that."""
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from avmsf._utils.files import new_folder
 from avmsf.capture.folder import write_capture
 from avmsf.errors import CaptureError, SimulationError
 from avmsf.mesh.textured_mesh import TexturedMesh
-from avmsf.photographs.folder import write_views
+from avmsf.photographs.folder import write_frames
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.recipe import AXES, EXAMPLE, ObjectRecipe
@@ -34,7 +33,7 @@ def write_simulation(
     folder appears whole or not at all. `progress` is called with the number of pictures rendered and their total.
     Raises SimulationError where the folder exists and is not empty, and where it cannot be written.
     """
-    folder = Path(folder)
+    folder, recipe, mesh = Path(folder), simulation.recipe, simulation.mesh
     try:
         with new_folder(folder, raising=SimulationError) as begun:
             # The whole recordings, and settings by which they are read as the simulation's own capture is.
@@ -44,9 +43,13 @@ def write_simulation(
             write_capture(replace(capture, surface=None, impacts=impacts), begun, onsets_within=seconds)
             for sound in begun.glob("*.wav"):
                 _zero_wav_timestamp(sound)
-            if simulation.recipe.surface:
-                write_textured(simulation.mesh, begun)
-            _write_views(simulation, begun, progress)
+            if recipe.surface:
+                write_textured(mesh, begun)
+            if recipe.views:
+                cameras = orbit_cameras(
+                    mesh.surface, size=recipe.view_size, azimuths=recipe.views // _CIRCLES, up=AXES[recipe.up]
+                )
+                write_frames(render_views(mesh, cameras, progress=progress), begun)
             write_truth(simulation.truth, begun / TRUTH)
     except CaptureError as error:
         raise SimulationError(
@@ -128,20 +131,6 @@ def _zero_wav_timestamp(path: Path) -> None:
             # Four bytes each of name, length and version stand before it.
             file.seek(start + 12)
             file.write(bytes(4))
-
-
-def _write_views(simulation: Simulation, folder: Path, progress: Callable[[int, int], None] | None) -> None:
-    recipe = simulation.recipe
-    if recipe.views == 0:
-        return
-    cameras = orbit_cameras(
-        simulation.mesh.surface, size=recipe.view_size, azimuths=recipe.views // _CIRCLES, up=AXES[recipe.up]
-    )
-    views = render_views(simulation.mesh, cameras, progress=progress)
-    write_views(views, folder / "views")
-    for each in sorted((folder / "views").iterdir()):
-        os.rename(each, folder / each.name)
-    (folder / "views").rmdir()
 
 
 def simulate_set(

@@ -20,9 +20,9 @@ from avmsf.simulate.recipe import Imperfections
 
 MIN_NORMAL_HEIGHT = -0.35
 """Least height of a unit normal where a hammer gets beneath: 20 degrees of overhang above a table."""
-_LEAD = 1e-4
+_RAY_LEAD = 1e-4
 """How far off the surface rays start, in object diagonals."""
-_CANDIDATES = 4
+_CANDIDATE_RATIO = 4
 """Places drawn evenly from what can be reached, for each contact: more would push the contacts to the rims."""
 
 
@@ -85,20 +85,20 @@ def nearest_on(surface: Surface, places: Float64[Tensor, "contacts 3"]) -> Float
 def _reached(
     surface: Surface, count: int, *, up: Float64[Tensor, " 3"], seed: int
 ) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places 3"]]:
-    """Return `_CANDIDATES` times `count` places that a hammer reaches, drawn evenly by area, and their normals."""
+    """Return `_CANDIDATE_RATIO` times `count` places that a hammer reaches, drawn evenly by area, and their normals."""
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     if not (len(mesh.faces) and math.isfinite(mesh.area) and mesh.area > 0.0):
         count, advice = len(mesh.faces), "give a mesh with faces"
         got = f"{count} without"
         raise SimulationError.expected("triangles with an area", count, got=got, name="surface", advice=advice)
     generator, cast = stream(seed, "contacts"), RayCaster(mesh.triangles)
-    wanted = _CANDIDATES * count
+    wanted = _CANDIDATE_RATIO * count
     places, normals, drawn = np.zeros((0, 3)), np.zeros((0, 3)), 0
     while len(places) < wanted and drawn < 200 * wanted:
         points, rows = trimesh.sample.sample_surface(mesh, 8 * wanted, seed=int(generator.integers(2**31)))
         outward = np.asarray(mesh.face_normals[rows])
         # A ray along the normal leaves the object without meeting it again.
-        free = cast(np.asarray(points), outward, lead=_LEAD)[0] < 0
+        free = cast(np.asarray(points), outward, lead=_RAY_LEAD)[0] < 0
         reached = free & (outward @ up.numpy() >= MIN_NORMAL_HEIGHT)
         places, normals = np.concatenate([places, points[reached]]), np.concatenate([normals, outward[reached]])
         drawn += 8 * wanted

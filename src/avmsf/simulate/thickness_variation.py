@@ -14,10 +14,10 @@ from avmsf.simulate.shapes.body import mitred_normals
 
 MAX_VARIATION = 0.5
 """Largest variation."""
-_SQUEEZED = 0.02
+_MIN_VOLUME_RATIO = 0.02
 """Part of its volume below which a tetrahedron is moved as a whole instead."""
 _MAX_REPAIRS = 30
-_LEAD = 1e-4
+_RAY_LEAD = 1e-4
 """How far inside of the surface rays start, in object diagonals."""
 
 
@@ -41,7 +41,7 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     share = np.bincount(triangles.ravel(), weights=np.repeat(areas, 3))
     field = torch.log(smooth_field(torch.from_numpy(places), 1.0, diagonal=solid.size, generator=generator)).numpy()
     factor = _factors(field, share, part)
-    _, reach = RayCaster(corners)(corners.mean(axis=1), -doubled / areas[:, None], lead=_LEAD)
+    _, reach = RayCaster(corners)(corners.mean(axis=1), -doubled / areas[:, None], lead=_RAY_LEAD)
     hit = np.isfinite(reach)
     if not hit.any():
         raise SimulationError("expected a closed surface, got an open one; make the tetrahedra again", name="solid")
@@ -89,7 +89,7 @@ def _repaired(solid: Solid, motion: Float64[np.ndarray, "points 3"]) -> Float64[
     before, cells = solid.volumes.numpy(), solid.cells.numpy()
     for _ in range(_MAX_REPAIRS):
         corners = (solid.points.numpy() + motion)[cells]
-        crushed = cells[np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0 < _SQUEEZED * before]
+        crushed = cells[np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0 < _MIN_VOLUME_RATIO * before]
         if not len(crushed):
             return motion
         means = np.repeat(motion[crushed].mean(axis=1), 4, axis=0)

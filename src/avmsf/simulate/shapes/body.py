@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
-from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import unit
-from avmsf.fem.solid import MIN_VOLUME_RATIO, Solid, prism_cells
+from avmsf.fem.solid import Solid, prism_cells
 
-_SHARPEST = 0.4
+_MIN_MITRE_COSINE = 0.4
 """Least mean of the cosines between the normal at a corner and the faces around it that a mitre is made for."""
 
 
@@ -63,7 +62,7 @@ def mitred_normals(
     total = np.stack([gather(angles * flat[:, axis, None]) for axis in range(3)], axis=1)
     normals = unit(total)
     cosines = gather(angles * (normals[triangles] * flat[:, None]).sum(axis=-1)) / np.maximum(gather(angles), 1e-300)
-    return normals / np.maximum(cosines, _SHARPEST)[:, None]
+    return normals / np.maximum(cosines, _MIN_MITRE_COSINE)[:, None]
 
 
 class SolidBuilder:
@@ -102,15 +101,10 @@ class SolidBuilder:
         Raises SimulationError where a wall is too thick for its bends, so that tetrahedra are turned inside out.
         """
         points, cells = np.concatenate(self._points) * scale, np.concatenate(self._cells)
-        edges = points[cells[:, 1:]] - points[cells[:, :1]]
-        longest = np.linalg.norm(edges, axis=-1).max(axis=1)
-        unfit = np.flatnonzero(~(np.linalg.det(edges) / 6.0 > MIN_VOLUME_RATIO * longest**3))
-        if len(unfit):
-            where = ", ".join(f"{value:.3f}" for value in points[cells[unfit[0]]].mean(axis=0))
-            got = f"{len(unfit)} of {len(cells)} inverted, first at ({where}) m"
-            message = f"expected tetrahedra of positive volume, got {got}; use thinner walls or a larger shape"
-            raise SimulationError(message, row=int(unfit[0]), name="cells", value=len(unfit))
-        return Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
+        made = Solid(torch.from_numpy(points), torch.from_numpy(cells))
+        # Before cells are turned to positive volume.
+        made.expect_volume(advice="use thinner walls or a larger shape")
+        return Solid.build(made.points, made.cells)
 
     def stack(
         self,

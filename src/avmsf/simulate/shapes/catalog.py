@@ -30,7 +30,7 @@ KINDS: Mapping[str, Maker] = MappingProxyType({maker.__name__: maker for maker i
 _MAX_EXTENT_M = 100.0
 """Meters."""
 _MIN_FACES = 6000
-_ROUNDS = 4
+_MAX_DRAFTS = 4
 """Drafts until walls and size are both as asked for."""
 
 
@@ -101,7 +101,7 @@ def _sized(kind: str, seed: int, size: float | None, wall: float | None) -> tupl
     draft = KINDS[kind](_chance(kind, seed, "form"), wall if size is None else None)
     if size is None:
         return draft, scale
-    for _ in range(1 if wall is None else _ROUNDS):
+    for _ in range(1 if wall is None else _MAX_DRAFTS):
         scale = size / draft.body.extent
         if wall is not None:
             # Walls are drawn to the scale of the draft, whose size they change a little.
@@ -137,9 +137,9 @@ _PAINTS = np.array([
     (0.13, 0.22, 0.48), (0.55, 0.13, 0.12), (0.10, 0.33, 0.28), (0.20, 0.14, 0.12),
     (0.86, 0.52, 0.10), (0.97, 0.95, 0.90), (0.38, 0.20, 0.45),
 ])  # fmt: skip
-_EDGE = 0.006
+_EDGE_WIDTH = 0.006
 """Width of the edge of what is painted, in object diagonals."""
-_LEAST_CONTRAST = 0.45
+_MIN_CONTRAST = 0.45
 
 Decor = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 """From places in object diagonals, about the middle, to how far inside of the paint each lies, in diagonals."""
@@ -151,10 +151,10 @@ def glaze(points: Float64[np.ndarray, "points 3"], random: np.random.Generator) 
     places = (points - 0.5 * (low + high)) / np.linalg.norm(high - low)
     ground = _GLAZES[random.integers(len(_GLAZES))]
     contrast = np.linalg.norm(_PAINTS - ground, axis=1)
-    fitting = _PAINTS[contrast > _LEAST_CONTRAST]
+    fitting = _PAINTS[contrast > _MIN_CONTRAST]
     paint = fitting[random.integers(len(fitting))]
     decor = DECORS[int(random.integers(len(DECORS)))]
-    inside = np.clip(0.5 + decor(places, random) / _EDGE, 0.0, 1.0)[:, None]
+    inside = np.clip(0.5 + decor(places, random) / _EDGE_WIDTH, 0.0, 1.0)[:, None]
     colors = ground + inside * (paint - ground)
     cloudy = 0.03 + 0.07 * random.random()
     light = 1.0 + cloudy * _waves(places, random, 0.35, 12) + 0.02 * random.standard_normal(len(points))

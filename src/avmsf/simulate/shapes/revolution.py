@@ -13,9 +13,9 @@ from scipy.interpolate import BSpline
 
 from avmsf.simulate.shapes.body import ROUND, UP, Draft, Patch, Rings, Sheet, SolidBuilder, Symmetry, drawn_wall
 
-POINTS = 900
+DEFAULT_POINTS = 900
 """Points in the middle of a wall: about 12 nodes of second order each, so some 32,000 degrees of freedom."""
-_FINE = 2000
+_CURVE_POINTS = 2000
 _MIN_INNER, _MAX_INNER = 8, 34
 """Points of the innermost ring."""
 
@@ -41,7 +41,7 @@ class Profile:
         controls = np.array(self.controls, dtype=np.float64)
         inner = np.linspace(0.0, 1.0, len(controls) - 1)[1:-1]
         knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
-        values = BSpline(knots, controls, 2)(np.linspace(0.0, 1.0, _FINE))
+        values = BSpline(knots, controls, 2)(np.linspace(0.0, 1.0, _CURVE_POINTS))
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(values[:, :2], axis=0), axis=1))])
         return length / length[-1], values
 
@@ -55,7 +55,7 @@ class Profile:
         places, values = self._curve
         return np.stack([np.interp(along, places, values[:, axis]) for axis in range(3)], axis=1)
 
-    def rings(self, *, fold: int = 1, points: int = POINTS) -> Rings:
+    def rings(self, *, fold: int = 1, points: int = DEFAULT_POINTS) -> Rings:
         """Return about `points` points on rings evenly along the curve, with triangles as equilateral as they may be.
 
         Rings of less than half and a quarter of the largest radius have as many times fewer points. The innermost
@@ -111,7 +111,7 @@ class Turned:
         profile: Profile,
         *,
         fold: int = 1,
-        points: int = POINTS,
+        points: int = DEFAULT_POINTS,
         crowd: float = 0.0,
         warp: Warp | None = None,
         rings: Rings | None = None,

@@ -50,7 +50,7 @@ class Grid:
 _POINTS = 900
 _HALF_TURN = Symmetry(UP, 2, torch.eye(3).double()[:2])
 """Of what is as long to both sides, and as wide, but not as high."""
-_HOLE = 2
+_HOLE_HALF_SIDE = 2
 """Half the side of the block of squares that a hole takes the place of."""
 
 
@@ -208,12 +208,12 @@ def _body(middle: np.ndarray, walls: np.ndarray | float, triangles: np.ndarray, 
 def _punch(grid: Grid, flat: np.ndarray, row: int, column: int) -> np.ndarray:
     """Round the points around a block of squares to a circle, in place; return which triangles stay."""
     apart = grid.places - (row, column)
-    ring = np.abs(apart).max(axis=1) == _HOLE
+    ring = np.abs(apart).max(axis=1) == _HOLE_HALF_SIDE
     center = flat[row * grid.columns + column].copy()
     radius = 0.9 * np.abs(flat[ring] - center).max(axis=0).min()
     ways = apart[ring] / np.linalg.norm(apart[ring], axis=1, keepdims=True)
     flat[ring] = center + radius * ways
-    return ~(np.abs(apart[grid.triangles]).max(axis=(1, 2)) <= _HOLE)
+    return ~(np.abs(apart[grid.triangles]).max(axis=(1, 2)) <= _HOLE_HALF_SIDE)
 
 
 def _bent(along: np.ndarray, first: float, angle: float, bend: float) -> tuple[np.ndarray, np.ndarray]:

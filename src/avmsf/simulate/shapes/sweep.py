@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 from avmsf.simulate.shapes.body import MIRRORED, Draft, Symmetry, drawn_wall
 from avmsf.simulate.shapes.revolution import Profile, Turned
 
-_MELT = 0.16
+_MELT_RATIO = 0.16
 """Part of a rod's length over which the patch's outline melts into the rod's own."""
 
 
@@ -85,13 +85,13 @@ def smooth_curve(controls: list[tuple[float, float]], layers: int) -> Float64[np
 
 
 def _fade(part: np.ndarray) -> np.ndarray:
-    """Return 1 at 0, falling smoothly to 0 at `_MELT`."""
-    rest = np.clip(1.0 - part / _MELT, 0.0, 1.0)
+    """Return 1 at 0, falling smoothly to 0 at `_MELT_RATIO`."""
+    rest = np.clip(1.0 - part / _MELT_RATIO, 0.0, 1.0)
     return rest**2 * (3.0 - 2.0 * rest)
 
 
-_CROWD = 0.35
-_HALF = 2
+_CROWDING = 0.35
+_HALF_WIDTH = 2
 """Points on each side of the middle of a handle's patch."""
 _BANDS = 2
 """Bands of triangles that a handle's patch is high."""
@@ -105,7 +105,7 @@ def mug(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.0035, 0.005, wall)
     height = tall * radius
     corners = [(0.0, 0.0, 1.2), (0.9 * narrow, 0.0, 1.2), (narrow, 0.03, 1.0), (1.0, 0.45, 1.0), (1.0, 1.0, 0.9)]
-    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWD)
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWDING)
     reach, low = random.uniform(0.75, 0.95) * radius, random.uniform(0.2, 0.3)
     _add_handle(turned, low * height, random.uniform(0.74, 0.82) * height, reach, random)
     return Draft(turned.body, wall, MIRRORED)
@@ -127,7 +127,7 @@ def jug(random: np.random.Generator, wall: float | None) -> Draft:
         return values[:, 0] * (1.0 + lip * part * near) + tilted, values[:, 1] + 0.12 * radius * part * near
 
     corners = [(0.0, 0.0, 1.2), (0.75, 0.0, 1.2), (1.2, 0.3, 1.0), (neck, 0.75, 1.0), (1.1 * neck, 1.0, 1.0)]
-    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWD, warp=warp)
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWDING, warp=warp)
     reach = random.uniform(0.9, 1.1) * radius
     _add_handle(turned, random.uniform(0.38, 0.45) * height, 0.82 * height, reach, random)
     return Draft(turned.body, wall, Symmetry())
@@ -140,9 +140,9 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.003, 0.0045, wall)
     height = depth * radius
     corners = [(0.0, 0.0, 1.2), (0.8, 0.0, 1.2), (0.9, 0.15, 1.0), (1.0, 1.0, 1.0)]
-    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=760, crowd=_CROWD)
+    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=760, crowd=_CROWDING)
     ring = _ring_at(turned, 0.6 * height, _BANDS)
-    patch = turned.side_patch(range(ring, ring + _BANDS + 1), _HALF)
+    patch = turned.side_patch(range(ring, ring + _BANDS + 1), _HALF_WIDTH)
     middle = patch.places.mean(axis=0)
     far = length * radius
     curve = smooth_curve(
@@ -158,7 +158,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     rounding = np.sqrt(1.0 - 0.85 * np.clip((part - 0.88) / 0.12, 0.0, 1.0) ** 2)
     widths = random.uniform(0.018, 0.023) * (0.75 + 0.25 * part) * rounding
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.009, 0.012)) * (0.4 + 0.6 * rounding)
-    layers = Rod(curve, widths, heights).layers(patch.places, square_columns(_BANDS + 1, _HALF))
+    layers = Rod(curve, widths, heights).layers(patch.places, square_columns(_BANDS + 1, _HALF_WIDTH))
     patch.grow(layers)
     return Draft(turned.body, wall, MIRRORED)
 
@@ -169,8 +169,8 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
     if (above + below + _BANDS) % 2:
         # The diagonals of the upper patch, upside down, are the lower one's only every second band.
         below += 1
-    leaving = turned.side_patch(range(above, above + _BANDS + 1), _HALF)
-    arriving = turned.side_patch(range(below, below + _BANDS + 1), _HALF, falling=True)
+    leaving = turned.side_patch(range(above, above + _BANDS + 1), _HALF_WIDTH)
+    arriving = turned.side_patch(range(below, below + _BANDS + 1), _HALF_WIDTH, falling=True)
     (x, _, z), (x_end, _, z_end) = leaving.places.mean(axis=0), arriving.places.mean(axis=0)
     far = max(x, x_end) + reach
     curve = smooth_curve(
@@ -188,7 +188,7 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
     part = np.linspace(0.0, 1.0, _HANDLE_LAYERS)
     widths = random.uniform(0.012, 0.015) * (1.0 - 0.15 * np.sin(math.pi * part))
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.0075, 0.0095))
-    columns = square_columns(_BANDS + 1, _HALF)
+    columns = square_columns(_BANDS + 1, _HALF_WIDTH)
     leaving.grow(Rod(curve, widths, heights).layers(leaving.places, columns, arriving.places), end=arriving)
 
 
