@@ -130,14 +130,6 @@ def test_flat_tip_is_a_mass_on_a_spring():
     assert forces.tolist() == pytest.approx([0.1 * speed * 2 * math.pi / period for speed in (0.2, 2.0)])
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("mass", 0.0), ("poisson", 0.5), ("contact_time", 1.0), ("speed", math.nan)]
-)
-def test_impossible_hammers_are_refused(name, value):
-    with raises(SimulationError, name=f"hammer.{name}", value=pytest.approx(value, nan_ok=True)):
-        replace(Hammer(), **{name: value})
-
-
 def test_a_cushion_is_no_hammer():
     speeds = torch.ones(1, dtype=torch.float64)
     with raises(SimulationError, name="hammer") as caught:
@@ -288,18 +280,14 @@ def test_an_object_stands_on_three_low_places_around_its_middle():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("kind", "name", "value"),
     [
-        ("coupling", 1.5),
-        ("stiffness", -0.1),
-        ("support", math.inf),
-        ("thickness", math.nan),
-        ("pretrigger", 11.0),
-        ("jitter", -0.001),
-        ("propagation", 1.5),
-        ("contact_time", math.nan),
+        (Hammer, "mass", 0.0), (Hammer, "poisson", 0.5), (Hammer, "contact_time", 1.0), (Hammer, "speed", math.nan),
+        (Imperfections, "coupling", 1.5), (Imperfections, "stiffness", -0.1), (Imperfections, "support", math.inf),
+        (Imperfections, "thickness", math.nan), (Imperfections, "pretrigger", 11.0), (Imperfections, "jitter", -0.001),
+        (Imperfections, "propagation", 1.5), (Imperfections, "contact_time", math.nan),
     ],
-)
-def test_impossible_imperfections_are_refused(name, value):
-    with raises(SimulationError, name=f"imperfections.{name}", value=pytest.approx(value, nan_ok=True)):
-        Imperfections(**{name: value})
+)  # fmt: skip
+def test_impossible_hammers_and_imperfections_are_refused(kind, name, value):
+    with raises(SimulationError, name=f"{kind.__name__.lower()}.{name}", value=pytest.approx(value, nan_ok=True)):
+        kind(**{name: value})

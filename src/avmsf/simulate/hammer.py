@@ -52,13 +52,11 @@ def contact_times(
         times = torch.full_like(speeds, math.pi * math.sqrt(moving / (2.0 * hammer.radius * joint)))
     else:
         times = _HERTZ_SCALE * (moving**2 / (hammer.radius * joint**2 * speeds)) ** 0.2
-    if float(times.max()) > MAX_CONTACT_SECONDS:
-        longest = float(times.max())
-        wanted, advice = (
-            f"a contact time up to {MAX_CONTACT_SECONDS:g} s",
-            "use a lighter hammer, a stiffer tip, or a higher speed",
-        )
-        raise SimulationError.expected(wanted, longest, got=f"{longest:.2g} s", name="hammer", advice=advice)
+    longest = float(times.max())
+    if longest > MAX_CONTACT_SECONDS:
+        wanted, got = f"a contact time up to {MAX_CONTACT_SECONDS:g} s", f"{longest:.2g} s"
+        advice = "use a lighter hammer, a stiffer tip, or a higher speed"
+        raise SimulationError.expected(wanted, longest, got=got, name="hammer", advice=advice)
     return times
 
 

@@ -18,6 +18,11 @@ MAX_CONTACT_SECONDS = 0.02
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
+def _expect(fits: bool, wanted: str, value: object, name: str) -> None:
+    if not fits:
+        raise SimulationError.expected(wanted, value, name=name)
+
+
 @dataclass(frozen=True)
 class Hammer:
     """The hammer; by default a small steel one with a round tip."""
@@ -40,14 +45,10 @@ class Hammer:
     def __post_init__(self) -> None:
         for name, unit in (("mass", "kg"), ("radius", "m"), ("young", "Pa"), ("speed", "m/s")):
             value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise SimulationError.expected(f"more than 0 {unit}", value, name=f"hammer.{name}")
-        if not -1 < self.poisson < 0.5:
-            raise SimulationError.expected("more than -1 and less than .5", self.poisson, name="hammer.poisson")
-        if not 0 <= self.contact_time <= MAX_CONTACT_SECONDS:
-            raise SimulationError.expected(
-                f"0 to compute it, or up to {MAX_CONTACT_SECONDS:g} s", self.contact_time, name="hammer.contact_time"
-            )
+            _expect(0 < value < math.inf, f"more than 0 {unit}", value, f"hammer.{name}")
+        _expect(-1 < self.poisson < 0.5, "more than -1 and less than .5", self.poisson, "hammer.poisson")
+        wanted = f"0 to compute it, or up to {MAX_CONTACT_SECONDS:g} s"
+        _expect(0 <= self.contact_time <= MAX_CONTACT_SECONDS, wanted, self.contact_time, "hammer.contact_time")
 
 
 @dataclass(frozen=True)
@@ -106,11 +107,9 @@ class Imperfections:
         }  # fmt: skip
         for each in fields(self):
             value, most = getattr(self, each.name), highest.get(each.name, 0.5)
-            if not (0 <= value <= most and math.isfinite(value)):
-                limit = f"up to {most:g}" if math.isfinite(most) else "a finite number above 0"
-                raise SimulationError.expected(
-                    f"0 to switch it off, or {limit}", value, name=f"imperfections.{each.name}"
-                )
+            limit = f"up to {most:g}" if math.isfinite(most) else "a finite number above 0"
+            fits = 0 <= value <= most and math.isfinite(value)
+            _expect(fits, f"0 to switch it off, or {limit}", value, f"imperfections.{each.name}")
 
     @classmethod
     def none(cls) -> "Imperfections":
@@ -174,20 +173,15 @@ class ObjectRecipe:
             ("detail", 0.005, 0.5),
         ):
             value = getattr(self, name)
-            if not least <= value <= most:
-                raise SimulationError.expected(f"{least:g} to {most:g}", value, name=name)
+            _expect(least <= value <= most, f"{least:g} to {most:g}", value, name)
         for name in ("thickness", "size"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise SimulationError.expected("more than 0 m", value, name=name)
-        if self.noise_db is not None and not -math.inf < self.noise_db < 100.0:
-            raise SimulationError.expected(
-                "a level in dB, such as -30, or None for none", self.noise_db, name="noise_db"
-            )
-        if self.views < 0 or self.views % 3:
-            raise SimulationError.expected("a multiple of 3, for three circles, or 0", self.views, name="views")
-        if self.seed < 0:
-            raise SimulationError.expected("0 or more", self.seed, name="seed")
+            _expect(value is None or 0 < value < math.inf, "more than 0 m", value, name)
+        fits = self.noise_db is None or -math.inf < self.noise_db < 100.0
+        _expect(fits, "a level in dB, such as -30, or None for none", self.noise_db, "noise_db")
+        circled = self.views >= 0 and not self.views % 3
+        _expect(circled, "a multiple of 3, for three circles, or 0", self.views, "views")
+        _expect(self.seed >= 0, "0 or more", self.seed, "seed")
 
     def values(self) -> dict[str, Any]:
         """Return all settings as JSON holds them, with the package's version and the digest of the mesh's file."""

@@ -20,6 +20,20 @@ _MIN_INNER, _MAX_INNER = 8, 34
 """Points of the innermost ring."""
 
 
+def spline(
+    controls: Sequence[tuple[float, ...]], *, degree: int, count: int
+) -> tuple[Float64[np.ndarray, " count"], Float64[np.ndarray, "count axes"]]:
+    """Return points on the curve that starts and ends as a polygon does and rounds it between, and the length there.
+
+    Lengths are those along the first two coordinates.
+    """
+    polygon = np.array(controls, dtype=np.float64)
+    inner = np.linspace(0.0, 1.0, len(polygon) - degree + 1)[1:-1]
+    knots = np.concatenate([np.zeros(degree + 1), inner, np.ones(degree + 1)])
+    points = BSpline(knots, polygon, degree)(np.linspace(0.0, 1.0, count))
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))]), points
+
+
 @dataclass(frozen=True, eq=False)
 class Profile:
     """The middle of a wall as a smooth curve from the axis, or the lower end of a tube, outwards to the rim."""
@@ -37,23 +51,18 @@ class Profile:
 
     @cached_property
     def _curve(self) -> tuple[Float64[np.ndarray, " fine"], Float64[np.ndarray, "fine 3"]]:
-        """Places along the curve, 0 to 1 of its length, and radius, height and thickness there."""
-        controls = np.array(self.controls, dtype=np.float64)
-        inner = np.linspace(0.0, 1.0, len(controls) - 1)[1:-1]
-        knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
-        values = BSpline(knots, controls, 2)(np.linspace(0.0, 1.0, _CURVE_POINTS))
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(values[:, :2], axis=0), axis=1))])
-        return length / length[-1], values
+        """Lengths along the curve, meters, and radius, height and thickness there."""
+        return spline(self.controls, degree=2, count=_CURVE_POINTS)
 
-    @cached_property
+    @property
     def length(self) -> float:
         """Meters along the curve."""
-        return float(np.linalg.norm(np.diff(self._curve[1][:, :2], axis=0), axis=1).sum())
+        return float(self._curve[0][-1])
 
     def at(self, along: Float64[np.ndarray, " places"]) -> Float64[np.ndarray, "places 3"]:
         """Return radius, height and thickness at parts of the curve's length, 0 to 1."""
-        places, values = self._curve
-        return np.stack([np.interp(along, places, values[:, axis]) for axis in range(3)], axis=1)
+        lengths, values = self._curve
+        return np.stack([np.interp(along, lengths / self.length, each) for each in values.T], axis=1)
 
     def rings(self, *, fold: int = 1, points: int = DEFAULT_POINTS) -> Rings:
         """Return about `points` points on rings evenly along the curve, with triangles as equilateral as they may be.
@@ -150,11 +159,14 @@ class Turned:
         """Return the rings about the pole up to one, on the lower or on the upper side."""
         return self._patch(np.arange(self.rings.starts[last + 1]), lower=lower)
 
-    def add_foot(self, ring: int, bottom: float) -> None:
-        """Add a foot under the band between a ring and the next one, down to a height."""
+    def add_foot(self, radius: float, height: float) -> None:
+        """Add a foot of about this radius and this height below the lowest point, under a band of two equal rings."""
+        counts = np.diff(self.rings.starts)
+        equal = np.flatnonzero(counts[1:-1] == counts[2:]) + 1
+        ring = int(equal[np.argmin(np.abs(self.radii[equal] - radius))])
         patch = self._patch(np.arange(self.rings.starts[ring], self.rings.starts[ring + 2]), lower=True)
         places = patch.places.copy()
-        places[:, 2] = bottom
+        places[:, 2] = float((self.sheet.middle - self.sheet.offsets)[:, 2].min()) - height
         patch.grow(places[None])
 
     def _patch(self, rows: Int[np.ndarray, " columns"], *, lower: bool) -> Patch:
@@ -180,7 +192,7 @@ def bowl(random: np.random.Generator, wall: float | None) -> Draft:
     height = depth * radius
     corners = [(0.0, 0.0, 1.25), (bottom, 0.0, 1.25), (belly, 0.15, 1.0), (0.97, 0.7, 1.0), (1.0, 1.0, 0.9)]
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners))
-    _stand(turned, 0.42 * radius, random.uniform(0.004, 0.008))
+    turned.add_foot(0.42 * radius, random.uniform(0.004, 0.008))
     return Draft(turned.body, wall, ROUND)
 
 
@@ -191,7 +203,7 @@ def plate(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.0035, 0.0055, wall)
     corners = [(0.0, 0.0, 1.0), (flat, 0.0, 1.0), (flat + 0.12, 0.65, 1.0), (flat + 0.2, 0.85, 1.0), (1.0, 1.0, 0.9)]
     turned = Turned.lay(Profile.scaled(radius, rise, wall, corners))
-    _stand(turned, 0.8 * flat * radius, random.uniform(0.003, 0.005))
+    turned.add_foot(0.8 * flat * radius, random.uniform(0.003, 0.005))
     return Draft(turned.body, wall, ROUND)
 
 
@@ -324,15 +336,6 @@ def dish(random: np.random.Generator, wall: float | None) -> Draft:
     corners = [(0.0, 0.0, 1.2), (0.55, 0.0, 1.2), (0.8, 0.25, 1.0), (1.0, 1.0, 0.9)]
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), warp=warp)
     return Draft(turned.body, wall, Symmetry())
-
-
-def _stand(turned: Turned, radius: float, height: float) -> None:
-    """Put a wall that turns on a foot of about this radius."""
-    counts = np.diff(turned.rings.starts)
-    equal = np.flatnonzero(counts[1:-1] == counts[2:]) + 1
-    ring = int(equal[np.argmin(np.abs(turned.radii[equal] - radius))])
-    below = turned.sheet.middle[:, 2] - turned.sheet.offsets[:, 2]
-    turned.add_foot(ring, float(below.min()) - height)
 
 
 def _crown(turned: Turned, radius: float, top: float, *, swell: float, taper: float) -> None:

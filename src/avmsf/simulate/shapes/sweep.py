@@ -1,101 +1,72 @@
 """Rods swept along a curve, and vessels with such a handle, which tells one side from the others."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.interpolate import BSpline
 
 from avmsf.simulate.shapes.body import MIRRORED, Draft, Symmetry, drawn_wall
-from avmsf.simulate.shapes.revolution import Profile, Turned
+from avmsf.simulate.shapes.revolution import Profile, Turned, spline
 
 _MELT_RATIO = 0.16
 """Part of a rod's length over which the patch's outline melts into the rod's own."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rod:
-    """A rod in the plane y = 0, of oval cross-section."""
-
-    curve: Float64[np.ndarray, "layers 2"]
-    """Its middle, x and z, from the patch it leaves, meters."""
-    widths: Float64[np.ndarray, " layers"]
-    """Along y, meters."""
-    heights: Float64[np.ndarray, " layers"]
-    """Across y, meters."""
-
-    def layers(
-        self,
-        start: Float64[np.ndarray, "columns 3"],
-        across: Float64[np.ndarray, "columns 2"],
-        end: Float64[np.ndarray, "columns 3"] | None = None,
-    ) -> Float64[np.ndarray, "layers columns 3"]:
-        """Return where columns of points pass, without the patches at the start and at the end.
-
-        `across` says where each column lies in the cross-section, -1 to 1 along y and across it, in the square that the
-        oval is made of.
-        """
-        tangents = np.gradient(self.curve, axis=0)
-        tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-        normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
-        one, other = across.T
-        disc = np.stack([one * np.sqrt(1 - 0.5 * other**2), other * np.sqrt(1 - 0.5 * one**2)], axis=1)
-        # Along the tangent, along y, and across both.
-        oval = np.stack(
-            [
-                np.zeros((len(self.curve), len(across))),
-                0.5 * self.widths[:, None] * disc[:, 0],
-                0.5 * self.heights[:, None] * disc[:, 1],
-            ],
-            axis=-1,
-        )
-        part = np.linspace(0.0, 1.0, len(self.curve))
-        leaving = _fade(part)[:, None, None]
-        local = leaving * self._local(start, 0, tangents, normals)
-        rest = 1.0 - leaving
-        if end is not None:
-            arriving = _fade(1.0 - part)[:, None, None]
-            local = local + arriving * self._local(end, -1, tangents, normals)
-            rest = rest - arriving
-        local = local + rest * oval
-        flat = local[..., :1] * tangents[:, None] + local[..., 2:] * normals[:, None] + self.curve[:, None]
-        places = np.stack([flat[..., 0], local[..., 1], flat[..., 1]], axis=-1)
-        return places[1:] if end is None else places[1:-1]
-
-    def _local(self, places: np.ndarray, layer: int, tangents: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        flat = places[:, [0, 2]] - self.curve[layer]
-        return np.stack([flat @ tangents[layer], places[:, 1], flat @ normals[layer]], axis=1)
-
-
-def square_columns(rows: int, half: int) -> Float64[np.ndarray, "columns 2"]:
-    """Return the places in a rod's cross-section of a patch of `rows` rings and 2 half + 1 points on each."""
-    one, other = np.meshgrid(np.linspace(-1, 1, 2 * half + 1), np.linspace(-1, 1, rows))
-    return np.stack([one.ravel(), other.ravel()], axis=1)
-
-
-def smooth_curve(controls: list[tuple[float, float]], layers: int) -> Float64[np.ndarray, "layers 2"]:
-    """Return points evenly along the curve that starts and ends as a polygon does and rounds it between."""
-    polygon = np.array(controls, dtype=np.float64)
-    knots = np.concatenate([np.zeros(4), np.linspace(0, 1, len(polygon) - 2)[1:-1], np.ones(4)])
-    fine = BSpline(knots, polygon, 3)(np.linspace(0, 1, 1000))
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
-    even = np.linspace(0, length[-1], layers)
-    return np.stack([np.interp(even, length, fine[:, axis]) for axis in range(2)], axis=1)
-
-
-def _fade(part: np.ndarray) -> np.ndarray:
-    """Return 1 at 0, falling smoothly to 0 at `_MELT_RATIO`."""
-    rest = np.clip(1.0 - part / _MELT_RATIO, 0.0, 1.0)
-    return rest**2 * (3.0 - 2.0 * rest)
-
-
 _CROWDING = 0.35
 _HALF_WIDTH = 2
 """Points on each side of the middle of a handle's patch."""
 _BANDS = 2
 """Bands of triangles that a handle's patch is high."""
 _HANDLE_LAYERS = 26
+
+
+def swept(
+    curve: Float64[np.ndarray, "layers 2"],
+    widths: Float64[np.ndarray, " layers"],
+    heights: Float64[np.ndarray, " layers"],
+    start: Float64[np.ndarray, "columns 3"],
+    end: Float64[np.ndarray, "columns 3"] | None = None,
+) -> Float64[np.ndarray, "layers columns 3"]:
+    """Return where the columns of a patch of `_BANDS` pass that grows to a rod, without the patches at both ends.
+
+    The rod lies in the plane y = 0: `curve` is its middle, x and z, from the patch it leaves; its cross-section is an
+    oval, `widths` along y and `heights` across it, meters.
+    """
+    tangents = np.gradient(curve, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+    # In the square that the oval is made of, -1 to 1 along y and across it.
+    one, other = map(np.ravel, np.meshgrid(np.linspace(-1, 1, 2 * _HALF_WIDTH + 1), np.linspace(-1, 1, _BANDS + 1)))
+    disc = np.stack([one * np.sqrt(1 - 0.5 * other**2), other * np.sqrt(1 - 0.5 * one**2)], axis=1)
+    # Along the tangent, along y, and across both.
+    sizes = np.stack([np.zeros(len(curve)), 0.5 * widths, 0.5 * heights], axis=1)
+    oval = sizes[:, None] * np.stack([np.zeros(len(disc)), *disc.T], axis=1)
+
+    def local(places: np.ndarray, layer: int) -> np.ndarray:
+        flat = places[:, [0, 2]] - curve[layer]
+        return np.stack([flat @ tangents[layer], places[:, 1], flat @ normals[layer]], axis=1)
+
+    part = np.linspace(0.0, 1.0, len(curve))[:, None, None]
+    leaving = _fade(part)
+    moved, rest = leaving * local(start, 0), 1.0 - leaving
+    if end is not None:
+        arriving = _fade(1.0 - part)
+        moved, rest = moved + arriving * local(end, -1), rest - arriving
+    moved = moved + rest * oval
+    flat = moved[..., :1] * tangents[:, None] + moved[..., 2:] * normals[:, None] + curve[:, None]
+    places = np.stack([flat[..., 0], moved[..., 1], flat[..., 1]], axis=-1)
+    return places[1:] if end is None else places[1:-1]
+
+
+def smooth_curve(controls: list[tuple[float, float]], layers: int) -> Float64[np.ndarray, "layers 2"]:
+    """Return points evenly along the curve that starts and ends as a polygon does and rounds it between."""
+    lengths, points = spline(controls, degree=3, count=1000)
+    even = np.linspace(0, lengths[-1], layers)
+    return np.stack([np.interp(even, lengths, axis) for axis in points.T], axis=1)
+
+
+def _fade(part: np.ndarray) -> np.ndarray:
+    """Return 1 at 0, falling smoothly to 0 at `_MELT_RATIO`."""
+    rest = np.clip(1.0 - part / _MELT_RATIO, 0.0, 1.0)
+    return rest**2 * (3.0 - 2.0 * rest)
 
 
 def mug(random: np.random.Generator, wall: float | None) -> Draft:
@@ -158,8 +129,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     rounding = np.sqrt(1.0 - 0.85 * np.clip((part - 0.88) / 0.12, 0.0, 1.0) ** 2)
     widths = random.uniform(0.018, 0.023) * (0.75 + 0.25 * part) * rounding
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.009, 0.012)) * (0.4 + 0.6 * rounding)
-    layers = Rod(curve, widths, heights).layers(patch.places, square_columns(_BANDS + 1, _HALF_WIDTH))
-    patch.grow(layers)
+    patch.grow(swept(curve, widths, heights, patch.places))
     return Draft(turned.body, wall, MIRRORED)
 
 
@@ -188,8 +158,7 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
     part = np.linspace(0.0, 1.0, _HANDLE_LAYERS)
     widths = random.uniform(0.012, 0.015) * (1.0 - 0.15 * np.sin(math.pi * part))
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.0075, 0.0095))
-    columns = square_columns(_BANDS + 1, _HALF_WIDTH)
-    leaving.grow(Rod(curve, widths, heights).layers(leaving.places, columns, arriving.places), end=arriving)
+    leaving.grow(swept(curve, widths, heights, leaving.places, arriving.places), end=arriving)
 
 
 def _ring_at(turned: Turned, height: float, bands: int) -> int:
