@@ -87,8 +87,9 @@ def test_the_notebook_is_stored_without_outputs() -> None:
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells)
 
 
-def test_every_function_and_test_in_the_table_of_equations_exists() -> None:
-    text = (REPOSITORY / "docs/paper-map.md").read_text()
+@pytest.mark.parametrize("page", ["paper-map", "gain-models"])
+def test_every_function_and_test_in_the_table_of_equations_exists(page: str) -> None:
+    text = (REPOSITORY / f"docs/{page}.md").read_text()
     functions = re.findall(r"`(avmsf\.[\w.]+)`", text)
     tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)
     assert min(len(functions), len(tests)) > 10

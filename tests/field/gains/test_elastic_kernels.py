@@ -4,8 +4,10 @@ import math
 from dataclasses import replace
 from itertools import product
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import norm
 
 from avmsf.field.gains import elastic as module
 from avmsf.field.gains.elastic import (
@@ -26,7 +28,8 @@ from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import log_evidence
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
-from factories.gain_cases import SIZE, families, impacts, measured, plate
+from factories.gain_cases import SIZE, draw, families, impacts, measured, plate
+from oracles import gain_model as oracle
 
 SHAPES = 6
 UNCHANGED = len(FACTORS) // 2 * len(FREQUENCY_ERRORS)
@@ -201,6 +204,22 @@ def test_the_density_of_a_measured_frequency_integrates_to_one():
     assert float(torch.trapezoid(prior.exp().sum(0), grid)) / width == pytest.approx(1.0, rel=1e-3)
 
 
+def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
+    """Half of the modes have the body's error, the others any; over a uniform density, .1 wider at both ends."""
+    given, measured_modes = family(3), torch.log(plate().frequency * 1.03)
+    weights = draw(len(FACTORS) * len(FREQUENCY_ERRORS), seed=3) + 0.5
+    given.frequency_weights = weights / weights.sum()
+    low, high = float(measured_modes.min()) - 0.1, float(measured_modes.max()) + 0.1
+    expected = np.zeros((SHAPES, SHAPES))
+    for factor, each in zip(FACTORS.log(), given.frequency_weights.reshape(len(FACTORS), -1), strict=True):
+        center = (factor + torch.log(plate().frequency)).numpy()
+        inside = max(((center > low) & (center < high)).sum(), 1)
+        for error, weight in zip(FREQUENCY_ERRORS, 0.5 * each + 0.5 * each.mean(), strict=True):
+            density = norm.pdf(measured_modes.numpy(), center[:, None], error)
+            expected += float(weight) * density * (high - low) / inside
+    assert given.shape_log_prior(measured_modes).exp().numpy() == pytest.approx(expected, rel=1e-4)
+
+
 def test_shapes_outside_the_measured_range_are_not_expected_in_it():
     """Twice as many shapes, half of them far above all measured modes, leave the others' densities as they were."""
     more = replace(
@@ -276,6 +295,19 @@ def test_a_shape_without_motion_at_the_impacts_is_not_visible():
     found = given.visibility()[narrowest]
     assert torch.allclose(found, (1.0 - RESIDUALS[0]) * size / size.mean() + RESIDUALS[0], rtol=0.1, atol=0.02)
     assert float(found.mean()) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_the_level_of_a_part_is_that_of_the_modes_near_in_frequency():
+    """Of the informative parts: here all but those of a mode that is another one's double."""
+    given = measured(impacts(6, seed=4))
+    doubled = replace(given, frequency=given.frequency.index_fill(0, torch.tensor([1]), float(given.frequency[0]) + 1))
+    counted = doubled.informative.reshape(2, -1).double().numpy()
+    assert counted.sum() == 2 * 4
+    expected = [
+        oracle.expected_level(part.numpy(), doubled.frequency.numpy(), known, width=0.3)
+        for part, known in zip((doubled.values.real, doubled.values.imag), counted, strict=True)
+    ]
+    assert doubled.level.reshape(2, -1).numpy() == pytest.approx(np.stack(expected), rel=5e-3)
 
 
 def test_one_impact_tells_a_visible_shape_from_one_that_does_not_move_there():

@@ -11,6 +11,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from factories.gain_cases import POSITIONAL, SIZE, draw, impacts, plate
+from oracles import gain_model as oracle
 
 KINDS = [*POSITIONAL, Elastic]
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -158,6 +159,19 @@ def test_smooth_kernels_are_the_written_ones():
     smooth = [torch.exp(-0.5 * squares / (share * 0.4) ** 2) for share in (0.05, 0.1, 0.2, 0.4, 0.8)]
     mixed = [(1.0 - share) * each + share * affine for share in (0.5, 0.9) for each in smooth[1:]]
     assert torch.allclose(family.kernels(), torch.stack(smooth + mixed), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2])
+def test_thin_plate_kernels_are_the_written_ones(dimensions):
+    """Along the axes of the contacts, over the longest extent, with each share of the affine part."""
+    known, others = scattered(dimensions, 12), scattered(dimensions, 5, seed=6)
+    middle, both = known.mean(0), torch.cat([known, others])
+    axes = torch.linalg.svd(known - middle, full_matrices=False).Vh[:dimensions].T
+    along = ((both - middle) @ axes).numpy()
+    along /= np.ptp(along[:12], axis=0).max()
+    expected = [oracle.thin_plate(along, along[:12], share) for share in (0.3, 0.7, 0.95)]
+    found = ThinPlate(alike(known), 0.4).between(alike(both), alike(both)).numpy()
+    assert found == pytest.approx(np.stack(expected), rel=1e-8, abs=1e-9)
 
 
 def spline_case(dimensions: int, count: int) -> tuple[ThinPlate, Sites, torch.Tensor]:

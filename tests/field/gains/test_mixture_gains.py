@@ -14,6 +14,7 @@ from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
 from factories.gain_cases import draw, families, impacts, measured, model
+from oracles import gain_model as oracle
 
 ASKED = impacts(9, seed=5)
 MODES = 5
@@ -35,15 +36,13 @@ def joint_kernels(given: MixtureGains) -> torch.Tensor:
     return torch.cat([family.between(both, both) for family in given.families])
 
 
-def dense(given: MixtureGains, kernel: torch.Tensor, share: int, series: int) -> tuple[torch.Tensor, ...]:
+def dense(
+    given: MixtureGains, kernel: torch.Tensor, share: int, series: int
+) -> tuple[torch.Tensor, torch.Tensor, float]:
     """Return one hypothesis's mean and covariance of a series at the asked places, and its noise's variance."""
-    values = series_of(given.values)
-    count, noise = len(values), NOISE_SHARES[share] + given.mixture.floor[series]
-    inverse = torch.linalg.inv(kernel[:count, :count] + noise * torch.eye(count, dtype=torch.float64))
-    across = kernel[count:, :count]
-    scale = values[:, series] @ inverse @ values[:, series] / count
-    mean = across @ inverse @ values[:, series]
-    return mean, scale * (kernel[count:, count:] - across @ inverse @ across.T), scale * noise
+    noise = float(NOISE_SHARES[share] + given.mixture.floor[series])
+    mean, covariance, scale = oracle.conditional(kernel.numpy(), noise, given.mixture.values[:, series].numpy())
+    return torch.from_numpy(mean), torch.from_numpy(covariance), scale * noise
 
 
 def test_hypotheses_of_opposite_signs_do_not_cancel_in_the_estimate():
@@ -115,7 +114,7 @@ def test_covariances_are_those_of_the_most_probable_hypothesis(make):
         row, share = divmod(int(weight.flatten().argmax()), len(NOISE_SHARES))
         both = [dense(given, kernels[row], share, part) for part in parts]
         assert torch.allclose(covariance, sum(part[1] for part in both), rtol=1e-6, atol=1e-9)
-        assert noise == pytest.approx(float(sum(part[2] for part in both)), rel=1e-9)
+        assert noise == pytest.approx(sum(part[2] for part in both), rel=1e-9)
         assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * noise
 
 

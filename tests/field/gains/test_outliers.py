@@ -25,6 +25,7 @@ from avmsf.field.gains.outliers import (
     set_aside,
 )
 from factories.gain_cases import draw
+from oracles import gain_model as oracle
 
 CONTACTS, MODES = 20, 12
 
@@ -94,20 +95,13 @@ def _recorded(sites: Sites) -> Impacts:
     return Impacts(sites.points.float(), torch.zeros(len(sites), 1), 1.0, names, sites.directions.float())
 
 
-def _dense_ratio(ratios: PredictiveRatios, row: int, others: list[int]) -> Float64[Tensor, ""]:
-    """The definition, with the library's own Student t: each contact given the others, series by series."""
-    total, count = torch.zeros((), dtype=torch.float64), len(others)
-    for series, weight in enumerate(ratios.weight):
-        known, cross = ratios.covariance[series][others][:, others], ratios.covariance[series, row, others]
-        values, value = ratios.values[others, series], ratios.values[row, series]
-        solved, shrunk = torch.linalg.solve(known, values), torch.linalg.solve(known, cross)
-        scale = (values @ solved / count * (ratios.covariance[series, row, row] - cross @ shrunk)).sqrt()
-        placed = torch.distributions.StudentT(count, cross @ solved, scale)
-        nowhere = torch.distributions.StudentT(
-            count, torch.zeros((), dtype=torch.float64), values.square().mean().sqrt()
-        )
-        total += weight * (placed.log_prob(value) - nowhere.log_prob(value))
-    return total
+def _dense_ratio(ratios: PredictiveRatios, row: int, others: list[int]) -> float:
+    """The definition: each contact given the others, series by series."""
+    rows = [*others, row]
+    return sum(
+        float(weight) * oracle.log_predictive_ratio(covariance[rows][:, rows].numpy(), 0.0, values[rows].numpy())
+        for weight, covariance, values in zip(ratios.weight, ratios.covariance, ratios.values.T, strict=True)
+    )
 
 
 def _ratios() -> PredictiveRatios:
@@ -123,7 +117,7 @@ def test_ratio_is_that_of_student_densities_given_the_other_contacts() -> None:
             _dense_ratio(ratios, row, [each for each in range(9) if each != row and each not in aside])
             for row in range(9)
         ]
-        torch.testing.assert_close(ratios_of_all(ratios, aside), torch.stack(expected), rtol=1e-9, atol=1e-9)
+        assert ratios_of_all(ratios, aside).tolist() == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_setting_one_more_contact_aside_needs_no_new_inverse() -> None:

@@ -74,6 +74,28 @@ def test_kernels_are_positive_semidefinite_and_one_on_the_mean_diagonal(found: S
     torch.testing.assert_close(family.own(both), torch.diagonal(kernels, dim1=1, dim2=2), atol=1e-9, rtol=0.0)
 
 
+def test_kernels_are_the_written_ones() -> None:
+    """Of one mirror: thin plates of all images, the impacts' and the moved ones', with signs of both characters."""
+    known, others = impacts(9), impacts(5, seed=1)
+    image = reflected(known)
+    orbit = Sites(torch.cat([known.points, image.points]), torch.cat([known.directions, image.directions]))
+    plate = ThinPlate(orbit, SIZE)
+
+    def written(one: Sites, other: Sites, sign: float, share: float, row: int) -> torch.Tensor:
+        same, moved = (plate.between(one, each)[row] for each in (other, reflected(other)))
+        return (1.0 - share) * (same + sign * moved) / 2.0 + share * same
+
+    found = Symmetric(known, SIZE, groups_of(of(X)), directional=True).between(others, known)
+    rows = [(share, sign, row) for share in symmetry.RESIDUALS for sign in (1.0, -1.0) for row in range(3)]
+    assert len(found) == len(rows)
+    for kernel, (share, sign, row) in zip(found, rows, strict=True):
+        whole, part = (written(known, known, sign, each, row).diagonal().mean() for each in (1.0, 0.0))
+        # Each part is scaled to a mean of one by itself.
+        expected = (1.0 - share) * written(others, known, sign, 0.0, row) / part
+        expected = expected + share * written(others, known, sign, 1.0, row) / whole
+        torch.testing.assert_close(kernel, expected, atol=1e-9, rtol=1e-9)
+
+
 def test_characters_of_a_group_sum_to_the_kernel_itself() -> None:
     for group in groups_of(of(X, Y, TURN)):
         order = len(group.motions)

@@ -41,6 +41,18 @@ def test_kernels_are_positive_semidefinite_and_one_on_the_diagonal() -> None:
     torch.testing.assert_close(torch.diagonal(kernels, dim1=1, dim2=2), torch.ones(kernels.shape[:2]).double())
 
 
+def test_kernels_are_the_written_ones() -> None:
+    """Features by the root mean square distance between those of points, alone and times those of positions."""
+    points, features = object_points()
+    known = sites(points[::7].double())
+    squares = torch.cdist(features.double(), features.double()).square()
+    similar = [torch.exp(-0.5 * squares / squares.mean() / length**2)[::7, ::7] for length in (0.25, 0.5, 1.0)]
+    apart = torch.cdist(known.points, known.points).square()
+    near = [torch.exp(-0.5 * apart / (length * SIZE) ** 2) for length in (0.2, 0.4, 0.8)]
+    expected = torch.stack(similar + [one * other for one in near for other in similar])
+    torch.testing.assert_close(visual(known).kernels(), expected, atol=1e-6, rtol=0.0)
+
+
 def test_places_that_look_alike_share_gains() -> None:
     points, features = object_points()
     known = sites(points[:20:2].double())
