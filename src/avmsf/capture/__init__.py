@@ -3,7 +3,8 @@
 In goes a folder: `impacts.csv` (a recording and its contact in each row), the sound files, perhaps `capture.toml`
 (`CaptureSettings`) and a surface. Out comes a `Capture`, whose `Impacts` hold one sound for each contact, of one rate
 and length, from the impact on and per newton where forces are known; or a `CaptureReport` of what is wrong. Datasets
-and the simulator enter one step later, with pairs of an `Impact` and its `Recording`.
+and the simulator enter one step later, with pairs of an `Impact` and its `Recording`. Every step tells `Issues`, which
+raise the first error for `read_capture` and collect all for `check`.
 
     table -> audio -> prepare (onset, highpass, force) -> preprocess -> Impacts
     table, surface -> checks (placement) -> what is wrong

@@ -18,7 +18,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.issues import Issues, RecordingReport, shared_problems, shortened
 from avmsf.capture.preprocess import check_levels, preprocess
 from avmsf.capture.settings import SETTINGS, TABLE, CaptureSettings, settings_of
-from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, Impact, in_folder, present_impacts, read_impacts
+from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, Impact, in_folder, is_inside, present_impacts, read_impacts
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, write_surface
 
@@ -165,8 +165,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     numbers. Everything is written to a temporary folder first and then renamed into place: a folder of this name is
     complete or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
     then finds the onsets, and keeps this many seconds from each on; without it they are final, and are not aligned when
-    they are read. Raises `CaptureError` where the folder exists and
-    is not empty, or cannot be written.
+    they are read. Raises `CaptureError` where the folder exists and is not empty, or cannot be written.
     """
     folder = Path(folder)
     with new_folder(folder, raising=CaptureError) as begun:
@@ -209,11 +208,10 @@ def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None)
 
 def _file_names(names: tuple[str, ...]) -> list[str]:
     """Return the names where all can be files inside the folder, else numbers."""
-    paths = [PurePosixPath(name) for name in names]
     usable = all(
-        path.suffix.lower() == ".wav" and str(path) == name and not path.is_absolute() and ".." not in path.parts
-        and "\\" not in name and ":" not in path.parts[0] and name == name.strip()
-        for path, name in zip(paths, names, strict=True)
+        name.lower().endswith(".wav") and name == name.strip() == str(PurePosixPath(name))
+        and is_inside(PurePosixPath(name)) and "\\" not in name
+        for name in names
     )  # fmt: skip
     if usable and len({name.lower() for name in names}) == len(names):
         return list(names)

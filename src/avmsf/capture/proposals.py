@@ -6,7 +6,7 @@ docs/decisions/reading-recordings.md has the measurements behind the limits.
 
 import json
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -75,29 +75,33 @@ def propose_settings(
     multiplied by to lie on the object in its photographs: it decides the unit where there is no surface. Recordings
     that cannot be read are passed over; raises nothing for bad input.
     """
-    folder = Path(folder)
+    folder, found = Path(folder), list[Proposal]()
     try:
         chosen = set(read_toml(folder / SETTINGS)) if settings is None and (folder / SETTINGS).is_file() else set()
         settings = settings or settings_of(folder)
         rows = read_rows(folder)[0]
     except (CaptureError, OSError, ValueError):
         return ()
-    defaults, found = vars(CaptureSettings()), list[Proposal]()
-    chosen |= {key for key, value in vars(settings).items() if value != defaults[key]}
+    chosen |= {key for key, value in vars(settings).items() if value != vars(CaptureSettings())[key]}
 
     def recordings(settings: CaptureSettings) -> Iterator[tuple[Impact, Recording]]:
-        return read_recordings(folder, parse_rows(rows, settings, Issues(collect=True)), Issues(collect=True))
+        issues = Issues(collect=True)
+        return read_recordings(folder, parse_rows(rows, settings, issues), issues)
 
-    steps: list[tuple[set[str], Callable[[CaptureSettings], list[Proposal]]]] = [
-        ({"unit", "surface_unit"}, lambda changed: _units(folder, rows, changed, factor)),
-        ({"force_channel", "response_channel"}, lambda changed: _channels(recordings(changed))),
-        ({"highpass"}, lambda changed: _highpass(recordings(changed), changed)),
-    ]
-    for keys, propose in steps:
-        if not chosen & keys:
-            values: dict[str, Any] = {each.key: each.value for each in found}
-            found += propose(replace(settings, **values))
+    if not chosen & {"unit", "surface_unit"}:
+        found += _units(folder, rows, settings, factor)
+    settings = _with(settings, found)
+    if not chosen & {"force_channel", "response_channel"}:
+        found += _channels(recordings(settings))
+    settings = _with(settings, found)
+    if "highpass" not in chosen:
+        found += _highpass(recordings(settings), settings)
     return tuple(found)
+
+
+def _with(settings: CaptureSettings, proposals: Sequence[Proposal]) -> CaptureSettings:
+    values: dict[str, Any] = {each.key: each.value for each in proposals}
+    return replace(settings, **values)
 
 
 def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
