@@ -59,6 +59,12 @@ def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
     (folder / "b.wav").rename(folder / "b1.wav")
     with raises(CaptureError, file="b.wav", value="b1.wav"):
         read_capture(folder)
+    # A recording with a row of its own is of another contact.
+    for others, value in ((("a.wav", "b1.wav"), "c.wav"), (("a.wav", "b1.wav", "c.wav"), None)):
+        fill(tmp_path, rows=[f"{name},0,0,0" for name in (*others, "d.wav")])
+        (folder / "b.wav").unlink()
+        with raises(CaptureError, file="d.wav", value=value):
+            read_capture(folder)
     (folder / "040.wav").write_bytes((folder / "a.wav").read_bytes())
     for missing, near in (("005.wav", None), ("40.wav", "040.wav")):
         fill(tmp_path, rows=("a.wav,0,0,0", f"{missing},1,0,0"))
@@ -67,7 +73,6 @@ def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
     fill(tmp_path, rows=("a.wav,0,0,0", "takes/b.wav,1,0,0"))
     with raises(CaptureError, file="takes/b.wav", value=None):
         read_capture(folder)
-    # A recording with a row of its own is of another contact.
     (folder / "takes").mkdir()
     (folder / "takes" / "hammer on rim.wav").write_bytes((folder / "a.wav").read_bytes())
     for rows, below in ((("a.wav,0,0,0",), "takes/hammer on rim.wav"), (("takes/hammer on rim.wav,0,0,0",), None)):
@@ -111,17 +116,10 @@ def test_channels_are_counted_from_one(tmp_path: Path) -> None:
             read_recording(folder / "a.wav").response(channel)
 
 
-def test_eight_bits_are_read_with_a_warning(tmp_path: Path) -> None:
-    with warns(CaptureWarning, file=tmp_path, value=["a.wav", "b.wav", "c.wav"]):
-        impacts = read_capture(fill(tmp_path, subtype="PCM_U8"))
-    assert len(impacts.impacts) == 3
-    reports = check(tmp_path).recordings
-    assert [(report.coding, report.clipped, len(report.problems)) for report in reports] == [("PCM_U8", 0, 1)] * 3
-
-
 @pytest.mark.parametrize(
     ("container", "subtype", "problems"),
     [
+        ("WAV", "PCM_U8", 1),
         ("WAV", "IMA_ADPCM", 1),
         ("WAV", "MS_ADPCM", 1),
         ("OGG", "VORBIS", 1),
@@ -131,11 +129,11 @@ def test_eight_bits_are_read_with_a_warning(tmp_path: Path) -> None:
         ("CAF", "ALAC_16", 0),
     ],
 )
-def test_compression_with_loss_is_reported(tmp_path: Path, container: str, subtype: str, problems: int) -> None:
+def test_loss_by_compression_or_8_bits_is_reported(tmp_path: Path, container: str, subtype: str, problems: int) -> None:
     fill(tmp_path)
     soundfile.write(tmp_path / "b.wav", ring(), RATE, format=container, subtype=subtype)
     report = check(tmp_path).recordings[1]
-    assert (report.coding, len(report.problems)) == (subtype, problems)
+    assert (report.coding, report.clipped, len(report.problems)) == (subtype, 0, problems)
 
 
 @pytest.mark.parametrize(

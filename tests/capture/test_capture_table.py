@@ -141,6 +141,8 @@ def test_directions_become_unit_vectors(tmp_path: Path) -> None:
         ("file,x,y,z,nx,ny,nz", ("a.wav,0,0,0,1,0,0", "b.wav,0,1,0,0,0,0"), 3, "nx", [0.0, 0.0, 0.0]),
         ("file,x,y,z,force_newtons", ("a.wav,0,0,0,2", "b.wav,0,1,0,0"), 3, "force_newtons", 0.0),
         ("file,x,y,z,force_newtons", ("a.wav,0,0,0,2", "b.wav,0,1,0,"), 3, "force_newtons", ""),
+        # A force so small would lift the sound beyond float32.
+        ("file,x,y,z,force_newtons", ("a.wav,0,0,0,2", "b.wav,0,1,0,1e-300"), 3, "force_newtons", 1e-300),
     ],
 )
 def test_a_bad_table_names_row_column_and_value(

@@ -65,13 +65,13 @@ def check_surface(
         message = f"the contacts lie on a part of {1e4 * areas[0]:.3g} cm2; larger ones ({sizes}) are left out"
         return surface, [CaptureWarning(message, name="surface", value=areas)]
     placement = check_placement(contacts, surface_points(surface))
-    if placement.on_surface:
+    if placement.fault == "none":
         return surface, []
     lines = [f'{key} = "{value}"' for key, value in fitting_units_of(placement, settings).items()]
     advice = f". If so, write {' and '.join(lines)} in capture.toml" if lines else ""
     found = placement.describe([f"row {impact.line}" for impact in impacts]) + advice
     farthest = float(placement.distances.max())
-    if placement.other_unit:
+    if placement.fault == "unit":
         message = f"{TABLE}: expected contacts and surface in one unit; {found}"
         raise CaptureError(message, file=TABLE, name="unit", value=farthest)
     worst = impacts[int(placement.distances.argmax())].line

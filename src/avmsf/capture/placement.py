@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -134,30 +135,26 @@ class Placement:
         return 0 < self.spread < _BOUNDS.spot * self.diagonal
 
     @property
-    def on_surface(self) -> bool:
-        """Whether all contacts lie on the surface and nothing says that they were meant elsewhere."""
-        return not self.off and not self.shrunken and self.mismatch is None
+    def fault(self) -> Literal["none", "rows", "frame", "unit"]:
+        """How wrong the contacts lie: not at all, as single mistakes or by little, most of them, or by their unit.
 
-    @property
-    def other_unit(self) -> bool:
-        """Whether contacts and surface count different units, beyond doubt: another one brings them onto the surface.
-
-        Where they lie on it already, as first impacts near the middle of a plate do, only many that are very close
-        together say so.
+        For "frame", which is turned, mirrored, of another size or has most contacts off, no shape can be used as it
+        lies. For "unit" another one brings them onto the surface beyond doubt; where they lie on it already, as first
+        impacts near the middle of a plate do, only many that are very close together say so.
         """
-        many = self.mostly_off or (self.shrunken and len(self.distances) >= _BOUNDS.spot_contacts)
-        return self.mismatch is not None and self.mismatch.unit is not None and many
-
-    @property
-    def misplaced(self) -> bool:
-        """Whether no shape can be used as it lies: turned, mirrored, of another size, or with most contacts off."""
-        if self.mismatch is None or float(np.median(self.distances)) > self.tolerance:
-            return float(np.median(self.distances)) > self.tolerance
-        return self.mismatch.turned or self.mostly_off or abs(math.log(self.mismatch.factor)) > _BOUNDS.log_size
+        mismatch, close = self.mismatch, self.shrunken and len(self.distances) >= _BOUNDS.spot_contacts
+        if mismatch is not None and mismatch.unit is not None and (self.mostly_off or close):
+            return "unit"
+        resized = mismatch is not None and abs(math.log(mismatch.factor)) > _BOUNDS.log_size
+        if mismatch is not None and (mismatch.turned or resized or self.mostly_off):
+            return "frame"
+        if float(np.median(self.distances)) > self.tolerance:
+            return "frame"
+        return "rows" if self.off or self.shrunken or mismatch is not None else "none"
 
     def describe(self, names: Sequence[str] = (), *, what: str = "surface") -> str:
         """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
-        if self.on_surface:
+        if self.fault == "none":
             return ""
         count, farthest = len(self.distances), float(self.distances.max())
         few = self.mismatch is None and 0 < 2 * len(self.off) < count
@@ -213,12 +210,11 @@ def expect_placed(
 ) -> None:
     """Raise FitError where contacts are not on a surface, with the transform that would bring them onto it.
 
-    `points` are all over the surface, as `surface_points` has them; both in meters. Contacts are not on it where
-    `Placement.misplaced` says so: rough surfaces, glue, single wrong rows and small shifts pass. `names` are for the
-    message.
+    `points` are all over the surface, as `surface_points` has them; both in meters. Rough surfaces, glue, single wrong
+    rows and small shifts pass (`Placement.fault`). `names` are for the message.
     """
     placement = check_placement(contacts, points)
-    if placement.misplaced:
+    if placement.fault in ("frame", "unit"):
         raise FitError.expected(
             "contacts on the surface for elastic mode shapes",
             float(placement.distances.max()),

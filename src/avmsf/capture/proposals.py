@@ -151,7 +151,7 @@ def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor:
         reason = "The contacts then lie on the object in the photographs; in the present unit most are outside of it."
         return [] if unit is None else [Proposal("unit", unit, reason)]
     placement = check_placement(contacts, surface_points(surface))
-    if not placement.other_unit and NARROWEST <= placement.diagonal <= WIDEST:
+    if placement.fault != "unit" and NARROWEST <= placement.diagonal <= WIDEST:
         return []
     units: dict[str, Any] = fitting_units_of(placement, settings)
     size = placement.diagonal / settings.surface_meters * replace(settings, **units).surface_meters

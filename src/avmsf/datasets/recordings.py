@@ -102,7 +102,7 @@ def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> lis
         return []
     placement = check_placement(impacts.contacts, surface_points(surface))
     found = placement.describe(impacts.names)
-    if placement.other_unit:
+    if placement.fault == "unit":
         raise DatasetError(
             f"{origin}: expected contacts and surface in one unit; {found}",
             name=origin,

@@ -175,7 +175,7 @@ def expect_on_object(
     """
     placement = check_placement(contacts, points, stated=stated)
     words, distance = placement.describe(names, what=what), float(placement.distances.max())
-    apart = placement.misplaced or placement.other_unit or distance > placement.diagonal
+    apart = placement.fault in ("frame", "unit") or distance > placement.diagonal
     if words and (apart or (strict and placement.off)):
         raise CaptureError(words, name="contacts", value=distance)
     if words:
