@@ -81,6 +81,13 @@ def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
             read_capture(folder)
 
 
+def test_a_sound_file_of_no_capture_is_guessed_too(tmp_path: Path) -> None:
+    fill(tmp_path)
+    for name, near in (("a1.wav", None), ("aa.wav", "a.wav"), ("takes/a.wav", None)):
+        with raises(CaptureError, file=tmp_path / name, value=near):
+            read_recording(tmp_path / name)
+
+
 def test_mixed_rates_are_refused_with_their_counts(tmp_path: Path) -> None:
     folder = fill(tmp_path)
     soundfile.write(folder / "c.wav", ring(), RATE + 1)
@@ -254,9 +261,8 @@ def test_different_channels_are_refused_once(tmp_path: Path, kind: str) -> None:
 
 
 def test_what_some_recordings_share_is_said_once_with_their_names(tmp_path: Path) -> None:
-    rows = [f"{number}.wav,0,0,{number}" for number in range(5)]
     files = {f"{number}.wav": ring(seed=number) for number in range(4)} | {"4.wav": np.clip(10 * ring(), -1, 1)}
-    folder = fill(tmp_path, rows=rows, replace=files, subtype="PCM_U8")
+    folder = fill(tmp_path, sounds=files, subtype="PCM_U8")
     sentences = shared_problems(check(folder).recordings)
     shared = [each for each in sentences if each.startswith("5 recordings (0.wav, 1.wav, 2.wav, …): ")]
     assert len(shared) == 1
@@ -266,14 +272,9 @@ def test_what_some_recordings_share_is_said_once_with_their_names(tmp_path: Path
 
 def test_a_recording_far_louder_than_all_others_is_named_and_a_fainter_one_is_not(tmp_path: Path) -> None:
     sounds = {f"{number}.wav": ring(seed=number) for number in range(7)}
-    rows = [f"{name},{number / 10},0,0" for number, name in enumerate(sounds)]
-    fine = fill(tmp_path / "fine", rows=rows, replace=sounds | {"2.wav": 0.1 * sounds["2.wav"]})
-    loud = fill(tmp_path / "loud", rows=rows, replace=sounds | {"2.wav": 10 * sounds["2.wav"]})
-    fine_ones, loud_ones = (
-        [each for each in check(folder).problems if each.startswith("2.wav")] for folder in (fine, loud)
-    )
-    assert fine_ones == []
-    assert len(loud_ones) == 1
+    for factor, named in ((0.1, 0), (10.0, 1)):
+        folder = fill(tmp_path / str(factor), sounds=sounds | {"2.wav": factor * sounds["2.wav"]})
+        assert len([each for each in check(folder).problems if each.startswith("2.wav")]) == named
 
 
 def test_noise_is_measured_in_what_the_settings_leave(tmp_path: Path) -> None:

@@ -162,11 +162,10 @@ def test_recordings_in_a_subfolder_are_named(tmp_path: Path, names: str) -> None
 
 
 def test_recordings_that_were_scaled_to_one_peak_are_named(tmp_path: Path) -> None:
-    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcd")]
-    sounds = {row.partition(",")[0]: ring(seed=seed) * (1 + seed) for seed, row in enumerate(rows)}
-    assert check(fill(tmp_path / "as recorded", rows=rows, replace=sounds)).problems == ()
+    sounds = {f"{seed}.wav": ring(seed=seed) * (1 + seed) for seed in range(4)}
+    assert check(fill(tmp_path / "as recorded", sounds=sounds)).problems == ()
     equal = {name: 0.9 * sound / np.abs(sound).max() for name, sound in sounds.items()}
-    (problem,) = check(fill(tmp_path / "scaled", rows=rows, replace=equal)).problems
+    (problem,) = check(fill(tmp_path / "scaled", sounds=equal)).problems
     assert "same peak, 0.9" in problem
 
 
@@ -180,24 +179,20 @@ def test_a_copy_is_named_with_its_source_and_what_differs_past_the_cut_is_none(t
 
 @pytest.mark.parametrize("offset", [0.01, -0.1, 4.0])
 def test_a_constant_offset_of_the_recorder_changes_nothing(tmp_path: Path, offset: float) -> None:
-    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcdef")]
-    sounds = {row.partition(",")[0]: ring(before=0.1, seed=seed) for seed, row in enumerate(rows)}
-    clean = read_capture(fill(tmp_path / "clean", rows=rows, replace=sounds)).impacts
+    sounds = {f"{seed}.wav": ring(before=0.1, seed=seed) for seed in range(6)}
+    clean = read_capture(fill(tmp_path / "clean", sounds=sounds)).impacts
     moved = {name: sound + offset for name, sound in sounds.items()}
-    read = read_capture(fill(tmp_path / "moved", rows=rows, replace=moved)).impacts
+    read = read_capture(fill(tmp_path / "moved", sounds=moved)).impacts
     # The offset is estimated from the quietest 40 ms or more, whose noise is 1e-4, and samples are float32.
     np.testing.assert_allclose(read.sounds, clean.sounds, atol=2e-5)
 
 
 def test_sway_and_rumble_are_proposed_to_be_filtered_whatever_their_onset(tmp_path: Path) -> None:
-    rows = [f"{name}.wav,{row / 10},0,0" for row, name in enumerate("abcd")]
     rate = 16_000
     time = np.arange(rate) / rate
     sway = 0.4 * np.sin(2 * np.pi * 8 * time + 1)
-    sounds = {
-        row.partition(",")[0]: ring(1.0, rate=rate, before=0.3, seed=seed) + sway for seed, row in enumerate(rows)
-    }
-    proposed = {each.key: each.value for each in propose_settings(fill(tmp_path, rows=rows, replace=sounds, rate=rate))}
+    sounds = {f"{seed}.wav": ring(1.0, rate=rate, before=0.3, seed=seed) + sway for seed in range(4)}
+    proposed = {each.key: each.value for each in propose_settings(fill(tmp_path, sounds=sounds, rate=rate))}
     assert proposed == {"highpass": 20.0}
 
 
@@ -205,8 +200,7 @@ def test_rows_in_the_order_of_text_and_not_of_numbers_are_remarked_on(tmp_path: 
     names = [f"{number}.wav" for number in range(1, 11)]
     sounds = {name: ring(1.0, before=0.25, seed=row) for row, name in enumerate(names)}
     for way, remarked in ((sorted(names), True), (names, False), (names[::-1], False)):
-        rows = tuple(f"{name},{row / 100},0,0" for row, name in enumerate(way))
-        report = check(fill(tmp_path / f"{way[1]}{way[2]}", rows=rows, replace=sounds))
+        report = check(fill(tmp_path / f"{way[1]}{way[2]}", sounds={name: sounds[name] for name in way}))
         assert any("order of text" in each for each in report.remarks) is remarked
 
 

@@ -24,9 +24,7 @@ def found(folder: Path) -> dict[str, object]:
 
 
 def folder_of(path: Path, sounds: list[np.ndarray]) -> Path:
-    names = [f"{number:02}.wav" for number in range(len(sounds))]
-    rows = [f"{name},{0.1 * row},0,0" for row, name in enumerate(names)]
-    return fill(path, rows=rows, replace=dict(zip(names, sounds, strict=True)))
+    return fill(path, sounds={f"{number:02}.wav": sound for number, sound in enumerate(sounds)})
 
 
 def rumbling(

@@ -26,6 +26,7 @@ def ring(
 def fill(
     folder: Path,
     *,
+    sounds: dict[str, np.ndarray] | None = None,
     rows: Sequence[str] = ROWS,
     header: str = HEADER,
     settings: str | None = None,
@@ -33,9 +34,15 @@ def fill(
     rate: int = RATE,
     subtype: str = "FLOAT",
 ) -> Path:
-    """Write a folder of three good recordings; `replace` gives others, shape [frames] or [frames, channels]."""
+    """Write a folder of three good recordings; `replace` gives others, shape [frames] or [frames, channels].
+
+    With `sounds`, these are all, at contacts in a row.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    sounds = {name: ring(rate=rate, seed=seed) for seed, name in enumerate(("a.wav", "b.wav", "c.wav"))}
+    if sounds is not None:
+        rows = [f"{name},{row / 10},0,0" for row, name in enumerate(sounds)]
+    else:
+        sounds = {name: ring(rate=rate, seed=seed) for seed, name in enumerate(("a.wav", "b.wav", "c.wav"))}
     for name, samples in (sounds | (replace or {})).items():
         soundfile.write(folder / name, samples, rate, subtype=subtype)
     (folder / "impacts.csv").write_bytes("\n".join([header, *rows, ""]).encode())

@@ -6,7 +6,7 @@ Where the sounds start in their files is decided for all recordings of a capture
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,23 +21,25 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
 from avmsf.errors import CaptureError, CaptureWarning
 
-START_LEVEL = 10**-2.0
-"""Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB. Impulse responses
-reach 0 to -3 dB (aircraft, ruler, tree), recordings with 4 samples to 1 s before the impact -25 to -47 dB."""
-MAX_START_SECONDS = 0.001
-"""By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes up to
-.3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz); delays of 1 ms are found on alignment."""
-USUAL_RANGE_DB = 80.0
-"""Level between a recording and the median beyond which its scale is doubtful: a contact near the nodes of most modes
-takes 40 dB, a soft impact 30."""
-MIN_EQUAL_PEAKS, SAME_PEAK_DB = 4, 0.05
-"""Recordings, and how far their peaks may differ, that were scaled to one peak: struck ones differ by decibels."""
-USUAL_GAP_DB = 12.0
-"""Level between the loudest recording and the next beyond which its scale is doubtful, of six recordings or more: 24
-measured and simulated captures have at most 7. One recording at ten times its level outweighs all others in a fit."""
-MAX_RANGE_DB = 140.0
-"""Level between the loudest and the faintest recording beyond which the faintest is less than the rounding of the
-loudest in float32 (144 dB), in which they are fitted."""
+
+@dataclass(frozen=True)
+class _Tolerances:
+    """What recordings of one capture have in common, and from where on one of them is doubtful."""
+
+    start_level: float = 10**-2.0
+    """Share of the largest mean square in the first 20 ms that a response must have at its start: -20 dB. Impulse
+    responses reach 0 to -3 dB (aircraft, ruler, tree), those with 4 samples to 1 s before the impact -25 to -47 dB."""
+    start_seconds: float = 0.001
+    """By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes
+    up to .3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz)."""
+    usual_range_db: float = 80.0  # from the median: near nodes of most modes it is 40, of a soft impact 30
+    usual_gap_db: float = 12.0  # of the loudest to the next, of six or more: at most 7 in 24 captures
+    range_db: float = 140.0  # of the loudest to the faintest: float32, in which they are fitted, rounds at 144
+    equal_peaks: int = 4  # recordings that were scaled to one peak, since struck ones differ by decibels
+    same_peak_db: float = 0.05
+
+
+_TOLERANCES = _Tolerances()
 
 
 def preprocess(
@@ -82,16 +84,14 @@ def _join(
 ) -> Impacts:
     names = [each.file for each in impacts]
     rate = common_rate([each.rate for each in sounds], names)
-    issues.uncut = (
-        settings.align and not settings.from_peaks and settings.force_channel is None and start_with_impact(sounds)
-    )
+    movable = settings.align and not settings.from_peaks
+    issues.uncut = movable and settings.force_channel is None and start_with_impact(sounds)
     if issues.uncut:
-        sounds = [
-            replace(each, sound=np.concatenate([each.before, each.sound]), before=each.before[:0]) for each in sounds
-        ]
+        wholes = [np.concatenate([each.before, each.sound]) for each in sounds]
+        sounds = [replace(each, sound=whole, before=whole[:0]) for each, whole in zip(sounds, wholes, strict=True)]
     length = _common_length([len(each.sound) for each in sounds], names, rate=rate, settings=settings, issues=issues)
     before = after = None
-    if settings.align and not settings.from_peaks:
+    if movable:
         size = margin_length(rate)
         before = torch.full((len(sounds), size), torch.nan)
         after = before.clone()
@@ -115,7 +115,7 @@ def _join(
 
 def latest_start(rate: float) -> int:
     """Return the sample before which an onset is found in a recording that starts with its impact, at a rate in Hz."""
-    return max(MIN_MARGIN, round(MAX_START_SECONDS * rate))
+    return max(MIN_MARGIN, round(_TOLERANCES.start_seconds * rate))
 
 
 def start_with_impact(recordings: Sequence[Prepared]) -> bool:
@@ -139,21 +139,17 @@ def start_with_impact(recordings: Sequence[Prepared]) -> bool:
     # The squared difference of a sine's samples is its square times (angle between them)^2, on average.
     angle = np.sqrt((np.diff(starts, axis=1) ** 2 / energies).mean() / mean.mean())
     first = max(2, 1 + round(2 * np.pi / 16 / max(float(angle), 1.0 / size)))
-    return bool(mean[:first].max() >= START_LEVEL * mean.max())
+    return bool(mean[:first].max() >= _TOLERANCES.start_level * mean.max())
 
 
 def common_rate(rates: Sequence[float], names: Sequence[str]) -> float:
     """Return the one sample rate of the files, Hz; `CaptureError` where they differ."""
     counts = Counter(rates).most_common()
     if len(counts) > 1:
-        found = [
-            f"{rate:g} Hz ({counted(count, 'file')}, {names[list(rates).index(rate)]} the first)"
-            for rate, count in counts
-        ]
+        first = {rate: names[list(rates).index(rate)] for rate, _ in counts}
+        got = ", ".join(f"{rate:g} Hz ({counted(count, 'file')}, {first[rate]} the first)" for rate, count in counts)
         wanted, advice = "recordings of one sample rate", "nothing is resampled, so convert them to one rate"
-        raise CaptureError.expected(
-            wanted, [rate for rate, _ in counts], got=", ".join(found), name="sample_rate", advice=advice
-        )
+        raise CaptureError.expected(wanted, list(first), got=got, name="sample_rate", advice=advice)
     return rates[0]
 
 
@@ -180,39 +176,34 @@ def _common_length(
 def check_levels(sounds: dict[str, tuple[bytes, float]]) -> list[CaptureWarning]:
     """Return a warning where one of `Issues.sounds` is far louder or fainter than the others, or all peaks are one.
 
-    Raises `CaptureError` where the loudest is more than `MAX_RANGE_DB` above the faintest.
+    Raises `CaptureError` where the loudest and the faintest differ by more than float32 holds.
     """
     if not sounds:
         return []
     names, peaks = list(sounds), [peak for _, peak in sounds.values()]
-    levels = 20 * np.log10(np.asarray(peaks))
-    away = levels - np.median(levels)
-    worst, loudest, extent = int(np.abs(away).argmax()), int(levels.argmax()), float(np.ptp(levels))
-    above = levels[loudest] - np.sort(levels)[-2] if len(levels) >= 6 else 0.0
-    found = f"peak, {peaks[worst]:.3g}, is {away[worst]:+.0f} dB from that of most recordings ({np.median(peaks):.3g})"
-    row = worst
-    if extent > MAX_RANGE_DB:
-        raise CaptureError(
-            f"{names[worst]}: its {found}; expected at most {MAX_RANGE_DB:g} dB between the loudest and the faintest, "
-            f"got {extent:.0f}; export it at the scale of the others, or remove its row",
-            file=names[worst],
-            name="peak",
-            value=peaks[worst],
+    levels = 20 * np.log10(peaks)
+    away, extent, order = levels - np.median(levels), float(np.ptp(levels)), np.argsort(levels, kind="stable")
+    row, advice = int(np.abs(away).argmax()), "check its gain, its scale and its force"
+    found = f"{away[row]:+.0f} dB from that of most recordings ({np.median(peaks):.3g})"
+    wanted = f"at most {_TOLERANCES.usual_range_db:g} dB"
+    if extent > _TOLERANCES.range_db:
+        wanted, advice = (
+            f"at most {_TOLERANCES.range_db:g} dB",
+            "export it at the scale of the others, or remove its row",
         )
-    if len(levels) >= MIN_EQUAL_PEAKS and extent < SAME_PEAK_DB:
-        row = 0
+        got = f"{extent:.0f}; its peak, {peaks[row]:.3g}, is {found}"
+        wanted = f"{wanted} between the loudest and the faintest"
+        raise CaptureError.expected(wanted, peaks[row], got=got, file=names[row], name="peak", advice=advice)
+    if len(levels) >= _TOLERANCES.equal_peaks and extent < _TOLERANCES.same_peak_db:
         message = (
             f"all {len(levels)} recordings have the same peak, {peaks[0]:.3g}: expected the levels as recorded, got "
             "each scaled to one peak, which loses how strong the modes are at each contact; export them unscaled"
         )
-    elif above > USUAL_GAP_DB:
-        row = loudest
-        message = (
-            f"{names[row]}: its peak, {peaks[row]:.3g}, is {above:.0f} dB above that of the next loudest recording; "
-            f"expected at most {USUAL_GAP_DB:g} dB; check its gain, its scale and its force"
-        )
-    elif abs(away[worst]) > USUAL_RANGE_DB:
-        message = f"{names[worst]}: its {found}; expected at most {USUAL_RANGE_DB:g} dB; check its scale and its force"
-    else:
+        return [CaptureWarning(message, file=names[0], name="peak", value=peaks[0])]
+    if len(levels) >= 6 and (gap := levels[order[-1]] - levels[order[-2]]) > _TOLERANCES.usual_gap_db:
+        row, wanted = int(order[-1]), f"at most {_TOLERANCES.usual_gap_db:g} dB"
+        found = f"{gap:.0f} dB above that of the next loudest recording"
+    elif abs(away[row]) <= _TOLERANCES.usual_range_db:
         return []
+    message = f"{names[row]}: its peak, {peaks[row]:.3g}, is {found}; expected {wanted}; {advice}"
     return [CaptureWarning(message, file=names[row], name="peak", value=peaks[row])]

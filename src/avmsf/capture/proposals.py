@@ -7,7 +7,9 @@ docs/decisions/reading-recordings.md has the measurements behind the limits.
 import json
 import textwrap
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,23 +33,21 @@ from avmsf.capture.table import Impact, Row, parse_rows, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh.surface import surface_points
 
-MIN_PUSH_SHARE = 0.5
-"""Share of its energy that a hammer's channel has within its push and one width on either side: most of it. The
-aircraft's hammer channel has .92 and more, its accelerometers .24 and less."""
-CUTOFFS_HZ = (20.0, 40.0)
-"""The lower limit of hearing, and an octave above it, where only a large structure rings."""
-MIN_FALL = 10**0.6
-"""Ratio by which a highpass must lower the power of the noise: 6 dB, half its amplitude. Likewise the power below the
-highpass after the impact over that before it, above which the object itself rings there: a few periods of noise scatter
-by 3."""
-MIN_NOISE_SHARE = 1e-6
-"""Mean square of noise against the squared peak, -60 dB, below which it does not hide the decay over its T60."""
-MIN_AUDIO_RATE_HZ = 16_000.0
-"""Sample rate from which on recordings are of sound: slower ones are of structures that vibrate below 20 Hz."""
-MAX_LOW_SHARE = 0.1
-"""Share of the energy after the impacts, below the lowest cutoff, above which it is no sound of the object."""
-MIN_LEAD_SECONDS = 0.1
-"""Two periods of the lowest cutoff: less than that before an impact does not show rumble."""
+
+@dataclass(frozen=True)
+class _Tolerances:
+    """From where on the recordings show that a setting helps."""
+
+    push_share: float = 0.5  # of a hammer's energy within its push and a width on either side: .92; accelerometers' .24
+    cutoffs_hz: tuple[float, float] = (20.0, 40.0)  # the lower limit of hearing, and an octave above
+    fall: float = 10**0.6  # 6 dB: of the noise's power by a highpass; a few periods of noise scatter by 3 below it
+    noise_share: float = 1e-6  # -60 dB: mean square of noise over the squared peak that hides a decay over its T60
+    audio_rate_hz: float = 16_000.0  # slower recordings are of structures that vibrate below 20 Hz
+    low_share: float = 0.1  # of the energy after the impacts below the lowest cutoff: no sound of the object
+    lead_seconds: float = 0.1  # two periods of the lowest cutoff: less before an impact does not show rumble
+
+
+_TOLERANCES = _Tolerances()
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ class Proposal:
 
     key: str
     """A field of `CaptureSettings`."""
-    value: bool | int | float | str
+    value: Any
+    """What TOML can hold: true or false, a number or text."""
     reason: str
 
     @property
@@ -83,25 +84,14 @@ def propose_settings(
     except (CaptureError, OSError, ValueError):
         return ()
     chosen |= {key for key, value in vars(settings).items() if value != vars(CaptureSettings())[key]}
-
-    def recordings(settings: CaptureSettings) -> Iterator[tuple[Impact, Recording]]:
-        issues = Issues(collect=True)
-        return read_recordings(folder, parse_rows(rows, settings, issues), issues)
-
-    if not chosen & {"unit", "surface_unit"}:
-        found += _units(folder, rows, settings, factor)
-    settings = _with(settings, found)
-    if not chosen & {"force_channel", "response_channel"}:
-        found += _channels(recordings(settings))
-    settings = _with(settings, found)
-    if "highpass" not in chosen:
-        found += _highpass(recordings(settings), settings)
+    for keys, propose in (
+        ({"unit", "surface_unit"}, partial(_units, factor=factor)),
+        ({"force_channel", "response_channel"}, _channels),
+        ({"highpass"}, _highpass),
+    ):
+        if not chosen & keys:
+            found += propose(folder, rows, replace(settings, **{each.key: each.value for each in found}))
     return tuple(found)
-
-
-def _with(settings: CaptureSettings, proposals: Sequence[Proposal]) -> CaptureSettings:
-    values: dict[str, Any] = {each.key: each.value for each in proposals}
-    return replace(settings, **values)
 
 
 def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
@@ -137,19 +127,16 @@ def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tenso
     return torch.tensor(contacts, dtype=torch.float64).reshape(-1, 3)
 
 
-def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor: float | None) -> list[Proposal]:
+def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, *, factor: float | None) -> list[Proposal]:
     """Return the units in which contacts lie on the object, where the present ones cannot be meant."""
-    try:
+    contacts, surface = contacts_of(rows, settings), None
+    with suppress(CaptureError):
         surface = find_surface(folder, settings)
-    except CaptureError:
+        if surface is None and factor is not None and (unit := unit_named(factor * settings.meters)):
+            reason = "The contacts then lie on the object in the photographs; in the present unit most are outside it."
+            return [Proposal("unit", unit, reason)]
+    if surface is None or not len(contacts):
         return []
-    contacts = contacts_of(rows, settings)
-    if not len(contacts):
-        return []
-    if surface is None:
-        unit = None if factor is None else unit_named(factor * settings.meters)
-        reason = "The contacts then lie on the object in the photographs; in the present unit most are outside of it."
-        return [] if unit is None else [Proposal("unit", unit, reason)]
     placement = check_placement(contacts, surface_points(surface))
     if placement.fault != "unit" and NARROWEST <= placement.diagonal <= WIDEST:
         return []
@@ -162,7 +149,7 @@ def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, factor:
     return [Proposal(key, unit, reason) for key, unit in units.items()]
 
 
-def _channels(recordings: Iterator[tuple[Impact, Recording]]) -> list[Proposal]:
+def _channels(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
     """Return which channel is the hammer's and which the sound's.
 
     A hammer's channel holds one short push in every recording. Of several sounds beside it, the one that stands highest
@@ -170,15 +157,15 @@ def _channels(recordings: Iterator[tuple[Impact, Recording]]) -> list[Proposal]:
     channel of several pushes is no sound.
     """
     figures = []
-    for _, recording in recordings:
-        if len(recording.channels) == 1:
-            return []
+    for _, recording in _recordings(folder, rows, settings):
         figures.append([_push_and_level(each, recording.sample_rate) for each in recording.channels])
-    if len({len(each) for each in figures}) != 1:
+        if not 1 < len(figures[-1]) == len(figures[0]):
+            return []
+    if not figures:
         return []
     shares, above = np.array(figures).transpose(2, 0, 1)
     proposals, sounds = [], list(range(shares.shape[1]))
-    hammers = np.flatnonzero(shares.min(axis=0) >= MIN_PUSH_SHARE)
+    hammers = np.flatnonzero(shares.min(axis=0) >= _TOLERANCES.push_share)
     if len(hammers) == 1:
         hammer = int(hammers[0])
         sounds.remove(hammer)
@@ -211,48 +198,46 @@ def _push_and_level(channel: Float64[np.ndarray, " frames"], rate: float) -> tup
     return share, -decibels(noise / float(np.abs(channel).max()))
 
 
-def _highpass(recordings: Iterator[tuple[Impact, Recording]], settings: CaptureSettings) -> list[Proposal]:
+def _highpass(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
     """Return the lowest cutoff that removes most of the noise and nothing of the object's.
 
     Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles. Recordings that
     cannot be prepared are passed over; those of different rates, which are refused as a capture, show nothing.
     """
-    rates, durations, noise, low = set(), [], [], []
-    for impact, recording in recordings:
-        try:
-            prepared = prepare(recording, settings, newtons=impact.newtons)
-        except CaptureError:
-            continue
-        rate, onset = recording.sample_rate, prepared.onset
-        rates.add(rate)
-        durations.append(recording.duration)
-        response = recording.response(settings.response_channel, force_channel=settings.force_channel)
-        if prepared.pulse is None and recording.duration * CUTOFFS_HZ[0] >= 1.0:
-            # Sway and drift as loud as the impact hide its onset.
-            onset = find_onset(remove_rumble(response, CUTOFFS_HZ[0], recording), sample_rate=rate)
-        lead = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
-        later = _powers_below(response[onset : onset + round(settings.kept_seconds(rate) * rate)], rate)
-        if len(lead) >= MIN_LEAD_SECONDS * rate:
-            noise.append(np.array([_powers_below(lead, rate), later]) / float(np.abs(response).max()) ** 2)
-        # Digital silence, as after a click at the start, has no rumble.
-        low.append(later[0] / later[-1] if later[-1] else 0.0)
+    lowest, rates, durations, noise, low = _TOLERANCES.cutoffs_hz[0], set(), [], [], []
+    for impact, recording in _recordings(folder, rows, settings):
+        with suppress(CaptureError):
+            rate, prepared = recording.sample_rate, prepare(recording, settings, newtons=impact.newtons)
+            response = recording.response(settings.response_channel, force_channel=settings.force_channel)
+            onset, response = prepared.onset, response / float(np.abs(response).max())
+            if prepared.pulse is None and recording.duration * lowest >= 1.0:
+                # Sway and drift as loud as the impact hide its onset.
+                onset = find_onset(remove_rumble(response, lowest, recording), sample_rate=rate)
+            lead = response[: max(0, onset - round(SECONDS_BEFORE * rate))]
+            later = _powers_below(response[onset : onset + round(settings.kept_seconds(rate) * rate)], rate)
+            rates.add(rate)
+            durations.append(recording.duration)
+            noise += [(_powers_below(lead, rate), later)] if len(lead) >= _TOLERANCES.lead_seconds * rate else []
+            # Digital silence, as after a click at the start, has no rumble.
+            low.append(later[0] / later[-1] if later[-1] else 0.0)
     if len(rates) != 1 or len(durations) < 2:
         return []
-    if min(rates) >= MIN_AUDIO_RATE_HZ and (share := float(np.median(low))) > MAX_LOW_SHARE:
+    if min(rates) >= _TOLERANCES.audio_rate_hz and (share := float(np.median(low))) > _TOLERANCES.low_share:
         reason = (
-            f"{share:.0%} of the energy after the impacts lies below {CUTOFFS_HZ[0]:g} Hz: drift, sway or a "
-            "sensor that settles. Leave it out if the object itself vibrates there."
+            f"{share:.0%} of the energy after the impacts lies below {lowest:g} Hz: drift, sway or a sensor that "
+            "settles. Leave it out if the object itself vibrates there."
         )
-        return [Proposal("highpass", CUTOFFS_HZ[0], reason)]
+        return [Proposal("highpass", lowest, reason)]
     if len(noise) < len(durations) / 2:
         return []
     (*below, total), (*after, _) = np.mean(noise, axis=0)
     left, chosen = total, None
-    for cutoff, lower, later_lower in zip(CUTOFFS_HZ, below, after, strict=True):
+    for cutoff, lower, later_lower in zip(_TOLERANCES.cutoffs_hz, below, after, strict=True):
         rest = max(total - lower, 1e-12 * total)
-        if cutoff * min(durations) >= 1.0 and later_lower <= MIN_FALL * lower and left / rest >= MIN_FALL:
+        silent = later_lower <= _TOLERANCES.fall * lower
+        if cutoff * min(durations) >= 1.0 and silent and left / rest >= _TOLERANCES.fall:
             chosen, left = cutoff, rest
-    if chosen is None or total < MIN_NOISE_SHARE:
+    if chosen is None or total < _TOLERANCES.noise_share:
         return []
     reason = (
         f"Before the impacts, an offset or rumble below {chosen:g} Hz is most of the noise: without it, noise is "
@@ -262,9 +247,15 @@ def _highpass(recordings: Iterator[tuple[Impact, Recording]], settings: CaptureS
     return [Proposal("highpass", chosen, reason)]
 
 
+def _recordings(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> Iterator[tuple[Impact, Recording]]:
+    """Yield what can be read of a folder."""
+    issues = Issues(collect=True)
+    yield from read_recordings(folder, parse_rows(rows, settings, issues), issues)
+
+
 def _powers_below(signal: Float64[np.ndarray, " samples"], rate: float) -> Float64[np.ndarray, " limits"]:
-    """Return the mean squares of what lies below each of `CUTOFFS_HZ`, and of all."""
+    """Return the mean squares of what lies below each of the cutoffs, and of all."""
     power = np.abs(np.fft.rfft(signal) / len(signal)) ** 2
     power[1 : (len(signal) + 1) // 2] *= 2.0
     frequency = np.fft.rfftfreq(len(signal), 1.0 / rate)
-    return np.array([power[frequency < limit].sum() for limit in (*CUTOFFS_HZ, np.inf)])
+    return np.array([power[frequency < limit].sum() for limit in (*_TOLERANCES.cutoffs_hz, np.inf)])
