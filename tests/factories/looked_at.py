@@ -34,7 +34,7 @@ def views_of(
 
 def depth_of(mesh: trimesh.Trimesh, *, behind: float = 0.0) -> DepthMap:
     """Return what gives the depth of a mesh, or of what lies `behind` it, meters."""
-    tracer = MeshTracer(TexturedMesh.plain(surface_of(mesh)))
+    tracer = MeshTracer(surface_of(mesh))
 
     def depth(camera: Camera) -> torch.Tensor:
         found = tracer.depth(camera)

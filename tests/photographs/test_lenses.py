@@ -10,7 +10,7 @@ from scipy.optimize import fsolve
 from avmsf.errors import CaptureError
 from avmsf.photographs import read_views
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.lenses import Lens, Location, straighten
+from avmsf.photographs.lenses import Lens, Location, undistort
 from factories.raising import raises
 from factories.views_folder import quaternion, ring, write_image
 
@@ -91,7 +91,7 @@ def taken(request: pytest.FixtureRequest) -> tuple[Lens, Project, np.ndarray]:
 
 def test_straight_pictures_show_the_scene_of_a_pinhole(taken: tuple[Lens, Project, np.ndarray]) -> None:
     lens, _, image = taken
-    straight, pinhole = straighten(image, lens)
+    straight, pinhole = undistort(image, lens)
     error = np.abs(straight.reshape(-1, 3).astype(float) - scene(plane_points(pinhole)))
     # Bilinear interpolation of such waves errs by 1 level on average; without its half pixel it errs by 5.
     assert error.mean() < 1.5
@@ -101,7 +101,7 @@ def test_straight_pictures_show_the_scene_of_a_pinhole(taken: tuple[Lens, Projec
 
 def test_every_pixel_shows_something_and_little_is_lost(taken: tuple[Lens, Project, np.ndarray]) -> None:
     lens, project, image = taken
-    _, pinhole = straighten(image, lens)
+    _, pinhole = undistort(image, lens)
 
     def beyond(zoom: float) -> float:
         """By how many pixels the pinhole, zoomed out, reaches past the lens's outermost pixel centers."""
@@ -115,17 +115,17 @@ def test_every_pixel_shows_something_and_little_is_lost(taken: tuple[Lens, Proje
     assert beyond(0.99) > 0.1
 
 
-def test_masks_are_straightened_alike(taken: tuple[Lens, Project, np.ndarray]) -> None:
+def test_masks_are_undistorted_alike(taken: tuple[Lens, Project, np.ndarray]) -> None:
     lens, _, image = taken
     mask = np.where(image[..., 0] > 127, 255, 0).astype(np.uint8)
-    straight, _ = straighten(np.repeat(mask[..., None], 4, axis=2), lens)
+    straight, _ = undistort(np.repeat(mask[..., None], 4, axis=2), lens)
     assert np.array_equal(straight[..., 3], straight[..., 1])
 
 
 def test_a_pinhole_is_left_as_it_is() -> None:
     image = scene(plane_points(Lens(FOCAL, CENTER, WIDTH, HEIGHT))).reshape(HEIGHT, WIDTH, 3)
     lens = Lens(FOCAL, CENTER, WIDTH, HEIGHT, (0.0, 0.0, 0.0, 0.0, 0.0))
-    straight, pinhole = straighten(image, lens)
+    straight, pinhole = undistort(image, lens)
     assert np.array_equal(straight, image)
     assert (pinhole.focal, pinhole.principal) == (FOCAL, CENTER)
 
@@ -136,9 +136,9 @@ def test_coefficients_that_fold_the_image_are_zoomed_away_or_refused(distortion:
     lens = Lens((14.0, 14.0), (32.0, 24.0), WIDTH, HEIGHT, distortion, origin=Location("cameras.txt", item="camera 3"))
     image = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
     with raises(CaptureError, file="cameras.txt", name="distortion", value=distortion):
-        straighten(image, lens)
+        undistort(image, lens)
     milder = Lens((54.0, 54.0), (32.0, 24.0), WIDTH, HEIGHT, (-0.9, 0.0, 0.0, 0.0, 0.0))
-    _, pinhole = straighten(image, milder)
+    _, pinhole = undistort(image, milder)
     assert np.square(plane_points(pinhole)).sum(axis=0).max() < 1 / 2.7
 
 

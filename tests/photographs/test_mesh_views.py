@@ -58,7 +58,7 @@ def test_a_spheres_silhouette_has_the_area_of_its_cone() -> None:
 
 def test_depth_of_a_sphere() -> None:
     camera = facing(96, focal=200.0, distance=DISTANCE)
-    depth = MeshTracer(sphere()).depth(camera)
+    depth = MeshTracer(sphere().surface).depth(camera)
     rays = camera.rays()
     along = rays[..., 2] * DISTANCE
     under = along.square() - DISTANCE**2 + RADIUS**2
@@ -167,21 +167,20 @@ def test_smooth_where_it_is_round_and_sharp_at_edges() -> None:
 def test_both_sides_are_seen_in_the_light_of_their_front() -> None:
     for flip in ([0, 1, 2], [0, 2, 1]):
         mesh = TexturedMesh.build(torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), torch.tensor([flip]))
-        assert MeshTracer(mesh).depth(facing(9))[4, 4].item() == pytest.approx(1.0, abs=1e-12)
+        assert MeshTracer(mesh.surface).depth(facing(9))[4, 4].item() == pytest.approx(1.0, abs=1e-12)
         (view,) = render_views(mesh, [facing(9)], ambient=0.0)
         assert np.allclose(view.image[4, 4].numpy(), 255 * GRAY * (1 - SKY[2]) / 2, atol=0.51)
 
 
 def test_no_ray_slips_through_between_faces() -> None:
-    depth = MeshTracer(sphere(4)).depth(facing(400, focal=1900.0, distance=DISTANCE))
+    depth = MeshTracer(sphere(4).surface).depth(facing(400, focal=1900.0, distance=DISTANCE))
     assert bool(torch.isfinite(depth).all())
 
 
 def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
     near = sphere(3)
     away = torch.tensor([3000.0, -2000.0, 500.0], dtype=torch.float64)
-    moved = TexturedMesh.plain(Surface(near.vertices, near.faces))
-    object.__setattr__(moved, "vertices", near.vertices.double() + away)
+    moved = Surface(near.vertices.double() + away, near.faces)
     camera = facing(48, focal=150.0, distance=DISTANCE)
     pose = camera.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ away
@@ -192,7 +191,7 @@ def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
 
 def test_a_camera_inside_and_one_that_looks_away() -> None:
     inside = Camera(torch.eye(4, dtype=torch.float64), (20.0, 20.0), (16.0, 16.0), 32, 32)
-    assert bool(torch.isfinite(MeshTracer(sphere(2)).depth(inside)).all())
+    assert bool(torch.isfinite(MeshTracer(sphere(2).surface).depth(inside)).all())
     away = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)), (20.0, 20.0), (16.0, 16.0), 32, 32)  # fmt: skip  # noqa: E501
     pose = away.world_to_camera.clone()
     pose[2, 3] = -1.0

@@ -13,7 +13,6 @@ from avmsf.cli import main
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
-from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.pipeline.frame_check import check_outlines, compare_outlines, expect_contacts_in_views
@@ -30,13 +29,13 @@ def scaled(factor: float) -> Surface:
 
 
 def test_a_mesh_agrees_with_pictures_of_it_and_a_larger_one_differs_by_its_area() -> None:
-    tracer = MeshTracer(TexturedMesh.plain(slab()))
+    tracer = MeshTracer(slab())
     # A mask has the pixels that are more than half covered, an outline those whose middle is.
     assert compare_outlines(tracer, VIEWS).difference < 0.01
     # Half the outline's area more; all cameras look from afar at its middle, to which the mesh is moved.
     middle = (slab().vertices.amax(0) + slab().vertices.amin(0)) / 2
     grown = Surface(1.5**0.5 * (slab().vertices - middle) + middle, slab().faces)
-    found = compare_outlines(MeshTracer(TexturedMesh.plain(grown)), VIEWS)
+    found = compare_outlines(MeshTracer(grown), VIEWS)
     assert found.difference == pytest.approx(1 / 3, abs=0.04)
     assert found.size == pytest.approx(1.5**0.5, rel=0.05)
     assert 0 < found.beyond < found.difference

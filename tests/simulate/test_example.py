@@ -7,7 +7,6 @@ import torch
 from avmsf.capture import read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.photographs import read_views
@@ -58,6 +57,6 @@ def test_the_example_shows_its_shape_in_photographs_alone() -> None:
     assert float(nearest(contacts.numpy()).distances.max()) < 1e-6  # meters
     for view in read_views(EXAMPLE_FOLDER)[::12]:
         assert view.mask is not None
-        depth = MeshTracer(TexturedMesh.plain(shape)).depth(view.camera)
+        depth = MeshTracer(shape).depth(view.camera)
         # Masks are smooth at outlines: a pixel there may be on either side.
         assert float((torch.isfinite(depth) != (view.mask > 127)).float().mean()) < 0.005

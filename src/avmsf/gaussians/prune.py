@@ -61,11 +61,7 @@ def keep_object(
 def _masks_agree(
     points: Float[Tensor, "points 3"], views: Sequence[View], *, wrong_fraction: float
 ) -> Bool[Tensor, " points"]:
-    """Return which points at most `wrong_fraction` of the views with them in their image see outside of their mask.
-
-    Views without a mask, or with an empty one, do not vote; a point that no view sees is not on the object, where some
-    view could have.
-    """
+    """Return which points at most `wrong_fraction` of the views with them in their image see outside of their mask."""
     device, points = points.device, points.cpu()
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _MASK_MARGIN_PIXELS + 1,) * 2)
     seen, against, voters = torch.zeros(len(points)), torch.zeros(len(points)), 0

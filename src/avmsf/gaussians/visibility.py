@@ -16,7 +16,6 @@ from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.mesh.surface import Surface
-from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import MeshTracer
 
@@ -96,7 +95,7 @@ def depth_of_surface(surface: Surface) -> DepthMap:
         wanted, got = "triangles, which can hide points from a camera", f"{len(surface.vertices)} points alone"
         advice = "compute the features of Gaussians instead, or give a mesh"
         raise SceneError.expected(wanted, 0, got=got, name="surface", advice=advice)
-    tracer = MeshTracer(TexturedMesh.plain(surface))
+    tracer = MeshTracer(surface)
 
     def cast(camera: Camera) -> Float[Tensor, "height width"]:
         depth = tracer.depth(camera)

@@ -88,7 +88,7 @@ class Lens:
         return replace(self, focal=same.focal, principal=same.principal, width=width, height=height)
 
 
-def straighten(
+def undistort(
     pixels: UInt8[np.ndarray, "height width channels"], lens: Lens
 ) -> tuple[UInt8[np.ndarray, "height width channels"], Camera]:
     """Return an image, mask included, as a pinhole at the origin would have taken it, and that pinhole.

@@ -49,20 +49,11 @@ class _Hits(NamedTuple):
 
 
 class MeshTracer:
-    """A mesh made ready for rays (by Embree, on the CPU)."""
+    """A surface's triangles made ready for the rays of cameras (by Embree, on the CPU)."""
 
-    def __init__(self, mesh: TexturedMesh) -> None:
-        self.vertices, self.faces = mesh.vertices.double().numpy(), mesh.faces.numpy()
-        self.normals, self.colors = mesh.normals.numpy(), mesh.colors.numpy()
-        self.coordinates, self.materials = mesh.coordinates.numpy(), mesh.materials.numpy()
-        self.atlas = TextureAtlas([texture.numpy() for texture in mesh.textures])
-        corners = self.vertices[self.faces]
-        self.caster = RayCaster(corners)
-        pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
-        across, down = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
-        texels = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
-        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        self.texels_per_meter = np.sqrt(texels / np.maximum(doubled, 1e-30))
+    def __init__(self, surface: Surface) -> None:
+        self.vertices, self.faces = surface.vertices.double().numpy(), surface.faces.numpy()
+        self.caster = RayCaster(self.vertices[self.faces])
 
     def depth(self, camera: Camera) -> Float[Tensor, "height width"]:
         """Return the depth of the face behind the center of each pixel, meters along the optical axis.
@@ -70,28 +61,11 @@ class MeshTracer:
         Float64; infinite where there is no face.
         """
         depth = np.full((camera.height, camera.width), np.inf)
-        for hits in self._cast(camera):
+        for hits in self.cast(camera):
             depth[hits.rows, hits.columns] = hits.depth
         return torch.from_numpy(depth)
 
-    def view(
-        self, camera: Camera, *, name: str, ambient: float, background: tuple[float, float, float], supersample: int
-    ) -> View:
-        """Render one view as `render_views` does."""
-        fine = camera.resized(camera.width * supersample, camera.height * supersample)
-        count = camera.width * camera.height
-        sums = np.zeros((4, count))
-        for hits in self._cast(fine):
-            pixel = hits.rows // supersample * camera.width + hits.columns // supersample
-            for total, weights in zip(sums, [*self._colors(hits, fine, ambient).T, None], strict=True):
-                total += np.bincount(pixel, weights=weights, minlength=count)
-        color, covered = sums[:3].T / supersample**2, sums[3:].T / supersample**2
-        image = np.clip(color + (1 - covered) * np.asarray(background), 0, 1)
-        pixels = np.rint(255 * np.hstack([image, covered])).astype(np.uint8).reshape(camera.height, camera.width, 4)
-        color, mask = np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
-        return View(name, torch.from_numpy(color), camera, torch.from_numpy(mask))
-
-    def _cast(self, camera: Camera) -> Iterator[_Hits]:
+    def cast(self, camera: Camera) -> Iterator[_Hits]:
         """Cast a ray through each pixel of the rectangle that the mesh fills, a band of rows at a time."""
         left, top, right, bottom = self._rectangle(camera)
         if right <= left:
@@ -130,6 +104,39 @@ class MeshTracer:
         left, top = (max(0, math.floor(value)) for value in low)
         right, bottom = min(camera.width, math.ceil(high[0])), min(camera.height, math.ceil(high[1]))
         return left, top, max(left, right), max(top, bottom)
+
+
+class _Painter:
+    """A mesh's colors, and the light on it, where rays meet it."""
+
+    def __init__(self, mesh: TexturedMesh) -> None:
+        self.tracer = MeshTracer(mesh.surface)
+        self.normals, self.colors = mesh.normals.numpy(), mesh.colors.numpy()
+        self.coordinates, self.materials = mesh.coordinates.numpy(), mesh.materials.numpy()
+        self.atlas = TextureAtlas([texture.numpy() for texture in mesh.textures])
+        corners = self.tracer.vertices[self.tracer.faces]
+        pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
+        across, down = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
+        texels = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
+        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self.texels_per_meter = np.sqrt(texels / np.maximum(doubled, 1e-30))
+
+    def view(
+        self, camera: Camera, *, name: str, ambient: float, background: tuple[float, float, float], supersample: int
+    ) -> View:
+        """Render one view as `render_views` does."""
+        fine = camera.resized(camera.width * supersample, camera.height * supersample)
+        count = camera.width * camera.height
+        sums = np.zeros((4, count))
+        for hits in self.tracer.cast(fine):
+            pixel = hits.rows // supersample * camera.width + hits.columns // supersample
+            for total, weights in zip(sums, [*self._colors(hits, fine, ambient).T, None], strict=True):
+                total += np.bincount(pixel, weights=weights, minlength=count)
+        color, covered = sums[:3].T / supersample**2, sums[3:].T / supersample**2
+        image = np.clip(color + (1 - covered) * np.asarray(background), 0, 1)
+        pixels = np.rint(255 * np.hstack([image, covered])).astype(np.uint8).reshape(camera.height, camera.width, 4)
+        color, mask = np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
+        return View(name, torch.from_numpy(color), camera, torch.from_numpy(mask))
 
     def _colors(self, hits: _Hits, camera: Camera, ambient: float) -> np.ndarray:
         """Return the color of each hit, 0 to 1."""
@@ -170,10 +177,10 @@ def render_views(
         raise CaptureError.expected("a supersample of at least 1", supersample, name="supersample")
     if not all(0 <= value <= 1 for value in background):
         raise CaptureError.expected("numbers from 0 to 1", background, name="background")
-    tracer, views = MeshTracer(mesh), []
+    painter, views = _Painter(mesh), []
     for number, camera in enumerate(cameras):
         name = f"view_{number:03d}"
-        views.append(tracer.view(camera, name=name, ambient=ambient, background=background, supersample=supersample))
+        views.append(painter.view(camera, name=name, ambient=ambient, background=background, supersample=supersample))
         if progress is not None:
             progress(number + 1, len(cameras))
     return tuple(views)

@@ -192,11 +192,7 @@ def _name(file: str, image: Path) -> str:
 
 
 def _rigid_pose(frame: dict[str, Any], where: Location) -> tuple[Float[np.ndarray, "4 4"], float]:
-    """Return a frame's camera-to-world matrix, of 4 rows or 3, made exactly rigid, and the scale of its rotation.
-
-    A scale that is the same along all axes does not move the camera and is removed; the caller warns of it. Raises
-    CaptureError, at `where`, for anything else that is not a rotation with a position.
-    """
+    """Return a frame's camera-to-world matrix, made exactly rigid, and the scale that its rotation had on all axes."""
     key, wanted = "transform_matrix", "the camera-to-world pose as 4 rows of 4 numbers"
     written = frame.get(key)
     try:

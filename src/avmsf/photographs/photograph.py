@@ -15,7 +15,7 @@ from avmsf.capture.filenames import pictures_in
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs.cameras import View
 from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, scale, size_of
-from avmsf.photographs.lenses import Lens, straighten
+from avmsf.photographs.lenses import Lens, undistort
 
 MAX_PHOTOGRAPHS = 10_000
 """Photographs of one object: a video of five minutes, frame by frame. Splatting uses some hundreds."""
@@ -103,7 +103,7 @@ def read_view(
         findings["missing images"].append(photograph.name)
         return None
     pixels, lens = _with_lens(photograph, pixels, findings)
-    pixels, camera = straighten(_with_mask(photograph, folder, pixels, findings), lens)
+    pixels, camera = undistort(_with_mask(photograph, folder, pixels, findings), lens)
     if longest is not None and max(size_of(pixels)) > longest:
         width, height = (max(1, round(side * longest / max(size_of(pixels)))) for side in size_of(pixels))
         pixels, camera = scale(pixels, width, height), camera.resized(width, height)

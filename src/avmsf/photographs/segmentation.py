@@ -70,7 +70,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
         view.foreground if view.mask is not None else _large_parts(distances[index] > cut)
         for index, view in enumerate(views)
     ]
-    _refuse_few(masks)
+    _check_found(masks)
     cameras = [view.camera for view in views]
     for _ in range(ROUNDS):
         outlines = _outlines(masks, cameras)
@@ -82,7 +82,7 @@ def find_foreground(views: Sequence[View]) -> tuple[View, ...]:
             masks[index] = _agreed(distances[index], cut, *outlines[index])
     for index in bare:
         masks[index] = _trimmed(masks[index], distances[index])
-    _refuse_few(masks)
+    _check_found(masks)
     empty = [view.name for view, mask in zip(views, masks, strict=True) if view.mask is None and not mask.any()]
     if empty:
         message = f"{counted(len(empty), 'view')} not used, without an object: {listed(empty)}"
@@ -167,7 +167,7 @@ def _check_plain(different: Sequence[Mask], names: Sequence[str]) -> None:
         raise CaptureError.expected("a plain background", share, got=got, name="background", advice=advice)
 
 
-def _refuse_few(masks: Sequence[Mask]) -> None:
+def _check_found(masks: Sequence[Mask]) -> None:
     found = sum(bool(mask.any()) for mask in masks)
     if found < MIN_VIEWS:
         wanted = f"an object in front of a plain background in at least {MIN_VIEWS} views"

@@ -82,11 +82,7 @@ def estimate_cameras(
 
 
 def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]:
-    """Put links to the images and their masks where COLMAP expects them.
-
-    Returns the images' names by those that they have there, and the names of those that cannot be read. Raises
-    CaptureError for too few images, and for images of different sizes.
-    """
+    """Put images and masks where COLMAP expects them; return their names by those there, and the unreadable ones."""
     names, unreadable, sizes = {}, [], {}
     for path in pictures_in(images, deep=True):
         name = path.relative_to(images).as_posix()
@@ -177,10 +173,7 @@ def _stage_and_lines(log: Path, count: int = 6) -> tuple[str, str]:
 def _check_groups(
     groups: Sequence[Sequence[str]], unreadable: Sequence[str], everything: Sequence[str], images: Path
 ) -> list[Remark]:
-    """Return remarks on images that cannot be read, that form groups apart, and that got no camera.
-
-    `groups` are the images of each model, the largest first. Raises CaptureError where that has less than half of all.
-    """
+    """Return remarks on the images without a camera in the first and largest group; raise CaptureError for too many."""
     largest = set(groups[0]) if groups else set()
     if len(largest) < max(MIN_IMAGES, MIN_REGISTERED_RATIO * len(everything)):
         lacking = [name for name in everything if name not in largest]

@@ -16,7 +16,6 @@ from avmsf.capture.settings import CaptureSettings, unit_named
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.gaussians.points import farthest_points
 from avmsf.mesh.surface import Surface
-from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.folder import check_cameras
 from avmsf.photographs.mesh_views import MeshTracer
@@ -76,7 +75,7 @@ def check_outlines(surface: Surface, views: Sequence[View], settings: CaptureSet
     chosen = _masked(views)
     if not chosen or not len(surface.faces):
         return None
-    tracer = MeshTracer(TexturedMesh.plain(surface))
+    tracer = MeshTracer(surface)
     found = compare_outlines(tracer, chosen)
     if found.beyond <= BEYOND:
         return None

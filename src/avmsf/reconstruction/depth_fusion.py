@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy import ndimage
 
-from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.photographs.visual_hull import Grid, project_votes
@@ -59,7 +58,7 @@ def _bias(
 
     Most of a surface touches its hull; the depth of cavities lies behind it by lengths of all kinds.
     """
-    tracer = MeshTracer(TexturedMesh.plain(closed_surface(hull, grid, _BIAS_FACES)))
+    tracer = MeshTracer(closed_surface(hull, grid, _BIAS_FACES))
     behind, step = [], max(1, len(depths) // _BIAS_VIEWS)
     for depth, camera in zip(depths[::step], cameras[::step], strict=True):
         front = tracer.depth(camera).numpy()

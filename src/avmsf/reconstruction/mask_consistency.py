@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 
-from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.photographs.visual_hull import Grid
@@ -75,7 +74,7 @@ def consistent_masks(views: Sequence[View], outlines: Sequence[Outline], grid: G
         return ~inconsistent
     # Half a cell larger, for cells are coarse.
     values = np.maximum(values + 0.5 * np.float32(grid.spacing), -grid.spacing)
-    tracer = MeshTracer(TexturedMesh.plain(closed_surface(values, grid)))
+    tracer = MeshTracer(closed_surface(values, grid))
     beyond = np.array([_beyond(view, each, tracer) for view, each in zip(views, outlines, strict=True)])
     shown = beyond > max(_MAX_BEYOND, _MIN_MEDIAN_RATIO * float(np.median(beyond)))
     return ~(inconsistent & (shown | (cut > _MAX_LEFT_OUT_ALONE)))
