@@ -83,7 +83,7 @@ def test_a_missing_file_is_named_and_guessed(tmp_path: Path) -> None:
 
 def test_a_sound_file_of_no_capture_is_guessed_too(tmp_path: Path) -> None:
     fill(tmp_path)
-    for name, near in (("a1.wav", None), ("aa.wav", "a.wav"), ("takes/a.wav", None)):
+    for name, near in (("other.wav", None), ("aa.wav", "a.wav"), ("takes/a.wav", None)):
         with raises(CaptureError, file=tmp_path / name, value=near):
             read_recording(tmp_path / name)
 
