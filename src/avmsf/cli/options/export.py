@@ -28,15 +28,6 @@ _USED: dict[Format, tuple[str, ...]] = {
 """Options that each format uses, in addition to those that all use."""
 CHOOSING = frozenset(name for name, used in _USED.items() if "position" in used)
 """Formats whose contacts can be given."""
-_OUTPUTS: dict[Format, NewFile | NewFolder] = {
-    "web": NewFile(SUFFIXES["web"], or_folder=True),
-    "gltf": NewFile(SUFFIXES["gltf"]),
-    "faust": NewFile(SUFFIXES["faust"]),
-    "avmsf-demo": NewFolder(),
-    "wavs": NewFolder(),
-    "uff": NewFile(SUFFIXES["uff"]),
-}
-"""What each format writes."""
 _OF_SOME = {name for used in _USED.values() for name in used}
 
 
@@ -123,9 +114,9 @@ class Options(Printing):
                 raise ExportError.expected("finite coordinates", list(place), row=row, name="--position")
         if self.contacts is not None and self.contacts < 1:
             raise ExportError.expected("1 or more", self.contacts, name="--contacts")
-        _OUTPUTS[self.to].check(self.output)
         # A web page is a file or, by a name without its suffix, a folder.
-        suffixes = getattr(_OUTPUTS[self.to], "suffixes", ())
+        suffixes = SUFFIXES.get(self.to, ())
+        (NewFile(suffixes, or_folder=self.to == "web") if suffixes else NewFolder()).check(self.output)
         check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
         FIELD.read_record(self.field)
 
