@@ -146,15 +146,6 @@ def test_wavs_without_noise_are_the_modes(field_file: Path, tmp_path: Path, caps
     np.testing.assert_allclose(sound, scale * modes.numpy(), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["a.dsp", "a.lib", "a.uff"])
-def test_other_formats_say_their_size(name: str, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    to = "uff" if name == "a.uff" else "faust"
-    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--contacts", "5"]
-    assert main(words) == 0
-    size = sum(path.stat().st_size for path in tmp_path.iterdir())
-    assert f"{to}, {size / 1e6:.3g} MB, " in capsys.readouterr().out
-
-
 def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     words = ["export", str(field_file), "--contacts", "7", "--to"]
     assert main([*words, "faust", "--output", str(tmp_path / "a.dsp"), "--json"]) == 0
@@ -244,12 +235,15 @@ def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys
         ("avmsf-demo", "demo", "demo"),
     ],
 )
-def test_what_follows_names_what_was_written(
+def test_the_size_is_said_and_what_follows_names_what_was_written(
     to: str, name: str, named: str, field_file: Path, tmp_path: Path, capsys: Streams
 ) -> None:
     words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--contacts", "4"]
     assert main([*words, *(["--forces", "1", "2", "--seconds", "0.01"] if to == "wavs" else [])]) == 0
-    (following,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("next: ")]
+    out, err = capsys.readouterr()
+    size = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
+    assert f"{to}, {size / 1e6:.3g} MB, " in out
+    (following,) = [line for line in err.splitlines() if line.startswith("next: ")]
     assert named in following
     assert "avmsf" not in following.replace(str(tmp_path), "")
 
@@ -266,12 +260,21 @@ def refused(words: list[str]) -> AvmsfError:
     return caught.value
 
 
-@pytest.mark.parametrize(("to", "name"), [("wavs", "s2.wav"), ("avmsf-demo", "bowl.ZIP"), ("web", "page.glb")])
-def test_a_files_name_is_no_folders(to: str, name: str, field_file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("to", "name"),
+    [
+        *(("wavs", "s2.wav"), ("avmsf-demo", "bowl.ZIP"), ("web", "page.glb")),
+        *(("gltf", "a.wav"), ("faust", "a"), ("uff", "a.txt")),
+    ],
+)
+def test_a_wrong_ending_is_refused_before_anything_else_is_said(
+    to: str, name: str, field_file: Path, tmp_path: Path, capsys: Streams
+) -> None:
     place = tmp_path / name
     error = refused([str(field_file), "--to", to, "--output", str(place)])
     assert (error.file, error.name, error.value) == (place, "suffix", place.suffix)
     assert list(tmp_path.iterdir()) == []
+    assert capsys.readouterr().err == ""
 
 
 def test_a_folder_may_have_a_dot_in_its_name(field_file: Path, tmp_path: Path) -> None:
@@ -280,16 +283,6 @@ def test_a_folder_may_have_a_dot_in_its_name(field_file: Path, tmp_path: Path) -
         words = ["--to", "wavs", "--output", str(tmp_path / name), "--contacts", "1", "--seconds", "0.01"]
         assert main(["export", str(field_file), *words]) == 0
         assert (tmp_path / name / "samples.csv").is_file()
-
-
-@pytest.mark.parametrize(("to", "name"), [("gltf", "a.wav"), ("faust", "a"), ("uff", "a.txt")])
-def test_a_wrong_ending_is_refused_before_anything_else_is_said(
-    to: str, name: str, field_file: Path, tmp_path: Path, capsys: Streams
-) -> None:
-    place = tmp_path / name
-    error = refused([str(field_file), "--to", to, "--output", str(place)])
-    assert (error.file, error.name, error.value) == (place, "suffix", place.suffix)
-    assert capsys.readouterr().err == ""
 
 
 def test_what_cannot_be_exported_is_said(field_file: Path, tmp_path: Path) -> None:

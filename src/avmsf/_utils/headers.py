@@ -88,8 +88,20 @@ class FileKind:
 
     def unreadable(self, path: Path) -> AvmsfError:
         """Return the error of a file that safetensors cannot read."""
-        found, helps = _guess(path, self.advice)
-        return self.error.expected(self.what, found, got=found, file=path, advice=helps)
+        try:
+            with open(path, "rb") as file:
+                start = file.read(9)
+            # Eight bytes of length, then the header's opening brace.
+            if not start or start[8:] == b"{":
+                found = "a truncated or damaged file" if start else "an empty file"
+                advice = f"copy it again, or {self.advice}"
+            else:
+                found, advice = f"a file that starts with {start[:8]!r}", f"name another, or {self.advice}"
+        except IsADirectoryError:
+            found, advice = "a folder", "name the file in it"
+        except OSError as error:
+            found, advice = f"an unreadable file ({error.strerror})", "check its permissions"
+        return self.error.expected(self.what, found, got=found, file=path, advice=advice)
 
     def damaged(self, path: Path, error: Exception, *, name: str | None = None) -> AvmsfError:
         """Return the error of a file whose record or tensors raised another one, about `name` if that names nothing."""
@@ -110,20 +122,3 @@ def read_metadata(path: Path) -> dict[str, str]:
             return dict(file.metadata() or {})
     except SafetensorError as error:
         raise ValueError(str(error)) from error
-
-
-def _guess(path: Path, advice: str) -> tuple[str, str]:
-    """Return what a file is that safetensors cannot read, and what to do."""
-    if path.is_dir():
-        return "a folder", "name the file in it"
-    try:
-        with open(path, "rb") as file:
-            start = file.read(9)
-    except OSError as error:
-        return f"an unreadable file ({error.strerror})", "check its permissions"
-    if not start:
-        return "an empty file", f"copy it again, or {advice}"
-    # Eight bytes of length, then the header's opening brace.
-    if start[8:] == b"{":
-        return "a truncated or damaged file", f"copy it again, or {advice}"
-    return f"a file that starts with {start[:8]!r}", f"name another, or {advice}"

@@ -32,8 +32,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: str, kind: Fi
     """Write a safetensors file, whole or not at all. Raises the kind's error."""
     # Safetensors refuses tensors that share memory.
     copies = {name: each.detach().cpu().clone(memory_format=torch.contiguous_format) for name, each in tensors.items()}
-    content = save(copies, {kind.key: text})
-    write_whole(path, content, raising=kind.error)
+    write_whole(path, save(copies, {kind.key: text}), raising=kind.error)
 
 
 def expect_tensors(tensors: Mapping[str, Tensor], skeleton: Mapping[str, Tensor], path: Path, kind: FileKind) -> None:
