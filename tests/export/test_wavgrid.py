@@ -67,6 +67,13 @@ def test_the_instrument_plays_every_file_at_its_key(tmp_path):
     assert all((tmp_path / "grid" / region["sample"]).is_file() for region in regions)
 
 
+def test_a_sound_holds_no_time_of_writing_so_that_equal_sounds_are_equal_files(tmp_path):
+    write_grid(table(), tmp_path / "grid", contacts=1)
+    content = (tmp_path / "grid" / "sounds" / "001-1.wav").read_bytes()
+    start = content.index(b"PEAK")
+    assert content[start + 12 : start + 16] == bytes(4)
+
+
 def played(folder: Path) -> list[dict[str, str]]:
     """Return the instrument's regions, each with what it takes over from its group."""
     regions, group = [], {}

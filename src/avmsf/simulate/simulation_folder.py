@@ -41,8 +41,6 @@ def write_simulation(
             impacts = replace(capture.impacts, sounds=simulation.recordings, before=None, after=None)
             seconds = capture.settings.seconds if capture.settings.align else None
             write_capture(replace(capture, surface=None, impacts=impacts), begun, onsets_within=seconds)
-            for sound in begun.glob("*.wav"):
-                _zero_wav_timestamp(sound)
             if recipe.surface:
                 write_textured(mesh, begun)
             if recipe.views:
@@ -121,16 +119,6 @@ def _write_pictured(mesh: TexturedMesh, path: Path) -> None:
 def _export(parts: list[trimesh.Trimesh], path: Path) -> None:
     shape = parts[0] if len(parts) == 1 else trimesh.Scene(parts)
     shape.export(path, file_type=path.suffix[1:])
-
-
-def _zero_wav_timestamp(path: Path) -> None:
-    """Set to zero the time of writing that float wav files carry in their PEAK chunk: equal sounds are equal files."""
-    with open(path, "r+b") as file:
-        start = file.read(256).find(b"PEAK")
-        if start >= 0:
-            # Four bytes each of name, length and version stand before it.
-            file.seek(start + 12)
-            file.write(bytes(4))
 
 
 def simulate_set(
