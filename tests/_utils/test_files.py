@@ -1,7 +1,11 @@
-"""Files that cannot be written: advice that fits the system's error."""
+"""Files that cannot be written: advice that fits the system's error, and what was there before."""
 
 import errno
 import os
+import resource
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -79,3 +83,34 @@ def test_a_folder_that_cannot_be_replaced_stays_as_it_was(tmp_path: Path, monkey
     with raises(ExportError), new_folder(tmp_path / "folder", raising=ExportError, replace=True) as begun:
         (begun / "new").touch()
     assert [path.name for path in tmp_path.rglob("*")] == ["folder", "mine"]
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"old")
+    limits, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with raises(ExportError, file=tmp_path / "file") as caught:
+            write_whole(tmp_path / "file", bytes(8192), raising=ExportError)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert isinstance(caught.value.__cause__, OSError)
+    assert caught.value.__cause__.errno == errno.EFBIG
+    assert [(each.name, each.read_bytes()) for each in tmp_path.iterdir()] == [("file", b"old")]
+
+
+def test_a_kill_before_the_last_moment_leaves_the_old_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"old")
+    script = (
+        "import os, signal, sys\nfrom pathlib import Path\nfrom avmsf._utils.files import write_whole\n"
+        "os.replace = lambda *given: os.kill(os.getpid(), signal.SIGKILL)\nwrite_whole(Path(sys.argv[1]), b'new')"
+    )
+    killed = subprocess.run([sys.executable, "-c", script, str(tmp_path / "file")], timeout=60, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert (tmp_path / "file").read_bytes() == b"old"
+    # The half-done file lies hidden beside it, has no name of the user's, and is in no later saving's way.
+    (left,) = [each for each in tmp_path.iterdir() if each.name != "file"]
+    assert left.name.startswith(".file.")
+    write_whole(tmp_path / "file", b"new")
+    assert (tmp_path / "file").read_bytes() == b"new"

@@ -1,14 +1,7 @@
 """A field is one file: it comes back to the last bit, or is refused with a reason."""
 
-import errno
 import json
-import os
-import resource
-import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
@@ -105,76 +98,6 @@ def test_missing_folders_are_made_and_what_is_there_is_replaced(tmp_path):
     save(other_field(), path)
     assert torch.equal(load(path).bank.damping, other_field().bank.damping)
     assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
-
-
-@pytest.mark.parametrize("place", ["file/plate", "."])
-def test_a_place_where_no_file_can_be_is_refused(tmp_path, place):
-    (tmp_path / "file").write_text("not a folder")
-    with raises(FieldFileError, file=tmp_path / place):
-        save(field(), tmp_path / place)
-    assert [each.name for each in tmp_path.iterdir()] == ["file"]
-    assert (tmp_path / "file").read_text() == "not a folder"
-
-
-def in_another_process(script: str, *arguments: object) -> subprocess.Popen[str]:
-    """Start Python on a script that finds `field` and `path`, the second a place where a field may be written."""
-    head = (
-        "import os, signal, sys\n"
-        "from avmsf.field.store import load, save\n"
-        "field, path = load(sys.argv[1]), sys.argv[2]\n"
-    )
-    return subprocess.Popen(
-        [sys.executable, "-c", head + script, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """Let no file grow beyond `size` bytes, as if the disk were full."""
-    limits, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, handler)
-
-
-def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
-    path = tmp_path / "plate.safetensors"
-    save(other_field(), path)
-    before = path.read_bytes()
-    with (
-        files_of_at_most(4096),
-        raises(FieldFileError, file=path) as caught,
-    ):
-        save(field(), path)
-    assert isinstance(caught.value.__cause__, OSError)
-    assert caught.value.__cause__.errno == errno.EFBIG
-    assert path.read_bytes() == before
-    assert [each.name for each in tmp_path.iterdir()] == ["plate.safetensors"]
-
-
-def test_a_kill_before_the_last_moment_leaves_the_old_field(tmp_path):
-    source, path = tmp_path / "source", tmp_path / "there" / "plate.safetensors"
-    save(field(), source)
-    save(other_field(), path)
-    before = path.read_bytes()
-    script = (
-        "import os\ndef die(*given):\n    os.kill(os.getpid(), signal.SIGKILL)\nos.replace = die\nsave(field, path)\n"
-    )
-    process = in_another_process(script, source, path)
-    process.communicate(timeout=60)
-    assert process.returncode == -signal.SIGKILL
-    assert path.read_bytes() == before
-    # The half-done file lies hidden beside it, is none of the user's names, and stands in no later saving's way.
-    (left,) = [each for each in path.parent.iterdir() if each != path]
-    assert left.name.startswith(".plate.safetensors.")
-    save(field(), path)
-    assert torch.equal(load(path).render(CONTACTS), field().render(CONTACTS))
 
 
 Change = Callable[[dict[str, torch.Tensor], dict], None]
