@@ -106,7 +106,7 @@ def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> E
     duration = samples / sample_rate
     expected = f"{SHORTEST} samples or more"
 
-    def failed(got: str, advice: str, name: str, value: float) -> ExtractionError:
+    def failed(got: str, advice: str, name: str, value: float | int) -> ExtractionError:
         return ExtractionError(f"expected {expected}, got {got}; {advice}", name=name, value=value)
 
     if samples < SHORTEST:
