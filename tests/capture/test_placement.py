@@ -156,6 +156,11 @@ def test_contacts_of_another_object_are_not_explained() -> None:
     assert explained <= 1
 
 
+def test_contacts_at_one_position_lie_on_the_surface_or_not() -> None:
+    for offset, fault in ((0.0, "none"), (0.2, "frame")):
+        assert check_placement(CONTACTS[:1].repeat(9, 1) + offset, CLOUD).fault == fault
+
+
 def test_sparse_points_widen_the_tolerance() -> None:
     corners = torch.tensor(trimesh.creation.box((0.2, 0.2, 0.2)).vertices)
     assert check_placement(torch.tensor([[0.1, 0.02, 0.0], [0.0, 0.1, 0.0]]), corners).fault == "none"

@@ -200,9 +200,8 @@ def check_placement(
         spread=float(np.linalg.norm(np.ptp(places, axis=0))),
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
-    resolution = max(spacing, _BOUNDS.resolution * diagonal)
-    search = _Search(tree, _evenly(places, _BOUNDS.max_contacts), placement, resolution)
-    return replace(placement, mismatch=search.find(stated))
+    some, resolution = _evenly(places, _BOUNDS.max_contacts), max(spacing, _BOUNDS.resolution * diagonal)
+    return replace(placement, mismatch=_find_mismatch(tree, some, placement, resolution, stated))
 
 
 def expect_placed(
@@ -225,98 +224,95 @@ def expect_placed(
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """The similarity of the least description length."""
+def _find_mismatch(
+    tree: cKDTree,
+    contacts: Float64[np.ndarray, "contacts 3"],
+    placement: Placement,
+    resolution: float,
+    stated: Sequence[FrameMismatch],
+) -> FrameMismatch | None:
+    """Return the similarity of the least description length; None where that changes nothing.
 
-    tree: cKDTree
-    contacts: Float64[np.ndarray, "contacts 3"]
-    placement: Placement
-    resolution: float
-    """Meters below which contacts lie equally well."""
+    What is `stated` goes first where it leaves most contacts near: what is fitted to few contacts and coarse points
+    describes these better by chance. Below the `resolution`, meters, contacts lie equally well.
+    """
+    widest, tolerance = max(2 * resolution, float(placement.distances.max())), placement.tolerance
+    steps = math.ceil(math.log(widest / resolution, 1.5)) + 1
+    deviations = np.geomspace(resolution, widest, steps)[:, None]
+    anywhere = math.log(max(placement.diagonal, placement.spread)) + _BOUNDS.outlier_nats
 
-    @cached_property
-    def deviations(self) -> Float64[np.ndarray, "steps 1"]:
-        """Standard deviations of distances to choose from, by half as much more each, meters."""
-        widest = max(2 * self.resolution, float(self.placement.distances.max()))
-        steps = math.ceil(math.log(widest / self.resolution, 1.5)) + 1
-        return np.geomspace(self.resolution, widest, steps)[:, None]
+    def distances(mismatch: FrameMismatch) -> np.ndarray:
+        return np.asarray(tree.query(mismatch.undo(contacts))[0])
 
-    def find(self, stated: Sequence[FrameMismatch]) -> FrameMismatch | None:
-        """Return the best similarity; None where that changes nothing.
-
-        What is `stated` goes first where it leaves most contacts near: what is fitted to few contacts and coarse points
-        describes these better by chance.
-        """
-        present, tolerance = self.nats(FrameMismatch()), self.placement.tolerance
-        if present - len(self.contacts) * (math.log(self.resolution) + 0.5) < 1:
-            return None
-        for each in stated:
-            near, far = np.quantile(self.distances(each), (0.5, 0.9)).tolist()
-            if near <= tolerance and math.log(2) + self.nats(each) < present:
-                return replace(each, distance=far)
-        starts = sorted(self.starts(), key=lambda start: start[0] + self.nats(start[1]))[: _BOUNDS.max_starts]
-        fitted = [(nats, self.fit(start, scaled, shifted)) for nats, start, scaled, shifted in starts]
-        for nats, each in sorted(((nats + self.nats(each), each) for nats, each in fitted), key=lambda pair: pair[0]):
-            far = float(np.quantile(self.distances(each), 0.9))
-            # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
-            spread = each.factor * self.placement.spread or math.inf
-            if nats < present and far <= min(max(self.resolution, 0.5 * tolerance), TOLERANCE * spread):
-                return replace(each, distance=far)
-        return None
-
-    def distances(self, mismatch: FrameMismatch) -> Float64[np.ndarray, " contacts"]:
-        return self.tree.query(mismatch.undo(self.contacts))[0]
-
-    def nats(self, mismatch: FrameMismatch) -> float:
-        """Return the nats of the distances that a similarity leaves.
-
-        Each is normal, with a standard deviation chosen for the similarity, or the contact is a mistake of its own and
-        lies anywhere. Distances over the scale make what is shrunk no better than what it was.
-        """
-        diagonal, factor = self.placement.diagonal, mismatch.factor
-        if not factor > 0:
+    def nats(mismatch: FrameMismatch) -> float:
+        # Each distance is normal, with a standard deviation chosen for the similarity, or the contact is a mistake of
+        # its own and lies anywhere. Distances over the scale make what is shrunk no better than what it was, and
+        # contacts within a spot of an object are as unlikely as the spot is small.
+        if not mismatch.factor > 0:
             return math.inf
-        distances = np.maximum(self.distances(mismatch), self.resolution)
-        near = np.square(distances / self.deviations) / 2 + np.log(self.deviations / min(factor, 1.0))
-        anywhere = math.log(max(diagonal, self.placement.spread)) + _BOUNDS.outlier_nats
-        # Contacts within a spot of an object are as unlikely as the spot is small.
-        spot = max(0.0, math.log(_BOUNDS.spot * diagonal / (factor * self.placement.spread or math.inf) or 1.0))
-        return float(np.minimum(near, anywhere).sum(axis=1).min()) + len(distances) * spot
+        left, scale = np.maximum(distances(mismatch), resolution), min(mismatch.factor, 1.0)
+        near = np.square(left / deviations) / 2 + np.log(deviations / scale)
+        spread = mismatch.factor * placement.spread or math.inf
+        spot = max(0.0, math.log(max(_BOUNDS.spot * placement.diagonal / spread, 1.0)))
+        return float(np.minimum(near, anywhere).sum(axis=1).min()) + len(left) * spot
 
-    def starts(self) -> Iterator[tuple[float, FrameMismatch, bool, bool]]:
-        """Yield similarities, the nats of their parameters, and whether their scale and their shift are fitted."""
-        spread, diagonal, count = self.placement.spread, self.placement.diagonal, len(self.contacts)
-        least, most = _BOUNDS.least_spread * diagonal, _BOUNDS.most_spread * diagonal
-        # What is symmetric but for errors of this size does not show which way it lies.
-        off = float(self.placement.distances.max()) > self.placement.tolerance / 2
-        fitting = (factor for factor in FACTORS if factor == 1 or not spread or least <= factor * spread <= most)
-        scales, shifts = [(factor, False) for factor in fitting], [False]
-        if count >= _BOUNDS.fit_contacts:
-            scales += [(factor, True) for factor in (1.0, 0.8 * diagonal / spread, diagonal / spread) if spread]
-            shifts = [False, True]
-        middle, own = ((each.min(axis=0) + each.max(axis=0)) / 2 for each in (self.tree.data, self.contacts))
-        for rarity, axes in _signed_permutations() if off and count >= _BOUNDS.axes_contacts else [(1, np.eye(3))]:
-            for (factor, scaled), shifted in itertools.product(scales, shifts):
-                start = FrameMismatch(factor, axes, (middle - factor * axes @ own) * shifted)
-                # Nothing in meters takes two units.
-                units = 2 if scaled or (factor != 1 and start.unit is None) else int(factor != 1)
-                nats = math.log(rarity) + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
-                yield nats, start, scaled, shifted
+    present = nats(FrameMismatch())
+    if present - len(contacts) * (math.log(resolution) + 0.5) < 1:
+        return None
+    for each in stated:
+        near, far = np.quantile(distances(each), (0.5, 0.9)).tolist()
+        if near <= tolerance and math.log(2) + nats(each) < present:
+            return replace(each, distance=far)
+    starts = sorted(_starts(tree.data, contacts, placement), key=lambda start: start[0] + nats(start[1]))
+    fitted = [(start[0], _fit(tree, contacts, *start[1:])) for start in starts[: _BOUNDS.max_starts]]
+    for total, each in sorted(((code + nats(each), each) for code, each in fitted), key=lambda pair: pair[0]):
+        far = float(np.quantile(distances(each), 0.9))
+        # Beside the size that the contacts have by then: what is shrunk comes nearer to anything.
+        spread = each.factor * placement.spread or math.inf
+        if total < present and far <= min(max(resolution, 0.5 * tolerance), TOLERANCE * spread):
+            return replace(each, distance=far)
+    return None
 
-    def fit(self, start: FrameMismatch, scaled: bool, shifted: bool) -> FrameMismatch:
-        """Return the similarity with the scale and the shift that iterated closest points find from a start."""
-        found, source = start, self.contacts @ start.axes.T
-        old = source.mean(axis=0) * shifted
-        size = float(np.square(source - old).sum())
-        for _ in range(_BOUNDS.max_steps if scaled or shifted else 0):
-            target = self.tree.data[self.tree.query(found.undo(self.contacts))[1]]
-            new = target.mean(axis=0) * shifted
-            factor = float(((source - old) * (target - new)).sum()) / size if scaled and size else found.factor
-            last, found = found, replace(found, factor=factor, shift=new - factor * old)
-            if factor == last.factor and np.array_equal(found.shift, last.shift):
-                break
-        return found
+
+def _starts(
+    points: Float64[np.ndarray, "points 3"], contacts: Float64[np.ndarray, "contacts 3"], placement: Placement
+) -> Iterator[tuple[float, FrameMismatch, bool, bool]]:
+    """Yield similarities, the nats of their parameters, and whether their scale and their shift are fitted."""
+    spread, diagonal, count = placement.spread, placement.diagonal, len(contacts)
+    least, most = _BOUNDS.least_spread * diagonal, _BOUNDS.most_spread * diagonal
+    # What is symmetric but for errors of this size does not show which way it lies.
+    off = float(placement.distances.max()) > placement.tolerance / 2
+    fitting = (factor for factor in FACTORS if factor == 1 or not spread or least <= factor * spread <= most)
+    scales, shifts = [(factor, False) for factor in fitting], [False]
+    if count >= _BOUNDS.fit_contacts:
+        ratio = diagonal / spread if spread else 1.0
+        scales += [(factor, True) for factor in (1.0, 0.8 * ratio, ratio)]
+        shifts = [False, True]
+    middle, own = ((each.min(axis=0) + each.max(axis=0)) / 2 for each in (points, contacts))
+    for rarity, axes in _signed_permutations() if off and count >= _BOUNDS.axes_contacts else [(1, np.eye(3))]:
+        for (factor, scaled), shifted in itertools.product(scales, shifts):
+            start = FrameMismatch(factor, axes, (middle - factor * axes @ own) * shifted)
+            # Nothing in meters takes two units.
+            units = 2 if scaled or (factor != 1 and start.unit is None) else int(factor != 1)
+            nats = math.log(rarity) + units * math.log(len(FACTORS)) + (3 * shifted + scaled) * math.log(count)
+            yield nats, start, scaled, shifted
+
+
+def _fit(
+    tree: cKDTree, contacts: Float64[np.ndarray, "contacts 3"], start: FrameMismatch, scaled: bool, shifted: bool
+) -> FrameMismatch:
+    """Return the similarity with the scale and the shift that iterated closest points find from a start."""
+    found, source = start, contacts @ start.axes.T
+    old = source.mean(axis=0) * shifted
+    size = float(np.square(source - old).sum())
+    for _ in range(_BOUNDS.max_steps if scaled or shifted else 0):
+        target = tree.data[tree.query(found.undo(contacts))[1]]
+        new = target.mean(axis=0) * shifted
+        factor = float(((source - old) * (target - new)).sum()) / size if scaled and size else found.factor
+        last, found = found, replace(found, factor=factor, shift=new - factor * old)
+        if factor == last.factor and np.array_equal(found.shift, last.shift):
+            break
+    return found
 
 
 def _signed_permutations() -> Iterator[tuple[int, Float64[np.ndarray, "3 3"]]]:

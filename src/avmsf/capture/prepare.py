@@ -34,11 +34,6 @@ class Prepared:
     rate: float
     """The file's own sample rate, Hz."""
 
-    @property
-    def peak(self) -> float:
-        """Largest magnitude of the sound."""
-        return float(np.abs(self.sound).max())
-
 
 def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float | None = None) -> Prepared:
     """Align and normalize one recording as the settings say; `newtons` is the peak force that the table gives.

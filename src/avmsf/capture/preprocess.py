@@ -64,7 +64,8 @@ def preprocess(
             prepared = prepare(recording, settings, newtons=impact.newtons)
             if measured:
                 issues.reports.append(measure(recording, prepared, settings=settings, line=impact.line))
-            issues.sounds[impact.file] = hashlib.sha256(prepared.sound.data).digest(), prepared.peak
+            peak = float(np.abs(prepared.sound).max())
+            issues.sounds[impact.file] = hashlib.sha256(prepared.sound.data).digest(), peak
             used.append((impact, _shorten(prepared, settings, gain=10 ** (-impact.gain_db / 20))))
     if used:
         with issues.keep():

@@ -50,7 +50,9 @@ def run(options: Options) -> int:
         screen.print(_table(report, str(options.capture), aligned))
     if visual is not None:
         screen.print(visual.sentence, soft_wrap=True)
-    problems = [*problems_of(report), *(() if visual is None else (*visual.problems, *visual.unused))]
+    # The folder's first, then the recordings', common ones once.
+    problems = [*report.problems, *shared_problems(report.recordings)]
+    problems += [] if visual is None else [*visual.problems, *visual.unused]
     problems += map(str, outside)
     hidden = len(problems) - MAX_PRINTED
     for problem in [*problems[:MAX_PRINTED], *([f"and {hidden} more; --json prints all"] if hidden > 0 else [])]:
@@ -104,11 +106,6 @@ def _write(options: Options, proposals: Sequence[Proposal], screen: Console) -> 
         screen.print(settings_text(proposals), soft_wrap=True)
         raise
     screen.print(f"{path}: written, with {', '.join(each.line for each in proposals)}", soft_wrap=True)
-
-
-def problems_of(report: CaptureReport) -> list[str]:
-    """Return a message for every problem: the folder's first, then the recordings', common ones once."""
-    return [*report.problems, *shared_problems(report.recordings)]
 
 
 def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -> object:
