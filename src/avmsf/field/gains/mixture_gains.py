@@ -154,19 +154,20 @@ class MixtureGains(GainModel):
         best = (weights * values.square().sum(0)).reshape(*weights.shape[:2], 2, -1).sum(2).flatten(0, 1).argmax(0)
         rows, shares = best // weights.shape[1], best % weights.shape[1]
         used, place = torch.unique(rows, return_inverse=True)
+        # Lists, for one tensor of all would take the memory twice.
         own, cross = (
-            torch.cat([family.between(sites, others) for family in self.families_of(used)])
+            [kernel for family in self.families_of(used) for kernel in family.between(sites, others)]
             for others in (sites, self.training)
         )
-        for mode, (row, share) in enumerate(zip(rows.tolist(), shares.tolist(), strict=True)):
+        for mode, (row, share, column) in enumerate(zip(rows.tolist(), shares.tolist(), place.tolist(), strict=True)):
             noise = float(self.mixture.noise_variance[share, mode])
             root = torch.linalg.cholesky(self.mixture.kernels[row] + noise * torch.eye(len(values)).double())
             half, parts = (
                 torch.linalg.solve_triangular(root, each, upper=False)
-                for each in (cross[place[mode]].T, values[:, [mode, mode + len(best)]])
+                for each in (cross[column].T, values[:, [mode, mode + len(best)]])
             )
             size = float(parts.square().sum()) / len(values)
-            yield size * (own[place[mode]] - half.T @ half), size * noise
+            yield size * (own[column] - half.T @ half), size * noise
 
     def families_of(self, rows: Int[Tensor, " rows"]) -> Iterator[KernelFamily]:
         """Yield the families of some of the mixture's kernels, given by their sorted rows, with these kernels alone."""
