@@ -23,23 +23,17 @@ class Sheet:
 
     middle: Float64[np.ndarray, "points 3"]
     """Meters."""
-    offsets: Float64[np.ndarray, "points 3"]
-    """From the middle to the upper side of the wall, the side from which triangles are counter-clockwise."""
+    walls: Float64[np.ndarray, " points"]
+    """Thickness at each point, measured across the triangles, meters."""
     triangles: Int[np.ndarray, "triangles 3"]
     """Rows of `middle`."""
     order: Int[np.ndarray, " points"]
     """Numbers that differ along every edge; they decide how the wall is cut into tetrahedra."""
 
-    @classmethod
-    def of(
-        cls,
-        middle: Float64[np.ndarray, "points 3"],
-        walls: Float64[np.ndarray, " points"],
-        triangles: Int[np.ndarray, "triangles 3"],
-        order: Int[np.ndarray, " points"],
-    ) -> "Sheet":
-        """Return the sheet whose thickness at each point is `walls`, measured across the triangles, meters."""
-        return cls(middle, 0.5 * walls[:, None] * mitred_normals(middle, triangles), triangles, order)
+    @cached_property
+    def offsets(self) -> Float64[np.ndarray, "points 3"]:
+        """From the middle to the upper side of the wall, the side from which triangles are counter-clockwise."""
+        return 0.5 * self.walls[:, None] * mitred_normals(self.middle, self.triangles)
 
 
 def mitred_normals(

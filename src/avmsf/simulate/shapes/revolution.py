@@ -141,7 +141,7 @@ class Turned:
         if warp is not None:
             radius, height = warp(angles, along, values[:, :2])
         middle = np.stack([radius * np.cos(angles), radius * np.sin(angles), height], axis=1)
-        sheet = Sheet.of(middle, values[:, 2], rings.triangles, rings.order)
+        sheet = Sheet(middle, values[:, 2], rings.triangles, rings.order)
         return cls(body, rings, sheet, *body.lay(sheet))
 
     @property
@@ -189,9 +189,8 @@ def bowl(random: np.random.Generator, wall: float | None) -> Draft:
     radius, depth = random.uniform(0.06, 0.1), random.uniform(0.55, 0.85)
     belly, bottom = random.uniform(0.8, 1.0), random.uniform(0.4, 0.52)
     wall = drawn_wall(random, 0.003, 0.0055, wall)
-    height = depth * radius
     corners = [(0.0, 0.0, 1.25), (bottom, 0.0, 1.25), (belly, 0.15, 1.0), (0.97, 0.7, 1.0), (1.0, 1.0, 0.9)]
-    turned = Turned.lay(Profile.scaled(radius, height, wall, corners))
+    turned = Turned.lay(Profile.scaled(radius, depth * radius, wall, corners))
     turned.add_foot(0.42 * radius, random.uniform(0.004, 0.008))
     return Draft(turned.body, wall, ROUND)
 
@@ -283,8 +282,8 @@ def tube(random: np.random.Generator, wall: float | None) -> Draft:
     radius, length = random.uniform(0.012, 0.022), random.uniform(0.16, 0.26)
     wall = drawn_wall(random, 0.002, 0.003, wall)
     # Outwards is upwards here, so that the lower side of the wall is the tube's outside.
-    turned = Turned.lay(Profile([(radius, height * length, wall) for height in (-0.5, 0.0, 0.5)]))
-    return Draft(turned.body, wall, Symmetry(UP, None, UP[None].clone()))
+    profile = Profile([(radius, height * length, wall) for height in (-0.5, 0.0, 0.5)])
+    return Draft(Turned.lay(profile).body, wall, Symmetry(UP, None, UP[None].clone()))
 
 
 def pot(random: np.random.Generator, wall: float | None) -> Draft:
@@ -292,12 +291,10 @@ def pot(random: np.random.Generator, wall: float | None) -> Draft:
     radius, tall = random.uniform(0.05, 0.075), random.uniform(0.9, 1.3)
     flare, edged = random.uniform(1.0, 1.2), random.uniform(0.65, 0.9)
     wall = drawn_wall(random, 0.004, 0.006, wall)
-    height, sides = tall * radius, 6
-    half = 0.5 * (1 + flare)
+    half, sides = 0.5 * (1 + flare), 6
     corners = [(0.0, 0.0, 1.2), (0.93, 0.0, 1.2), (1.0, 0.1, 1.0), (half, 0.6, 1.0), (flare, 1.0, 1.0)]
-    profile = Profile.scaled(radius, height, wall, corners)
-    turned = Turned.lay(profile, fold=sides, warp=_polygon(sides, edged))
-    return Draft(turned.body, wall, _turning(sides))
+    profile = Profile.scaled(radius, tall * radius, wall, corners)
+    return Draft(Turned.lay(profile, fold=sides, warp=_polygon(sides, edged)).body, wall, _turning(sides))
 
 
 def fluted(random: np.random.Generator, wall: float | None) -> Draft:
@@ -306,15 +303,14 @@ def fluted(random: np.random.Generator, wall: float | None) -> Draft:
     lobes = int(random.integers(5, 9))
     deep, wavy = random.uniform(0.05, 0.08), random.uniform(0.03, 0.07)
     wall = drawn_wall(random, 0.003, 0.005, wall)
-    height = depth * radius
 
     def warp(angles: np.ndarray, along: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         wave = np.cos(lobes * angles) * np.clip((along - 0.25) / 0.75, 0.0, 1.0) ** 1.5
         return values[:, 0] * (1.0 + deep * wave), values[:, 1] + wavy * radius * wave
 
     corners = [(0.0, 0.0, 1.2), (0.5, 0.0, 1.2), (0.85, 0.3, 1.0), (1.0, 1.0, 1.0)]
-    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), fold=lobes, warp=warp)
-    return Draft(turned.body, wall, _turning(lobes))
+    profile = Profile.scaled(radius, depth * radius, wall, corners)
+    return Draft(Turned.lay(profile, fold=lobes, warp=warp).body, wall, _turning(lobes))
 
 
 def dish(random: np.random.Generator, wall: float | None) -> Draft:
@@ -325,7 +321,6 @@ def dish(random: np.random.Generator, wall: float | None) -> Draft:
     rim = random.normal(size=4) * (0.03, 0.03, 0.04, 0.02)
     phases = random.uniform(0.0, 2.0 * np.pi, (2, 4))
     wall = drawn_wall(random, 0.0035, 0.0055, wall)
-    height = depth * radius
 
     def warp(angles: np.ndarray, along: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         turning = waves * angles[:, None]
@@ -334,8 +329,8 @@ def dish(random: np.random.Generator, wall: float | None) -> Draft:
         return values[:, 0] * (1.0 + out * along), values[:, 1] + radius * up * along**2
 
     corners = [(0.0, 0.0, 1.2), (0.55, 0.0, 1.2), (0.8, 0.25, 1.0), (1.0, 1.0, 0.9)]
-    turned = Turned.lay(Profile.scaled(radius, height, wall, corners), warp=warp)
-    return Draft(turned.body, wall, Symmetry())
+    profile = Profile.scaled(radius, depth * radius, wall, corners)
+    return Draft(Turned.lay(profile, warp=warp).body, wall, Symmetry())
 
 
 def _crown(turned: Turned, radius: float, top: float, *, swell: float, taper: float) -> None:

@@ -201,7 +201,7 @@ def _draft(grid: Grid, middle: np.ndarray, wall: float, symmetry: Symmetry) -> D
 
 def _body(middle: np.ndarray, walls: np.ndarray | float, triangles: np.ndarray, order: np.ndarray) -> SolidBuilder:
     body = SolidBuilder()
-    body.lay(Sheet.of(middle, np.broadcast_to(walls, len(middle)), triangles, order))
+    body.lay(Sheet(middle, np.broadcast_to(walls, len(middle)), triangles, order))
     return body
 
 
