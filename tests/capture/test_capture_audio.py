@@ -21,20 +21,31 @@ def stereo() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("samples", "name", "value"),
+    ("samples", "settings", "name", "value"),
     [
-        (np.zeros(4000), None, 0.0),
-        (np.full(4000, 0.25), None, 0.25),
-        (np.zeros(0), None, 0),
-        (np.where(np.arange(4000) == 7, np.nan, ring()), None, 1),
-        (ring(0.015), "samples", 120),
-        (stereo(), "response_channel", 2),
+        (np.zeros(4000), {}, None, 0.0),
+        (np.full(4000, 0.25), {}, None, 0.25),
+        (np.zeros(0), {}, None, 0),
+        (np.where(np.arange(4000) == 7, np.nan, ring()), {}, None, 1),
+        (ring(0.015), {}, "samples", 120),
+        (np.linspace(-0.1, 0.1, 12), {"highpass": 20.0}, "samples", 12),
+        (stereo(), {}, "response_channel", 2),
+        (ring(), {"force_channel": 1}, "response_channel", 0),
+        (np.stack([np.zeros(4000), ring()], axis=1), {"force_channel": 1}, "force_channel", 1),
+        (ring(), {"normalize": "peak"}, "normalize", "peak"),
     ],
-    ids=["silent", "constant", "empty", "nan", "short", "stereo"],
+    ids=["silent", "constant", "empty", "nan", "short", "highpass", "stereo", "force alone", "no force", "no peak"],
 )
-def test_a_bad_recording_is_named(tmp_path: Path, samples: np.ndarray, name: str | None, value: float) -> None:
-    with raises(CaptureError, file="b.wav", name=name, value=value):
-        read_capture(fill(tmp_path, replace={"b.wav": samples}))
+def test_a_bad_recording_is_named(
+    tmp_path: Path, samples: np.ndarray, settings: dict, name: str | None, value: float | str
+) -> None:
+    with raises(CaptureError, file="a.wav", name=name, value=value):
+        read_capture(fill(tmp_path, replace={"a.wav": samples}), CaptureSettings(**settings))
+
+
+def test_asking_for_less_than_modes_need_is_refused(tmp_path: Path) -> None:
+    with raises(CaptureError, name="seconds", value=0.01):
+        read_capture(fill(tmp_path), CaptureSettings(seconds=0.01))
 
 
 @pytest.mark.parametrize(

@@ -142,18 +142,6 @@ def test_only_the_push_itself_is_divided_by() -> None:
     assert np.array_equal(clean, found)
 
 
-def test_normalizations_that_lack_their_force_say_so(tmp_path: Path) -> None:
-    folder = fill(tmp_path)
-    with raises(CaptureError, file="a.wav", name="normalize", value="peak"):
-        read_capture(folder, CaptureSettings(normalize="peak"))
-    with raises(CaptureError, file="a.wav", name="response_channel", value=0):
-        read_capture(folder, CaptureSettings(force_channel=1))
-    silent = np.stack([np.zeros(4000), ring()], axis=1)
-    folder = fill(tmp_path, replace={"a.wav": silent, "b.wav": silent, "c.wav": silent})
-    with raises(CaptureError, file="a.wav", name="force_channel", value=1):
-        read_capture(folder, CaptureSettings(force_channel=1))
-
-
 # The measured aircraft: 74 strikes with hammer force at 512 Hz, and beside them the same strikes as impulse responses
 # at 400 Hz, each from the transfer function averaged over several hits of the contact.
 

@@ -174,14 +174,11 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
 
 def _as_on_disk(folder: Path, file: str) -> str:
     """Return the name of a file that exists and has the same letters, composed or decomposed; else the name given."""
-    if file.isascii():
+    if file.isascii() or not _is_missing(folder / file):
         return file
-    path = folder / file.replace("\\", "/")
-    if _is_missing(path) and path.parent.is_dir():
-        wanted = unicodedata.normalize("NFC", path.name)
-        same = [each for each in path.parent.iterdir() if unicodedata.normalize("NFC", each.name) == wanted]
-        return same[0].relative_to(folder).as_posix() if same else file
-    return file
+    wanted = unicodedata.normalize("NFC", file.replace("\\", "/"))
+    names = (path.relative_to(folder).as_posix() for path in files_in(folder))
+    return next((name for name in names if unicodedata.normalize("NFC", name) == wanted), file)
 
 
 def parse_row(row: Row, settings: CaptureSettings) -> Impact:
