@@ -114,19 +114,16 @@ def _with_noise(field: SoundField, train: Impacts) -> SoundField:
     config, bins = field.origin.config, len(field.residual.magnitude)
     if not config.residual or config.noise_rate or not config.steps:
         return field
-    silent = replace(field, residual=Residual(torch.zeros(bins)))
-    modes = silent.render(train.contacts, directions=train.directions)
+    modes = field.render(train.contacts, directions=train.directions, noise=False)
     return replace(field, residual=estimate_residual(train.sounds, modes, bins=bins))
 
 
 def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundField:
     """Return a field with the residual and spread share that predict its own contacts best, and its quality reported.
 
-    The residual is the stationary noise of the field, or the mean of what the three nearest recordings have in addition
-    to their modes. By the error at contacts left out; of the shares the smallest within one standard error of the best,
-    since fewer contacts leave more spread. `train` holds the recordings that the gain model uses, row for row. A field
-    of fewer than `_MIN_PLACES` places keeps its noise, a share of zero, and has no quality. `advise`: whether to name
-    the contact to record next, one of the field's points; not if these are not on the object.
+    The residual is stationary noise or what the nearest recordings have in addition to their modes; of the shares the
+    smallest within one standard error counts, since fewer contacts leave more spread. `train` is row for row the gain
+    model's; `advise` says whether to name the contact to record next.
     """
     gains = field.gain_field
     if not isinstance(gains, MixtureGains) or gains.place_count < _MIN_PLACES:

@@ -207,8 +207,7 @@ def _compare(
 ) -> Float[Tensor, ""]:
     """Return the L1 distance of magnitudes to the target's frames `first` + i `every`; turn `spectra` into its slope.
 
-    A power below `floor` counts as `floor`. The slope, by real and imaginary part, is doubled in the first and the last
-    bin: a one-sided inverse transform counts those once and all others twice.
+    The slope is doubled in the first and the last bin, which a one-sided inverse transform counts once, others twice.
     """
     if spectra.device.type != "cpu":
         return _compare_torch(spectra, target, floor, first, every)

@@ -167,10 +167,7 @@ class _ExpectedError:
 def _chosen(
     error: _ExpectedError, sites: Sites, allowed: Bool[Tensor, " candidates"], count: int, same: float
 ) -> tuple[list[int], list[float]]:
-    """Return the rows of `count` allowed sites, each the one that lowers `error` most, and the error after each.
-
-    Adds them to `error`. Raises FitError where fewer lie farther apart than `same`.
-    """
+    """Return the rows of `count` allowed sites that lower `error` most, farther apart than `same`, and it after each."""
     rows, after = list[int](), list[float]()
     while len(rows) < count and bool(allowed.any()):
         rows.append(int(torch.where(allowed, error.reductions(), -math.inf).argmax()))
@@ -188,8 +185,7 @@ def _reachable(
 ) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places 3"] | None]:
     """Return those of the points, moved onto the body's surface, that a hammer can strike, and along which direction.
 
-    Without a body they are judged by the object's points, stay where they are, and have no directions. Raises FitError
-    where none can be struck.
+    Without a body they stay where they are, and have no directions.
     """
     body = gains.body
     access = (

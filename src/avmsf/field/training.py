@@ -192,7 +192,9 @@ class TrainingRun(nn.Module):
     def advance(self, targets: Targets) -> Float[Tensor, ""]:
         """Take one step on all contacts and return the loss before it, of the frames whose turn it is."""
         if self.step < self.config.warmup_steps:
-            loss = self._warmup_loss(targets)
+            # The squared error of the gains (paper, eq. 13), over their mean square.
+            off = self.network.read(targets.rows).mean.real - targets.gains
+            loss = (off.square() * self.weight).sum(1).mean()
             optimizers, done = self.warmup, self.step / self.config.warmup_steps
         else:
             loss = self.spectral_loss(targets)
@@ -218,14 +220,6 @@ class TrainingRun(nn.Module):
             for target in (targets.whole, targets.early)
         )
         return torch.add(whole, early, alpha=self.config.early_weight) + self.network.penalty()
-
-    def _warmup_loss(self, targets: Targets) -> Float[Tensor, ""]:
-        """Return the squared error of the gains (paper, eq. 13), over their mean square.
-
-        Each mode weighs as its energy over time does, gain^2 / (4 d): by the sound that it makes; or alike (paper).
-        """
-        gains = self.network.read(targets.rows).mean.real
-        return ((gains - targets.gains).square() * self.weight).sum(1).mean()
 
     def state(self) -> dict[str, Any]:
         """Return all that decides how the run goes on after its last whole step: tensors, numbers, containers of these.

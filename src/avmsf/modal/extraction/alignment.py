@@ -239,9 +239,8 @@ def _common_onset(
 ) -> float:
     """Return how much later than their common start aligned recordings leave the noise, all together, samples.
 
-    That is where the mean power of sounds of equal energy, each counting by its agreement, first reaches a hundredth of
-    its maximum, and ten times the noise before. The median of single onsets is off by what these are, over the square
-    root of their number. Between samples, too: else it would depend on where between two samples the impacts fall.
+    That is where their mean power, between samples too, first reaches a hundredth of its maximum and ten times the
+    noise before.
     """
     assert impacts.before is not None
     assert impacts.after is not None
@@ -299,10 +298,8 @@ def _estimate(
 ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"], Phases]:
     """Return the delays' medians, the probabilities that recordings agree, and the phases at the delayed starts.
 
-    `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all
-    delays are zero where the recordings are likelier to be aligned as they are, which `exact` favors, log odds a
-    recording. `vague` is how many recordings of the usual spread each mode's own is mixed with. The share of recordings
-    that agree is learned from all: a capture without common phases may have single ones that agree by chance.
+    `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all are
+    zero where that is likelier, with `exact` added to its log odds a recording. `vague` as in `MeasuredPhases.spread`.
     """
     if earlier is None:
         prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _FIRST_JITTER)
@@ -319,6 +316,7 @@ def _estimate(
     turned = fit.weights * measured.doubled(fit.delays)
     _, odds, _ = measured.search(fit.spread, turned.sum(0) - turned, fit.prior)
     agreement = odds.sigmoid()
+    # The share that agrees is learned from all: without common phases single recordings may agree by chance.
     for _ in range(_ROUNDS):
         share = (agreement.sum() + 1) / (len(odds) + 2)
         agreement = (odds + share.logit()).sigmoid()

@@ -197,11 +197,7 @@ class MeasuredPhases:
     def _candidates(
         self, toward: Complex128[Tensor, "contacts modes"], prior: DelayPrior
     ) -> Float64[Tensor, "contacts candidates"]:
-        """Return delays of the grid at which the product of the densities has its highest peaks.
-
-        Many modes that agree outweigh a strong one that does not, which the product would follow: the choice is made
-        among these. In single precision, for only places on the grid are asked for.
-        """
+        """Return delays of the grid at which the product of the densities is highest, in single precision."""
         away = (self.grid - prior.middle[:, None]).float() / prior.scale
         parts = torch.cat([toward.real, toward.imag], dim=1).float()
         score = torch.addmm(torch.log1p(away.square()), parts, self.table, beta=-1)
