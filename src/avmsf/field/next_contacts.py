@@ -108,7 +108,7 @@ def suggest(
         sites = gains.sites(pool[kept], None if directions is None else directions[kept])
         error = _ExpectedError(field, gains, points, sites)
         before = error.total()
-        rows, after = _chosen(error, sites, allowed[kept], count, same)
+        rows, after = error.choose(allowed[kept], count, same=same)
     return Suggestions(
         sites.points[rows],
         sites.directions[rows] if gains.directional else None,
@@ -126,7 +126,7 @@ class _ExpectedError:
     def __init__(
         self, field: SoundField, gains: MixtureGains, points: Float64[Tensor, "points 3"], candidates: Sites
     ) -> None:
-        self.points = len(points)
+        self.points, self.candidates = len(points), candidates.points
         self.modes: list[tuple[Float64[Tensor, "places candidates"], float]] = []
         """Of each mode the covariances between all places and the candidates, the last of these, and the noise."""
         self.variance = torch.zeros(len(points), dtype=torch.float64)
@@ -143,15 +143,26 @@ class _ExpectedError:
         """Return the expected relative error over all points."""
         return math.sqrt(float(self.variance.mean()) / self.energy)
 
-    def reductions(self) -> Float64[Tensor, " candidates"]:
-        """Return by how much each candidate would lower the variance, summed over the points."""
-        reduced = (
-            shared[: self.points].square().sum(0) / self._measured(shared, noise) for shared, noise in self.modes
-        )
-        return torch.stack(list(reduced)).sum(0)
+    def choose(self, allowed: Bool[Tensor, " candidates"], count: int, *, same: float) -> tuple[list[int], list[float]]:
+        """Return the rows of `count` allowed candidates that lower the error most in turn, and the error after each.
 
-    def add(self, row: int) -> None:
-        """Take a candidate as measured."""
+        They are taken as measured. Raises FitError where fewer lie farther apart than `same`.
+        """
+        rows, after = list[int](), list[float]()
+        while len(rows) < count and bool(allowed.any()):
+            reduced = [
+                known[: self.points].square().sum(0) / self._measured(known, noise) for known, noise in self.modes
+            ]
+            rows.append(int(torch.where(allowed, torch.stack(reduced).sum(0), -math.inf).argmax()))
+            self._measure(rows[-1])
+            allowed = allowed & ((self.candidates - self.candidates[rows[-1]]).norm(dim=1) > same)
+            after.append(self.total())
+        if len(rows) < count:
+            wanted = f"{count} different positions or more"
+            raise FitError.expected(wanted, len(rows), name="candidates", advice="ask for fewer")
+        return rows, after
+
+    def _measure(self, row: int) -> None:
         for shared, noise in self.modes:
             column = shared[:, row].clone()
             measured = self._measured(shared, noise)[row]
@@ -162,22 +173,6 @@ class _ExpectedError:
         """Return the variance of a measured gain at each candidate."""
         own = torch.diagonal(shared[self.points :]).clamp_min(0.0)
         return (own + noise).clamp_min(torch.finfo(torch.float64).tiny)
-
-
-def _chosen(
-    error: _ExpectedError, sites: Sites, allowed: Bool[Tensor, " candidates"], count: int, same: float
-) -> tuple[list[int], list[float]]:
-    """Return the rows of `count` allowed sites that lower `error` most, farther apart than `same`, and it after each."""
-    rows, after = list[int](), list[float]()
-    while len(rows) < count and bool(allowed.any()):
-        rows.append(int(torch.where(allowed, error.reductions(), -math.inf).argmax()))
-        error.add(rows[-1])
-        allowed = allowed & ((sites.points - sites.points[rows[-1]]).norm(dim=1) > same)
-        after.append(error.total())
-    if len(rows) < count:
-        wanted = f"{count} different positions or more"
-        raise FitError.expected(wanted, len(rows), name="candidates", advice="ask for fewer")
-    return rows, after
 
 
 def _reachable(
