@@ -251,7 +251,10 @@ def test_a_compressed_file_is_measured_by_its_header(tmp_path: Path) -> None:
 
 
 def test_many_missing_files_are_counted_once(tmp_path: Path) -> None:
-    folder = fill(tmp_path, rows=(*ROWS, *(f"aa{number}.wav,0,0,0.1" for number in range(200))))
+    rows = [*ROWS, *(f"aa{number}.wav,0,0,0.1" for number in range(200))]
+    # Each row has its report, also one that names a file again.
+    assert [row.line for row in check(fill(tmp_path, rows=(*rows, rows[-1]))).recordings] == list(range(2, 206))
+    folder = fill(tmp_path, rows=rows)
     report = check(folder)
     assert [row.readable for row in report.recordings] == [True] * 3 + [False] * 200
     (line,) = shared_problems(report.recordings)

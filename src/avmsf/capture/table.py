@@ -253,9 +253,9 @@ def read_impacts(folder: Path, settings: CaptureSettings, issues: Issues) -> lis
 
 def present_impacts(folder: Path, impacts: Sequence[Impact], issues: Issues) -> list[Impact]:
     """Return the impacts whose recordings exist; `issues` raise or collect the error of the others."""
-    missing = {each.file: each.line for each in impacts if _is_missing(folder / each.file)}
+    missing = dict.fromkeys(each.file for each in impacts if _is_missing(folder / each.file))
     if missing:
-        with issues.keep(*missing.items()):
+        with issues.keep(*((each.file, each.line) for each in impacts if each.file in missing)):
             raise _missing_error(folder, {each.file for each in impacts}, list(missing))
     return [each for each in impacts if each.file not in missing]
 
@@ -288,14 +288,13 @@ def _check_files_differ(impacts: Sequence[Impact]) -> None:
 
 def _missing_error(folder: Path, files: Collection[str], missing: Sequence[str]) -> CaptureError:
     """Return the error of recordings that do not exist, with the file that may be meant by one of them."""
-    others = [path.relative_to(folder).as_posix() for path in files_in(folder)]
-    others = [name for name in others if name not in files]
+    others = [name for path in files_in(folder) if (name := path.relative_to(folder).as_posix()) not in files]
     below = {PurePosixPath(name).name: name for name in reversed(others)}
     file, single = next((each for each in missing if each in below), missing[0]), len(missing) == 1
     near = below.get(file) or (similar_name(file, others) if single else None)
     advice = f"write {near} in place of {file}" if near else f"copy it there, or remove its row from {TABLE}"
     if single:
-        return CaptureError(f"{file}: expected a sound file, got none; {advice}", file=file, value=near)
+        return CaptureError.expected("a sound file", near, got="none", file=file, advice=advice)
     got = f"none for {len(missing)} of {len(files)} ({listed(missing)})"
     advice = advice if near else "copy them there, or correct their names"
     return CaptureError.expected("a file for each row", missing, got=got, file=TABLE, name="file", advice=advice)
