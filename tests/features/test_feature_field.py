@@ -7,7 +7,7 @@ import torch
 
 from avmsf.errors import FitError, SceneError
 from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
-from avmsf.gaussians.points import cluster
+from avmsf.gaussians.points import cluster, lattice
 from avmsf.mesh.surface import Surface
 from factories.raising import raises
 
@@ -65,19 +65,10 @@ def test_a_mesh_gives_points_on_it_and_points_alone_are_kept():
     assert torch.equal(cloud.points, vertices)
 
 
-@pytest.mark.parametrize("flat", [0, 1, 2])
-def test_points_that_stand_for_contacts_fill_their_box_and_stay_in_their_plane(flat):
-    contacts = box(40)
-    contacts[:, flat] = 0.7
-    field = FeatureField.from_contacts(contacts, count=300)
-    assert 100 < len(field.points) <= 300
-    assert torch.equal(field.points[:, flat], torch.full((len(field.points),), 0.7))
-    torch.testing.assert_close(field.points.amin(0), contacts.amin(0), rtol=0, atol=1e-7)
-    torch.testing.assert_close(field.points.amax(0), contacts.amax(0), rtol=0, atol=1e-7)
-    # No contact is farther from a point than half the diagonal of the lattice's cell; the widest cell has the area of
-    # the box over the number of cells in it.
-    distance = torch.cdist(contacts, field.points).amin(1)
-    assert float(distance.max()) < 0.02
+def test_points_that_stand_for_contacts_are_a_lattice_off_the_surface():
+    field = FeatureField.from_contacts(box(40), count=300)
+    assert torch.equal(field.points, lattice(box(40), 300))
+    assert not field.on_surface
 
 
 @pytest.mark.parametrize(

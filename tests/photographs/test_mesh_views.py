@@ -17,14 +17,14 @@ from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import GRAY, TexturedMesh, read_textured_mesh
 from avmsf.photographs.cameras import Camera
 from avmsf.photographs.mesh_views import FOCAL, SKY, MeshTracer, orbit_cameras, render_views
+from factories.looked_at import surface_of
 from factories.raising import raises, warns
 
 RADIUS, DISTANCE = 0.1, 0.5
 
 
 def sphere(subdivisions: int = 5) -> TexturedMesh:
-    shape = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
-    return TexturedMesh.plain(Surface(torch.tensor(shape.vertices).float(), torch.tensor(shape.faces)))
+    return TexturedMesh.plain(surface_of(trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)))
 
 
 def facing(size: int = 64, *, focal: float = 100.0, distance: float = 1.0) -> Camera:
@@ -126,7 +126,8 @@ def test_colors_between_corners_are_their_mean() -> None:
 
 def test_a_mask_says_how_much_of_a_pixel_is_covered() -> None:
     # The card's edges lie a third and two thirds into pixels of 0.01 m.
-    vertices = torch.tensor([[-0.1 - 1 / 300, -0.2, 0], [0.1 + 2 / 300, -0.2, 0], [0.1 + 2 / 300, 0.2, 0], [-0.1 - 1 / 300, 0.2, 0]])  # fmt: skip  # noqa: E501
+    left, right = -0.1 - 1 / 300, 0.1 + 2 / 300
+    vertices = torch.tensor([[left, -0.2, 0], [right, -0.2, 0], [right, 0.2, 0], [left, 0.2, 0]])
     mesh = TexturedMesh.build(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), colors=torch.full((2, 3, 3), 0.2))
     (view,) = render_views(mesh, [facing()], ambient=1.0, supersample=3, background=(1.0, 0.5, 0.0))
     assert view.mask[32, 20:24].tolist() == [0, 85, 255, 255]
@@ -137,15 +138,13 @@ def test_a_mask_says_how_much_of_a_pixel_is_covered() -> None:
 
 
 def test_faces_are_as_bright_as_the_part_of_the_sky_that_they_see() -> None:
-    box = trimesh.creation.box((0.2, 0.2, 0.2))
-    mesh = TexturedMesh.plain(Surface(torch.tensor(box.vertices).float(), torch.tensor(box.faces)))
+    mesh = TexturedMesh.plain(surface_of(trimesh.creation.box((0.2, 0.2, 0.2))))
     for axis in range(3):
         for sign in (-1.0, 1.0):
             position = torch.zeros(3)
             position[axis] = sign
-            camera = Camera.looking(
-                position, torch.zeros(3), up=torch.eye(3)[(axis + 1) % 3], focal=100.0, width=32, height=32
-            )
+            up = torch.eye(3)[(axis + 1) % 3]
+            camera = Camera.looking(position, torch.zeros(3), up=up, focal=100.0, width=32, height=32)
             (view,) = render_views(mesh, [camera], ambient=0.2)
             expected = 255 * GRAY * (0.2 + 0.8 * (1 + sign * SKY[axis]) / 2)
             assert np.allclose(view.image[16, 16].numpy(), expected, atol=0.51)
@@ -154,8 +153,7 @@ def test_faces_are_as_bright_as_the_part_of_the_sky_that_they_see() -> None:
 def test_smooth_where_it_is_round_and_sharp_at_edges() -> None:
     ball = sphere(3)
     assert float((ball.normals - ball.vertices[ball.faces] / RADIUS).norm(dim=-1).max()) < 0.01
-    pillar = trimesh.creation.cylinder(radius=1.0, height=2.0, sections=48)
-    mesh = TexturedMesh.plain(Surface(torch.tensor(pillar.vertices).float(), torch.tensor(pillar.faces)))
+    mesh = TexturedMesh.plain(surface_of(trimesh.creation.cylinder(radius=1.0, height=2.0, sections=48)))
     corners = mesh.vertices[mesh.faces]
     lid = (corners[..., 2].amax(1) - corners[..., 2].amin(1)) < 1e-6
     assert bool((mesh.normals[lid][..., 2].abs() > 1 - 1e-6).all())
@@ -190,12 +188,9 @@ def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
 
 
 def test_a_camera_inside_and_one_that_looks_away() -> None:
-    inside = Camera(torch.eye(4, dtype=torch.float64), (20.0, 20.0), (16.0, 16.0), 32, 32)
+    inside = facing(32, focal=20.0, distance=0.0)
     assert bool(torch.isfinite(MeshTracer(sphere(2).surface).depth(inside)).all())
-    away = Camera(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)), (20.0, 20.0), (16.0, 16.0), 32, 32)  # fmt: skip  # noqa: E501
-    pose = away.world_to_camera.clone()
-    pose[2, 3] = -1.0
-    (view,) = render_views(sphere(2), [Camera(pose, (20.0, 20.0), (16.0, 16.0), 32, 32)])
+    (view,) = render_views(sphere(2), [facing(32, focal=20.0, distance=-1.0)])
     assert bool((view.image == 255).all())
     assert not view.mask.any()
 

@@ -32,10 +32,8 @@ def facing_down_z(folder: Path) -> Path:
     """Three cameras on the z axis's side, their matrices written by hand: the first at z = 5 with no rotation."""
     right = [[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]  # at x = 5, backward is +x
     left = [[0, 0, -1, -5], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
-    poses = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]], right, left]
-    rows = [
-        {"file_path": f"images/{name}.png", "transform_matrix": pose} for name, pose in zip("abc", poses, strict=True)
-    ]
+    poses = {"a": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]], "b": right, "c": left}
+    rows = [{"file_path": f"images/{name}.png", "transform_matrix": pose} for name, pose in poses.items()]
     return write_transforms(folder, rows)
 
 
@@ -113,9 +111,8 @@ def test_coefficients_go_where_opencv_has_them(tmp_path: Path) -> None:
     rows[1]["camera_model"] = "OPENCV_FISHEYE"
     rows[1]["k4"] = 0.4
     write_transforms(tmp_path, rows, k1=0.1, k2=0.2, k3=0.3, p1=0.01, p2=0.02)
-    perspective, fisheye = (
-        each.lens_of(1, 1) for each in read_transforms(tmp_path / "transforms.json").photographs[:2]
-    )
+    photographs = read_transforms(tmp_path / "transforms.json").photographs
+    perspective, fisheye = (each.lens_of(1, 1) for each in photographs[:2])
     assert perspective.distortion == (0.1, 0.2, 0.01, 0.02, 0.3)
     assert fisheye.distortion == (0.1, 0.2, 0.3, 0.4)
     assert (perspective.fisheye, fisheye.fisheye) == (False, True)
@@ -246,17 +243,13 @@ def test_paths_outside_the_folder_are_read(tmp_path: Path) -> None:
 
 
 def some_views(*, masked: bool = True) -> tuple[View, ...]:
-    generator = torch.Generator().manual_seed(0)
-    views = []
+    generator, views, up = torch.Generator().manual_seed(0), [], torch.tensor([0.0, 0.0, 1.0])
     for number in range(4):
-        position = torch.randn(3, generator=generator, dtype=torch.float64)
-        up = torch.tensor([0.0, 0.0, 1.0])
-        camera = Camera.looking(
-            3 * position / position.norm(), torch.zeros(3), up=up, focal=40.0 + number, width=24, height=17
-        )
-        image = torch.randint(0, 256, (17, 24, 3), generator=generator, dtype=torch.uint8)
-        mask = torch.randint(0, 256, (17, 24), generator=generator, dtype=torch.uint8)
-        views.append(View(f"side/{number}.jpg", image, camera, mask if masked else None))
+        position = 3 * torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
+        camera = Camera.looking(position, torch.zeros(3), up=up, focal=40.0 + number, width=24, height=17)
+        pixels = torch.randint(0, 256, (17, 24, 4), generator=generator, dtype=torch.uint8)
+        mask = pixels[..., 3].contiguous() if masked else None
+        views.append(View(f"side/{number}.jpg", pixels[..., :3].contiguous(), camera, mask))
     return tuple(views)
 
 
@@ -296,21 +289,17 @@ def test_a_folder_that_holds_something_is_left_alone_or_replaced(tmp_path: Path)
 
 
 def with_poses(folder: Path, change) -> Path:
-    """A ring of four whose second to fourth poses went through `change`."""
+    """A ring of four whose poses went through `change`."""
     rows = frames(ring(4))
-    for row in rows[1:]:
+    for row in rows:
         row["transform_matrix"] = change(np.array(row["transform_matrix"])).tolist()
     return write_transforms(folder, rows)
 
 
 def test_a_scaled_rotation_is_mended_where_it_stands(tmp_path: Path) -> None:
-    def scale(pose: np.ndarray) -> np.ndarray:
-        pose[:3, :3] *= 0.25
-        return pose
-
-    scaled = ["b.png (0.25)", "c.png (0.25)", "d.png (0.25)"]
+    scaled = [f"{name}.png (0.25)" for name in "abcd"]
     with warns(CaptureWarning, file="transforms.json", name="transform_matrix", value=scaled):
-        views = read_views(with_poses(tmp_path, scale))
+        views = read_views(with_poses(tmp_path, lambda pose: pose * [0.25, 0.25, 0.25, 1]))
     for view, camera in zip(views, ring(4), strict=True):
         assert torch.allclose(view.camera.world_to_camera, camera.world_to_camera, atol=1e-12)
 
@@ -329,21 +318,14 @@ def test_three_rows_are_enough(tmp_path: Path) -> None:
 
 
 def test_opencv_axes_in_the_file_make_cameras_look_away(tmp_path: Path) -> None:
-    rows = frames(ring(5))
-    for row in rows:
-        row["transform_matrix"] = (np.array(row["transform_matrix"]) * [1, -1, -1, 1]).tolist()
-    with warns(CaptureWarning, file="transforms.json", name="axes", value=5):
-        read_views(write_transforms(tmp_path, rows))
+    with warns(CaptureWarning, file="transforms.json", name="axes", value=4):
+        read_views(with_poses(tmp_path, lambda pose: pose * [1, -1, -1, 1]))
 
 
 def test_cameras_at_one_position_are_warned_of(tmp_path: Path) -> None:
-    rows = frames(ring(4))
-    for row in rows:
-        pose = np.array(row["transform_matrix"])
-        pose[:3, 3] = (1.0, 2.0, 3.0)
-        row["transform_matrix"] = pose.tolist()
+    moved = with_poses(tmp_path, lambda pose: np.column_stack([pose[:, :3], [1, 2, 3, 1]]))
     with warns(CaptureWarning, file="transforms.json", name="positions", value=[1.0, 2.0, 3.0]):
-        read_views(write_transforms(tmp_path, rows))
+        read_views(moved)
 
 
 def test_cameras_side_by_side_are_right(tmp_path: Path) -> None:

@@ -50,28 +50,16 @@ def scene() -> TexturedMesh:
     )
 
 
-def true_views() -> tuple[View, ...]:
+@pytest.fixture(scope="module")
+def taken() -> tuple[View, ...]:
     cameras = []
     for number in range(VIEWS):
         azimuth, elevation = math.radians(12 * number), math.radians(50 + 12 * (number % 2))
-        place = 0.5 * torch.tensor(
-            [
-                math.cos(azimuth) * math.cos(elevation),
-                math.sin(azimuth) * math.cos(elevation),
-                math.sin(elevation),
-            ]
-        )
-        cameras.append(
-            Camera.looking(
-                place, torch.zeros(3), up=torch.tensor([0.0, 0.0, 1.0]), focal=1.1 * SIZE, width=SIZE, height=SIZE
-            )
-        )
+        flat = math.cos(elevation)
+        place = 0.5 * torch.tensor([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
+        up = torch.tensor([0.0, 0.0, 1.0])
+        cameras.append(Camera.looking(place, torch.zeros(3), up=up, focal=1.1 * SIZE, width=SIZE, height=SIZE))
     return render_views(scene(), cameras, supersample=2)
-
-
-@pytest.fixture(scope="module")
-def taken() -> tuple[View, ...]:
-    return true_views()
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +68,8 @@ def found(taken: tuple[View, ...], tmp_path_factory: pytest.TempPathFactory) -> 
     folder = tmp_path_factory.mktemp("scene")
     fill(folder / "images", taken)
     (folder / "images/view_004.png").unlink()
-    cv2.imwrite(
-        str(folder / "images/view_004.webp"), taken[4].image.numpy()[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101]
-    )
+    lossless = [cv2.IMWRITE_WEBP_QUALITY, 101]
+    cv2.imwrite(str(folder / "images/view_004.webp"), taken[4].image.numpy()[..., ::-1], lossless)
     cv2.imwrite(str(folder / "images/wall.png"), np.full((SIZE, SIZE, 3), 90, dtype=np.uint8))
     (folder / "images/zero.jpg").write_bytes(b"\xff\xd8\xff")
     with pytest.warns(CaptureWarning) as caught:
@@ -105,10 +92,9 @@ def test_cameras_agree_with_the_true_ones_up_to_a_similarity(taken: tuple[View, 
         views = read_views(folder)
     assert len(views) == VIEWS
     assert "view_004.webp" in [view.name for view in views]
-    places = torch.stack([view.camera.position for view in views])
-    true_places = torch.stack([view.camera.position for view in taken])
+    places, true_places = (torch.stack([view.camera.position for view in each]).numpy() for each in (views, taken))
     # As docs/visual-inputs.md says.
-    matrix = trimesh.registration.procrustes(places.numpy(), true_places.numpy(), reflection=False)[0]
+    matrix = trimesh.registration.procrustes(places, true_places, reflection=False)[0]
     back, scale = torch.from_numpy(np.linalg.inv(matrix)), np.cbrt(np.linalg.det(matrix[:3, :3]))
     for view, true in zip(views, taken, strict=True):
         pose = view.camera.world_to_camera @ back
