@@ -220,7 +220,7 @@ def _reading(path: Path, row: int | None = None, line: str | None = None) -> Ite
         yield
     except (OSError, ValueError, OverflowError) as error:
         value = line or getattr(error, "strerror", None) or str(error)
-        wanted = "a readable file" if row is None else "a row as COLMAP writes it"
-        advice = "get read permission, or export the model again"
-        got = repr(value[:80])
-        raise CaptureError.expected(wanted, value, got=got, file=path, row=row, advice=advice) from error
+        wanted, advice = "a row as COLMAP writes it", "export the model again"
+        if row is None:
+            wanted, advice = "a readable file", f"get read permission, or {advice}"
+        raise CaptureError.expected(wanted, value, got=repr(value[:80]), file=path, row=row, advice=advice) from error

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avmsf._utils.files import new_folder
-from avmsf._utils.text import counted, listed
+from avmsf._utils.text import listed
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs import colmap, nerf_json
 from avmsf.photographs.cameras import Camera, View, nearest_to_lines
@@ -50,22 +50,18 @@ def read_views(
     if repeated:
         wanted, got, advice = "one camera for each image", f"several for {listed(repeated)}", "remove all but one"
         raise CaptureError.expected(wanted, repeated, got=got, file=cameras.path, name=repeated[0], advice=advice)
-    remarks, findings = list(cameras.remarks), Findings(list)
-    unused = cameras.without_camera()
-    if unused:
-        message = f"{counted(len(unused), 'image')} not used, without a camera: {listed(unused)}"
-        remarks.append(Remark(message, name="cameras", value=unused))
+    findings = Findings(list, transform_matrix=list(cameras.scaled), cameras=cameras.without_camera())
     if max_views is not None:
         photographs = photographs[:: max(1, -(-len(photographs) // max_views))]
     read = (read_view(each, cameras.folder, longest, meters, findings) for each in photographs)
     views = [view for view in read if view is not None]
-    if photographs and len(findings.get("empty masks", ())) == len(photographs):
+    if photographs and len(findings["empty masks"]) == len(photographs):
         wanted, got = "masks with 255 on the object and 0 elsewhere", f"{len(photographs)} without an object"
         raise CaptureError.expected(wanted, 0, got=got, file=cameras.path, name="masks")
-    remarks += summarize(findings)
+    remarks = summarize(findings)
     if len(views) < MIN_VIEWS:
         reasons = "".join(f"; {remark.message}" for remark in remarks)
-        place = f" (expected {photographs[0].image} and so on)" if "missing images" in findings else ""
+        place = f" (expected {photographs[0].image} and so on)" if findings["missing images"] else ""
         got = f"{len(views)} of {len(photographs)} that can be used{reasons}{place}"
         raise CaptureError.expected(f"at least {MIN_VIEWS} views", len(views), got=got, file=cameras.path, name="views")
     for remark in remarks + check_cameras([view.camera for view in views]):

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from avmsf._utils.text import listed, read_json
+from avmsf._utils.text import read_json
 from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import FrameMismatch
-from avmsf.errors import CaptureError, Remark
+from avmsf.errors import CaptureError
 from avmsf.mesh.io import load_parts
 from avmsf.photographs.lenses import Lens, Location
 from avmsf.photographs.photograph import CameraFile, Photograph, check_count
@@ -55,9 +55,7 @@ def read_transforms(path: Path) -> CameraFile:
         lens_of = partial(_lens, settings, where, _is_fisheye(settings, where))
         world_to_camera = torch.from_numpy(np.linalg.inv(pose @ OPENCV_FROM_OPENGL))
         photographs.append(Photograph(name, image, world_to_camera, lens_of, mask))
-    message = f"poses have a scaled rotation; the scale was removed: {listed(scaled)}"
-    remarks = (Remark(message, name="transform_matrix", value=scaled),) if scaled else ()
-    return CameraFile(path, path.parent, tuple(photographs), remarks)
+    return CameraFile(path, path.parent, tuple(photographs), tuple(scaled))
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray] | None:

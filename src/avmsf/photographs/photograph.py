@@ -22,6 +22,8 @@ MAX_PHOTOGRAPHS = 10_000
 Findings = defaultdict[str, list[str]]
 """Names of images, by the keys of `KINDS`."""
 KINDS = {
+    "transform_matrix": ("pose", "with a scaled rotation, whose scale was removed"),
+    "cameras": ("image", "without a camera, not used"),
     "missing images": ("image", "missing or corrupt, not used"),
     "empty masks": ("image", "with an empty mask, not used"),
     "image sizes": ("image", "of another size than the camera, whose intrinsics were scaled"),
@@ -56,8 +58,8 @@ class CameraFile:
     folder: Path
     """Where `images/` and `masks/` are."""
     photographs: tuple[Photograph, ...]
-    remarks: tuple[Remark, ...] = ()
-    """What looks wrong but was corrected."""
+    scaled: tuple[str, ...] = ()
+    """Names of photographs of which a scale was removed from the pose's rotation, with the scale."""
 
     def without_camera(self) -> list[str]:
         """Return the names of image files that lie among the photographs but have no camera."""
@@ -89,7 +91,7 @@ def summarize(findings: Mapping[str, Sequence[str]]) -> list[Remark]:
     return [
         Remark(f"{counted(len(findings[name]), thing)} {message}: {listed(findings[name])}", name, findings[name])
         for name, (thing, message) in KINDS.items()
-        if name in findings
+        if findings.get(name)
     ]
 
 
