@@ -250,15 +250,6 @@ def test_weights_sum_to_one_and_none_is_negligible():
     assert bool((found.weights == 0).any())
 
 
-def test_kernels_of_no_weight_are_dropped():
-    given = hypotheses()
-    given.log_prior[1] = -1e3
-    found, kept = posterior(given, mixture().values, mixture().floor)
-    assert kept.tolist() == [0, 2, 3]
-    assert torch.equal(found.kernels, given.kernels[kept])
-    assert torch.allclose(found.weights, weighed(mixture().values, mixture().floor, given).weights[kept])
-
-
 def test_without_active_series_weights_are_bayes_theorem():
     likelihood = torch.from_numpy(np.random.default_rng(4).uniform(size=(KERNELS, len(NOISE_SHARES), SERIES)))
     given = hypotheses()
@@ -340,62 +331,6 @@ def test_rounding_is_no_energy():
     values = torch.tensor([[1.0, 1e-9, 1e-12, 0.0]], dtype=torch.float64)
     assert active_series(values).tolist() == [True, True, False, False]
     assert not active_series(torch.zeros(3, 2, dtype=torch.float64)).any()
-
-
-def test_the_order_of_contacts_does_not_matter():
-    order = torch.tensor([3, 0, 6, 2, 5, 1, 4])
-    given, floor = hypotheses(), mixture().floor
-    one = weighed(mixture().values, floor, given)
-    turned = replace(given, kernels=given.kernels[:, order[:, None], order])
-    other = weighed(mixture().values[order], floor, turned)
-    assert torch.allclose(other.weights, one.weights, rtol=1e-8)
-    assert torch.allclose(other.solve(), one.solve()[:, order], rtol=1e-7, atol=1e-9)
-    for found, expected in zip(other.leave_out(GROUPS[order]), one.leave_out(GROUPS), strict=True):
-        assert torch.allclose(found, expected[order], rtol=1e-7, atol=1e-9)
-
-
-def test_the_order_of_series_does_not_matter():
-    order = torch.tensor([3, 0, 4, 2, 1])
-    given, values, floor = hypotheses(), mixture().values, mixture().floor
-    one = weighed(values, floor, given)
-    other = weighed(values[:, order], floor[order], replace(given, log_prior=given.log_prior[:, order]))
-    for found in (other, one.take(order)):
-        assert torch.allclose(found.weights, one.weights[..., order], rtol=1e-9)
-        assert torch.allclose(found.solve(), one.solve()[..., order], rtol=1e-8, atol=1e-10)
-        assert torch.allclose(found.standard_error(), one.standard_error()[order], rtol=1e-9)
-
-
-@pytest.mark.parametrize("factor", [-3.5, 1e-6])
-def test_scaled_values_scale_mean_and_deviation(factor):
-    joint = torch.from_numpy(joint_kernels().copy())
-    cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
-    one, other = (weighed(f * mixture().values, mixture().floor, hypotheses()) for f in (1.0, factor))
-    assert torch.allclose(other.weights, one.weights, rtol=1e-8)
-    pairs = [
-        (other.solve(), factor * one.solve()),
-        (spread_of(other, cross, own), abs(factor) * spread_of(one, cross, own)),
-        (other.standard_error(), abs(factor) * one.standard_error()),
-        (other.leave_out(GROUPS)[0], factor * one.leave_out(GROUPS)[0]),
-        (other.leave_out(GROUPS)[1], abs(factor) * one.leave_out(GROUPS)[1]),
-    ]
-    for found, expected in pairs:
-        assert torch.allclose(found, expected, rtol=1e-6, atol=1e-9 * abs(factor))
-
-
-def test_at_contacts_keeps_weights_and_forgets_values():
-    rows = torch.tensor([4, 0, 2])
-    found = mixture().at_contacts(rows)
-    assert torch.equal(found.weights, mixture().weights)
-    index = rows.tolist()
-    for series in range(SERIES):
-        values, floor, _ = drawn()
-        for kernel in range(KERNELS):
-            expected = sum(
-                float(mixture().weights[kernel, column, series])
-                * np.linalg.inv(among()[kernel][np.ix_(index, index)] + (share + floor[series]) * np.eye(3))
-                for column, share in enumerate(NOISE_SHARES)
-            )
-            assert found.solve()[kernel, :, series].numpy() == pytest.approx(expected @ values[index, series], rel=1e-8)
 
 
 def test_thousands_of_equally_probable_kernels_keep_their_weights():

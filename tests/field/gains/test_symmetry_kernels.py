@@ -7,7 +7,7 @@ import torch
 
 from avmsf.field.gains import symmetry
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import groups_of
@@ -55,10 +55,9 @@ def measured(values: torch.Tensor) -> MeasuredGains:
     return MeasuredGains(values, torch.zeros(modes, dtype=torch.float64), frequency, torch.ones_like(frequency))
 
 
-def fit(found: Symmetries, known: Sites, values: torch.Tensor, *, alone: bool = True) -> MixtureGains:
+def fit(found: Symmetries, known: Sites, values: torch.Tensor) -> MixtureGains:
     symmetric = Symmetric(known, SIZE, groups_of(found), directional=True)
-    other = [] if alone else [Unstructured(known, SIZE), Smooth(known, SIZE), ThinPlate(known, SIZE)]
-    return fit_mixture([*other, symmetric], measured(values), known.points.float(), directional=True)
+    return fit_mixture([symmetric], measured(values), known.points.float(), directional=True)
 
 
 @pytest.mark.parametrize("found", [of(X), of(X, Y), of(X, Y, TURN), of(ROUND)], ids=["mirror", "pair", "four", "round"])
@@ -155,8 +154,13 @@ def test_predictions_move_with_the_object() -> None:
 def test_a_model_that_was_saved_says_the_same() -> None:
     known, places = impacts(8), impacts(5, seed=4)
     values = torch.randn(8, 3, generator=torch.Generator().manual_seed(5), dtype=torch.complex128)
-    model = fit(of(X, Y, ROUND), known, values, alone=False)
-    assert Symmetric.kind in model.record()["families"]
+    points = torch.cat([known.points, places.points]).float()
+    looks = torch.randn(len(points), 2, generator=torch.Generator().manual_seed(7))
+    families: list[KernelFamily] = [kind(known, SIZE) for kind in (Unstructured, Smooth, ThinPlate)]
+    families += [Symmetric(known, SIZE, groups_of(of(X, Y, ROUND)), directional=True)]
+    families += [Visual(known, SIZE, points, looks)]
+    model = fit_mixture(families, measured(values), points, directional=True)
+    assert {Symmetric.kind, Visual.kind} <= set(model.record()["families"])
     tensors = model.tensors()
     like = MixtureGains.skeleton(model.record())
     assert {name: (each.shape, each.dtype) for name, each in like.items()} == {

@@ -68,16 +68,3 @@ def test_the_unit_of_features_does_not_matter() -> None:
     known = sites(points[::4].double())
     other = Visual(known, SIZE, points, 100.0 * features)
     torch.testing.assert_close(other.kernels(), visual(known).kernels(), atol=1e-6, rtol=0.0)
-
-
-def test_a_model_that_was_saved_says_the_same() -> None:
-    points, features = object_points()
-    known = sites(points[:20:2].double())
-    model = fit(known, features[:20:2].to(torch.complex128))
-    tensors = model.tensors()
-    like = MixtureGains.skeleton(model.record())
-    assert {name: (each.shape, each.dtype) for name, each in like.items()} == {
-        name: (each.shape, each.dtype) for name, each in tensors.items()
-    }
-    read = MixtureGains.restore(model.record(), tensors)
-    torch.testing.assert_close(read.predict(points).mean, model.predict(points).mean)

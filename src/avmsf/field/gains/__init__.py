@@ -1,1 +1,14 @@
-"""Gains over the surface of an object: see `avmsf.field` for the model, `mixture` for its mathematics."""
+"""Gains over the surface of an object, from those of recorded impacts: see `avmsf.field` for the model.
+
+- `model`, `data`: what every gain model is, and what it is fitted to.
+- `kernels`, `symmetry`, `elastic`: covariance functions, in families of one assumption each (R&W 4).
+- `mixture`: regression, evidence, the average over kernels and leave-one-out predictions (R&W 2, 5). Start here.
+- `fitting`: measured gains, the prior of kernels learned from all modes, and which shape of a body a mode is.
+- `mixture_gains`, `attention`, `scaled`: the final classes, and their form in a file.
+- `outliers`, `labels`: log predictive ratios, by which labels are wrong and whether a body is credible.
+- `refinement`: the gains at the contacts, refined end to end on the recordings' spectra.
+- `estimator`: the order of all this in a fit, with the thickness of a wall, supports and model updating.
+
+A new family of kernels of the position is a subclass of `kernels.KernelFamily` in `kernels.POSITIONAL`: fits, reports
+and files take it from there.
+"""
