@@ -7,12 +7,12 @@ from typing import Any
 
 from rich.console import Console
 
+from avmsf._utils.files import write_whole
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.suggest import PICTURE, TABLE, Options
 from avmsf.cli.printing import console, next_step, print_json, say, table
-from avmsf.cli.writing import write_text
 from avmsf.field.next_contacts import Suggestions, suggest
 from avmsf.field.posterior import relative_gain_std
 from avmsf.field.store import load
@@ -47,7 +47,7 @@ def run(options: Options) -> int:
         straight = "" if given else ", as nearly perpendicular to the surface as can be reached"
         screen.print(f"nx, ny, nz: direction of the impact{straight}")
     if paths:
-        write_text(paths[TABLE], _list(rows))
+        write_whole(paths[TABLE], _list(rows))
         doing("drawing the uncertainty")
         step = max(1, len(gains.points) // _DRAWN_POINTS)
         points = gains.points[::step]

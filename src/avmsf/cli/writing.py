@@ -1,4 +1,4 @@
-"""What the commands write: wav files, figures and texts, each complete or not at all."""
+"""What the commands write: wav files, each complete or not at all."""
 
 import io
 import math
@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
+from avmsf.capture.audio import wav_bytes
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.render import Coding
 
-SUBTYPES = {"float32": "FLOAT", "int16": "PCM_16"}
 _LARGEST_INT16 = 2**15 - 1
 FULL_SCALE: dict[Coding, float] = {"float32": 1.0, "int16": _LARGEST_INT16 / 2**15}
 """Largest sample of each format."""
@@ -41,37 +41,27 @@ class Level:
 def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, coding: Coding) -> None:
     """Write a mono wav file. Raises `OutputError` for a rate that wav files cannot hold, for samples that
     are not finite and for what would clip."""
-    rate = round(sample_rate)
+    rate, wrong = round(sample_rate), int((~torch.isfinite(sound)).sum())
     if rate < 1:
-        raise OutputError.expected(
-            "a sample rate of 1 Hz or more", sample_rate, got=f"{sample_rate:g} Hz", file=path, name="sample_rate"
-        )
-    wrong = int((~torch.isfinite(sound)).sum())
+        got = f"{sample_rate:g} Hz"
+        raise OutputError.expected("a rate of 1 Hz or more", sample_rate, got=got, file=path, name="sample_rate")
     if wrong:
-        raise OutputError(
-            f"{path}: expected finite samples, got {wrong} of {len(sound)} that are not; fit the field again, or "
-            "choose a smaller force or level",
-            file=path,
-            name="finite",
-            value=wrong,
+        got, advice = f"{wrong} of {len(sound)} that are not", "fit the field again, or choose a smaller force or level"
+        raise OutputError.expected("finite samples", wrong, got=got, file=path, name="finite", advice=advice)
+    scaled = sound.numpy().astype(np.float32)
+    if coding == "float32":
+        write_whole(path, wav_bytes(scaled, rate))
+        return
+    peak = float(np.abs(scaled).max(initial=0.0))
+    if round(peak * 2**15) > _LARGEST_INT16:
+        got, advice = (
+            f"{peak:.3g} ({20 * math.log10(peak):+.1f} dB)",
+            "add --normalize peak, lower --level-db, or write float32",
         )
-    peak = float(sound.abs().max()) if len(sound) else 0.0
-    if coding == "int16" and round(peak * 2**15) > _LARGEST_INT16:
-        raise OutputError(
-            f"{path}: expected amplitudes below 1 for 16 bits, got {peak:.3g} ({20 * math.log10(peak):+.1f} dB); add "
-            "--normalize peak, lower --level-db, or write float32",
-            file=path,
-            name="peak",
-            value=peak,
+        raise OutputError.expected(
+            "amplitudes below 1 for 16 bits", peak, got=got, file=path, name="peak", advice=advice
         )
     memory = io.BytesIO()
-    scaled = sound.numpy().astype(np.float32)
     # Rounded here: libsndfile rounds down.
-    samples = np.rint(scaled * 2**15).astype(np.int16) if coding == "int16" else scaled
-    soundfile.write(memory, samples, rate, subtype=SUBTYPES[coding], format="WAV")
+    soundfile.write(memory, np.rint(scaled * 2**15).astype(np.int16), rate, subtype="PCM_16", format="WAV")
     write_whole(path, memory.getvalue())
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file."""
-    write_whole(path, text)
