@@ -69,12 +69,8 @@ def _called(frequency: float, named: Float[Tensor, " modes"], option: str) -> in
     """Return the index of the mode at a frequency. Raises EditError where there is none."""
     row = int((named - frequency).abs().argmin())
     if not abs(float(named[row]) - frequency) <= _NEAR * float(named[row]):
-        raise EditError(
-            f"{option}: expected the frequency of a mode, got {frequency:g} Hz; the nearest is at "
-            f"{float(named[row]):.5g} Hz (`avmsf info` lists them)",
-            name=option,
-            value=frequency,
-        )
+        got, advice = f"{frequency:g} Hz", f"the nearest is at {float(named[row]):.5g} Hz (`avmsf info` lists them)"
+        raise EditError.expected("the frequency of a mode", frequency, got=got, name=option, advice=advice)
     return row
 
 
@@ -260,14 +256,11 @@ def _read_scores(path: Path, clap: Clap) -> dict[int, float]:
         scores = {int(step): float(score) for step, score in read["scores"]}
         digest = read["digest"]
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise EditError(f"{path}: expected CLAP scores, got {error}; delete the file to continue", file=path) from error
+        advice = "delete the file to continue"
+        raise EditError.expected("CLAP scores", got=str(error), file=path, advice=advice) from error
     if digest != clap.digest:
-        raise EditError(
-            f"{path}: expected scores of {clap.name}, got those of another network; give that network",
-            file=path,
-            name="digest",
-            value=digest,
-        )
+        wanted, got = f"scores of {clap.name}", "those of another network"
+        raise EditError.expected(wanted, digest, got=got, file=path, name="digest", advice="give that network")
     return scores
 
 

@@ -78,11 +78,9 @@ def run(options: Options) -> int:
         return INTERRUPTED
     if not summary["methods"]:
         first = summary["failures"][0]["failure"] if summary["failures"] else "no object"
-        raise EvaluationError(
-            f"expected a result of a method, got none: {first}",
-            file=folder,
-            name="failures",
-            value=len(summary["failures"]),
+        count = len(summary["failures"])
+        raise EvaluationError.expected(
+            "a result of a method", count, got=f"none: {first}", file=folder, name="failures"
         )
     screen = console(errors=options.json)
     for part in parts[1:3]:

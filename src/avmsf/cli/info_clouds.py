@@ -74,13 +74,9 @@ def _colors_of(path: Path, features: FeatureField) -> Float[Tensor, "points 3"]:
     cloud = read_splats(path)
     apart, rows = cKDTree(cloud.centers.numpy()).query(features.points.numpy())
     if apart.any():
-        raise SceneError(
-            f"{path}: expected the {len(features.points)} Gaussians of the features, got {len(cloud)} others; name the "
-            "file that the features were computed on",
-            file=path,
-            name="--cloud",
-            value=len(cloud),
-        )
+        wanted, got = f"the {len(features.points)} Gaussians of the features", f"{len(cloud)} others"
+        advice = "name the file that the features were computed on"
+        raise SceneError.expected(wanted, len(cloud), got=got, file=path, name="--cloud", advice=advice)
     return cloud.take(torch.from_numpy(rows)).colors
 
 

@@ -123,11 +123,8 @@ def _pulse(options: Options) -> ForcePulse | None:
 def _paths(output: Path, contacts: Contacts) -> list[Path]:
     if output.suffix.lower() == ".wav" and not output.is_dir():
         if len(contacts.names) > 1:
-            raise OutputError(
-                f"{output}: expected a folder for {len(contacts.names)} contacts, got the name of a file",
-                file=output,
-                value=len(contacts.names),
-            )
+            wanted, count = f"a folder for {len(contacts.names)} contacts", len(contacts.names)
+            raise OutputError.expected(wanted, count, got="the name of a file", file=output)
         expect_writable(output)
         return [output]
     paths = [output / name for name in contacts.names]

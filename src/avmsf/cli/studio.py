@@ -59,9 +59,7 @@ class Options(Printing):
         super().check_inputs()
         expect_modes(self.modes)
         if self.target is None:
-            raise StudioError(
-                "expected a field, a capture folder, a folder of images or a mesh, got none", name="target"
-            )
+            raise StudioError.expected("a field, a capture folder, a folder of images or a mesh", name="target")
 
 
 def run(options: Options) -> int:
@@ -73,10 +71,8 @@ def run(options: Options) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] not in ("anyio", "starlette", "uvicorn"):
             raise
-        raise StudioError(
-            f"expected starlette and uvicorn for the page's server, got no {error.name}; pip install 'avmsf[studio]'",
-            name=error.name,
-        ) from error
+        wanted, advice = "starlette and uvicorn for the page's server", "pip install 'avmsf[studio]'"
+        raise StudioError.expected(wanted, name=error.name, advice=advice) from error
     assert options.target is not None
     opened = open_target(options.target, object=options.object, capture=options.capture)
     computing = serve(

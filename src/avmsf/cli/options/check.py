@@ -50,12 +50,8 @@ class Options(Printing):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if self.write_settings and self.settings is not None:
-            raise CaptureError(
-                f"expected --write-settings without --settings, got both; the new {SETTINGS} would not contain those "
-                f"of {self.settings}",
-                file=self.settings,
-                name="--write-settings",
-            )
+            wanted, advice = "--write-settings without it", f"the new {SETTINGS} would not contain its settings"
+            raise CaptureError.expected(wanted, got="both", file=self.settings, name="--write-settings", advice=advice)
         if self.is_dataset:
             detect_dataset(self.capture)
             for option, given in (("--settings", self.settings), ("--write-settings", self.write_settings or None)):

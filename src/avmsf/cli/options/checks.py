@@ -26,13 +26,12 @@ def expect_writable(path: Path | None) -> None:
     if path is None:
         return
     if is_folder(path):
-        raise OutputError(f"{path}: expected the name of a file, got a folder", file=path, value="folder")
+        raise OutputError.expected("the name of a file", "folder", got="a folder", file=path)
     folder = path.parent
     existing = next(place for place in (folder, *folder.resolve().parents) if place.exists())
     if not existing.is_dir():
-        raise OutputError(
-            f"{path}: expected a folder at {existing}, got a file; choose another folder", file=existing, value="file"
-        )
+        advice = f"choose another folder for {path.name}"
+        raise OutputError.expected("a folder", "file", got="a file", file=existing, advice=advice)
 
 
 def is_folder(path: Path) -> bool:

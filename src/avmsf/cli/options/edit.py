@@ -169,23 +169,20 @@ class Options(Configured):
         if settings.material.law != MaterialSettings.law and not self.changes_material:
             raise EditError.expected("--to, --scale or a constant of a material with it", name="material.law")
         if self.position is not None and self.plots is None:
-            raise EditError("--position: expected --plots with it, got none", name="--position")
+            raise EditError.expected("--plots with it", name="--position")
         if self.old is not None and not (self.changes_material or self.like_material):
             raise EditError.expected(
                 "--to, --scale, a constant of a material or --like-material with it", name="--from"
             )
         if not (self.changes_material or self.changes_modes or self.guides):
-            raise EditError(
-                "expected an edit, got none: give --to, --scale, --pitch, --decay, --brightness, --mode-db, "
-                "--mode-pitch or --mode-decay, --prompt, --like or --like-material, or --set material.young=PASCALS",
-                name="options",
+            ways = (
+                "--to, --scale, --pitch, --decay, --brightness, --mode-db, --mode-pitch, --mode-decay, --prompt, --like"
             )
+            advice = f"give {ways} or --like-material, or --set material.young=PASCALS"
+            raise EditError.expected("an edit", name="options", advice=advice)
         if self.output.exists() and self.field.exists() and self.output.samefile(self.field):
-            raise OutputError(
-                f"{self.output}: expected another file than the field to edit; choose another --output",
-                file=self.output,
-                name="--output",
-            )
+            wanted, got = "another file than the field to edit", "the same"
+            raise OutputError.expected(wanted, got=got, file=self.output, name="--output", advice="choose another")
         if self.plots is not None:
             for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
                 expect_writable(self.plots / name)
@@ -193,12 +190,9 @@ class Options(Configured):
     def _check_guide(self, settings: EditSettings) -> None:
         """Raise EditError for more than one guide, an empty prompt, and settings of a guide that is not given."""
         if len(self.guides) > 1:
-            raise EditError(
-                f"expected one of --prompt, --like and --like-material, got {' and '.join(self.guides)}; use one "
-                "after the other",
-                name=self.guides[0],
-                value=tuple(self.guides),
-            )
+            wanted, advice = "one of --prompt, --like and --like-material", "use one after the other"
+            got = " and ".join(self.guides)
+            raise EditError.expected(wanted, tuple(self.guides), got=got, name=self.guides[0], advice=advice)
         usual, prompted = self.usual, settings.prompt
         if not self.guides:
             for name in ("parameters", "guide"):

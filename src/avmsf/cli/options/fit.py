@@ -139,7 +139,7 @@ class Options(Configured):
 
     def _check_split(self) -> None:
         if self.train_count is not None and self.train_fraction is not None:
-            raise FitError("expected --train-count or --train-fraction, got both; leave one out", name="--train-count")
+            raise FitError.expected("it or --train-fraction", got="both", name="--train-count", advice="leave one out")
         if self.train_fraction is not None and not 0.0 < self.train_fraction < 1.0:
             raise EvaluationError.expected(
                 "a fraction of training contacts between 0 and 1, such as 0.75",

@@ -50,9 +50,7 @@ class Options(Printing):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if not self.recordings:
-            raise OutputError(
-                "expected one recording or more after the field, such as HIT.wav", name="recordings", value=0
-            )
+            raise OutputError.expected("one or more after the field, such as HIT.wav", 0, name="recordings")
         # One that is missing does not keep the others from being located.
         failures = []
         for path in self.recordings:
@@ -63,11 +61,8 @@ class Options(Printing):
         if len(failures) == len(self.recordings):
             raise failures[0]
         if self.true_contact is not None and self.true_contact_table is not None:
-            raise OutputError(
-                "expected true contacts either by --true-contact X Y Z or by --true-contact-table TABLE.csv, got both",
-                name="--true-contact",
-                value=list(self.true_contact),
-            )
+            wanted = "true contacts by it, X Y Z, or by --true-contact-table TABLE.csv"
+            raise OutputError.expected(wanted, list(self.true_contact), got="both", name="--true-contact")
         if not 0.0 < self.probability < 1.0:
             raise OutputError.expected(
                 "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"

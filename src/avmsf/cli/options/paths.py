@@ -57,7 +57,7 @@ class Existing:
         if kind is not None and kind not in self.kinds:
             cached = path / CACHE / CACHED_FIELD
             other = cached if "a sound field" in self.kinds and cached.is_file() else "another"
-            raise InputError(f"{path}: expected {self.what}, got {kind}; name {other}", file=path, value=kind)
+            raise InputError.expected(self.what, kind, got=kind, file=path, advice=f"name {other}")
 
 
 @dataclass(frozen=True)
@@ -89,13 +89,9 @@ class NewFile:
             return
         expect_writable(path)
         if suffix not in self.suffixes:
-            raise OutputError(
-                f"{path}: expected a name that ends in {' or '.join(self.suffixes)}{self.or_folder * ', or a folder'}, "
-                f"got {path.suffix or 'no ending'}; rename it",
-                file=path,
-                name="suffix",
-                value=path.suffix,
-            )
+            wanted = f"a name that ends in {' or '.join(self.suffixes)}{self.or_folder * ', or a folder'}"
+            got = path.suffix or "no ending"
+            raise OutputError.expected(wanted, path.suffix, got=got, file=path, name="suffix", advice="rename it")
 
 
 @dataclass(frozen=True)
@@ -105,12 +101,9 @@ class NewFolder:
     def check(self, path: Path) -> None:
         """Raise `OutputError` for a path where no folder can be made, and for a name with the ending of a file."""
         if not is_folder(path) and path.suffix.lower() in FILE_SUFFIXES:
-            raise OutputError(
-                f"{path}: expected the name of a folder, got one with {path.suffix}; use {path.with_suffix('')}",
-                file=path,
-                name="suffix",
-                value=path.suffix,
-            )
+            got, advice = f"one with {path.suffix}", f"use {path.with_suffix('')}"
+            wanted = "the name of a folder"
+            raise OutputError.expected(wanted, path.suffix, got=got, file=path, name="suffix", advice=advice)
         expect_writable(path / "file")
 
 

@@ -60,17 +60,11 @@ class Options(Printing):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if bool(self.position) == (self.contact_table is not None):
-            raise OutputError(
-                "expected contacts either by --position X Y Z, once or more, or by --contact-table TABLE.csv",
-                name="--position",
-                value=len(self.position),
-            )
+            wanted = "contacts by it, X Y Z, once or more, or by --contact-table TABLE.csv"
+            raise OutputError.expected(wanted, len(self.position), name="--position")
         if self.direction and len(self.direction) != len(self.position):
-            raise OutputError(
-                f"--direction: expected one for each --position, got {len(self.direction)} for {len(self.position)}",
-                name="--direction",
-                value=len(self.direction),
-            )
+            wanted = f"one for each of {len(self.position)} --position"
+            raise OutputError.expected(wanted, len(self.direction), name="--direction")
         for row, place in enumerate(self.position):
             if not all(map(math.isfinite, place)):
                 raise OutputError.expected("finite coordinates", list(place), row=row, name="--position")

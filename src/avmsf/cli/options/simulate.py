@@ -73,7 +73,7 @@ class Options(Configured):
         """Raise `InputError` for a mesh that does not exist, `SimulationError` for options that do not fit."""
         super().check_inputs()
         if self.output is None and not self.list:
-            raise SimulationError("--output: expected a folder, got none; --list names the objects", name="output")
+            raise SimulationError.expected("a folder", name="output", advice="--list names the objects")
         _ = self.all_settings
         named = {each.partition("=")[0].strip() for each in self.set}
         for name in _IDENTITY if self.what in SETS else ():

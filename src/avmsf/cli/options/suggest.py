@@ -39,8 +39,8 @@ class Options(Printing):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if self.settings is not None and self.candidates is None:
-            raise FitError("--settings: expected it with --candidates, got it without; leave it out", name="--settings")
+            raise FitError.expected("--candidates with it", name="--settings", advice="leave it out")
         if self.unseen and self.candidates is not None:
-            raise FitError("--unseen: expected it without --candidates, got both; leave one out", name="--unseen")
+            raise FitError.expected("no --candidates with it", got="both", name="--unseen", advice="leave one out")
         if self.candidates is not None:
             expect_capture(self.candidates, self.settings)
