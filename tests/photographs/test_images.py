@@ -13,7 +13,7 @@ from PIL import Image
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import read_views
 from avmsf.photographs.images import MAX_PIXELS, read_image, read_mask, size_of
-from avmsf.photographs.photograph import MAX_PHOTOGRAPHS
+from avmsf.photographs.lenses import MAX_PHOTOGRAPHS
 from factories.raising import raises, warns
 from factories.views_folder import HEIGHT, WIDTH, frames, ring, write_image, write_transforms
 

@@ -6,9 +6,9 @@ OpenCV's axes, lengths in meters, pixels from the image's corner, so that the fi
 
 Start with `folder.read_views` and `cameras`. On the way to a view:
 
-- `nerf_json`, `colmap`: the two kinds of camera files. Both give a `CameraFile` of `Photograph`s, which `photograph`
-  turns into views: image and mask are read (`images`), the lens's distortion is removed (`lenses`: Brown's and Kannala
-  and Brandt's models, as OpenCV has them), and cameras are fitted to images of another size.
+- `nerf_json`, `colmap`: the two kinds of camera files. Both give a `CameraFile` of `Photograph`s, which `folder` turns
+  into views: image and mask are read (`images`), the lens's distortion is removed (`lenses`: Brown's and Kannala and
+  Brandt's models, as OpenCV has them), and cameras are fitted to images of another size.
 - `segmentation`: masks before a plain background, by color (Otsu's threshold) and the agreement of all views.
 - `visual_hull`: the visual hull (Laurentini 1994) by voting on the cells of a `Grid`; `project_votes` is the one loop
   over views and cells, which `reconstruction` and `gaussians` use too.

@@ -11,8 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from avmsf.errors import CaptureError
-from avmsf.photographs.lenses import Lens, Location
-from avmsf.photographs.photograph import CameraFile, Photograph, check_count
+from avmsf.photographs.lenses import CameraFile, Lens, Location, Photograph, check_count
 
 PLACES = ("sparse/0", "sparse", ".")
 MODELS = {

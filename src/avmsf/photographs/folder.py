@@ -3,7 +3,9 @@
 import json
 import math
 import warnings
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
@@ -14,16 +16,30 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avmsf._utils.files import new_folder
-from avmsf._utils.text import listed
+from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs import colmap, nerf_json
 from avmsf.photographs.cameras import Camera, View, nearest_to_lines
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap
+from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, scale, size_of
+from avmsf.photographs.lenses import CameraFile, Lens, Photograph, undistort
 from avmsf.photographs.nerf_json import OPENCV_FROM_OPENGL, read_transforms
-from avmsf.photographs.photograph import CameraFile, Findings, read_view, summarize
 
 MIN_VIEWS = 3
 _NO_CAMERAS = "neither: photographs without cameras need structure from motion first"
+Findings = defaultdict[str, list[str]]
+"""Names of images, by the keys of `KINDS`."""
+KINDS = {
+    "transform_matrix": ("pose", "with a scaled rotation, whose scale was removed"),
+    "cameras": ("image", "without a camera, not used"),
+    "missing images": ("image", "missing or corrupt, not used"),
+    "empty masks": ("image", "with an empty mask, not used"),
+    "image sizes": ("image", "of another size than the camera, whose intrinsics were scaled"),
+    "orientations": ("image", "rotated by the orientation tag to fit the camera"),
+    "missing masks": ("mask", "missing or corrupt; the images are used without"),
+    "mask sizes": ("mask", "scaled from another size to that of the image"),
+}
+"""Problems of single images, which are reported together: what they concern, and what became of it."""
 
 
 def read_views(
@@ -53,12 +69,16 @@ def read_views(
     findings = Findings(list, transform_matrix=list(cameras.scaled), cameras=cameras.without_camera())
     if max_views is not None:
         photographs = photographs[:: max(1, -(-len(photographs) // max_views))]
-    read = (read_view(each, cameras.folder, longest, meters, findings) for each in photographs)
+    read = (_read_view(each, cameras.folder, longest, meters, findings) for each in photographs)
     views = [view for view in read if view is not None]
     if photographs and len(findings["empty masks"]) == len(photographs):
         wanted, got = "masks with 255 on the object and 0 elsewhere", f"{len(photographs)} without an object"
         raise CaptureError.expected(wanted, 0, got=got, file=cameras.path, name="masks")
-    remarks = summarize(findings)
+    remarks = [
+        Remark(f"{counted(len(names), thing)} {message}: {listed(names)}", kind, names)
+        for kind, (thing, message) in KINDS.items()
+        if (names := findings[kind])
+    ]
     if len(views) < MIN_VIEWS:
         reasons = "".join(f"; {remark.message}" for remark in remarks)
         place = f" (expected {photographs[0].image} and so on)" if findings["missing images"] else ""
@@ -89,6 +109,92 @@ def read_camera_file(folder: Path) -> CameraFile:
     got = f"{listed(others)}; give the path of one of these" if others else _NO_CAMERAS
     wanted = f"transforms.json, or COLMAP's cameras and images (.bin or .txt) in {', '.join(PLACES)}"
     raise CaptureError.expected(wanted, others, got=got, file=folder)
+
+
+def mask_paths(name: str, folder: Path) -> list[Path]:
+    """Return the paths where the mask of the photograph of this name may be, the likeliest first."""
+    path = PurePosixPath(name)
+    return [folder / "masks" / path.with_suffix(".png"), folder / "masks" / f"{path}.png"]
+
+
+def _read_view(
+    photograph: Photograph, folder: Path, longest: int | None, meters: float, findings: Findings
+) -> View | None:
+    """Read one photograph and its mask into a pinhole's view; None, and a finding, where there is nothing to see."""
+    try:
+        pixels = read_image(photograph.image)
+    except UnreadableImageError:
+        findings["missing images"].append(photograph.name)
+        return None
+    pixels, lens = _with_lens(photograph, pixels, findings)
+    pixels, camera = undistort(_with_mask(photograph, folder, pixels, findings), lens)
+    if longest is not None and max(size_of(pixels)) > longest:
+        width, height = (max(1, round(side * longest / max(size_of(pixels)))) for side in size_of(pixels))
+        pixels, camera = scale(pixels, width, height), camera.resized(width, height)
+    mask = torch.from_numpy(np.ascontiguousarray(pixels[..., 3])) if pixels.shape[2] == 4 else None
+    if mask is not None and not mask.any():
+        findings["empty masks"].append(photograph.name)
+        return None
+    pose = photograph.world_to_camera.clone()
+    pose[:3, 3] *= meters
+    image = torch.from_numpy(np.ascontiguousarray(pixels[..., :3]))
+    return View(photograph.name, image, replace(camera, world_to_camera=pose), mask)
+
+
+def _with_lens(
+    photograph: Photograph, pixels: UInt8[np.ndarray, "height width channels"], findings: Findings
+) -> tuple[UInt8[np.ndarray, "height width channels"], Lens]:
+    """Return image and lens of one size; raises CaptureError where their shapes differ."""
+    lens = photograph.lens_of(*size_of(pixels))
+    size = (lens.width, lens.height)
+    if pixels.shape[2] == 3 and size_of(pixels) != size:
+        upright = read_image(photograph.image, upright=True)
+        if size_of(upright) != size_of(pixels) and _same_shape(size_of(upright), size):
+            pixels = upright
+            findings["orientations"].append(photograph.name)
+    if size_of(pixels) == size:
+        return pixels, lens
+    advice = "give the images of which the cameras were estimated, not cropped or rotated"
+    _check_shape(size_of(pixels), size, f"its camera's ({lens.origin})", photograph.image, "image", advice)
+    findings["image sizes"].append(f"{photograph.name} ({_shown(size_of(pixels))} instead of {_shown(size)})")
+    return pixels, lens.resized(*size_of(pixels))
+
+
+def _with_mask(
+    photograph: Photograph, folder: Path, pixels: UInt8[np.ndarray, "height width channels"], findings: Findings
+) -> UInt8[np.ndarray, "height width masked_channels"]:
+    """Return the image with the mask that lies in a file, where it has none of its own."""
+    named = [] if photograph.mask is None else [photograph.mask]
+    paths = [path for path in (*named, *mask_paths(photograph.name, folder)) if path.is_file()] or named
+    if pixels.shape[2] == 4 or not paths:
+        return pixels
+    try:
+        mask = read_mask(paths[0])
+    except UnreadableImageError:
+        findings["missing masks"].append(photograph.name)
+        return pixels
+    size = size_of(pixels)
+    _check_shape(size_of(mask), size, "its image's", paths[0], "mask", "make the mask of this image")
+    if size_of(mask) != size:
+        findings["mask sizes"].append(f"{photograph.name} ({_shown(size_of(mask))} for {_shown(size)})")
+    return np.dstack([pixels, scale(mask, *size)])
+
+
+def _check_shape(found: tuple[int, int], size: tuple[int, int], whose: str, path: Path, name: str, advice: str) -> None:
+    if not _same_shape(found, size):
+        wanted = f"the shape {_shown(size)}, {whose}"
+        raise CaptureError.expected(wanted, list(found), got=_shown(found), file=path, name=name, advice=advice)
+
+
+def _shown(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
+
+
+def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes are one image at two scales, up to a pixel of rounding in the smaller."""
+    small, large = sorted((one, other))
+    factor = large[0] / small[0]
+    return abs(large[1] / factor - small[1]) <= 1
 
 
 def check_cameras(cameras: Sequence[Camera]) -> list[Remark]:

@@ -1,6 +1,7 @@
-"""Lenses as files describe them, with distortion, and images as pinholes would have taken them."""
+"""What camera files say of photographs: lenses, whose distortion is removed here, and poses."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
+from avmsf.capture.filenames import pictures_in
 from avmsf.errors import CaptureError
 from avmsf.photographs.cameras import Camera
 from avmsf.photographs.images import MAX_PIXELS
@@ -18,6 +21,8 @@ _GRID_POINTS = 33
 """Points along each side of a pinhole's image at which a lens is tested."""
 _MAX_FIELD_RATIO = 2.0
 """Width and height that a pinhole takes in over those that the lens has in its middle, at most."""
+MAX_PHOTOGRAPHS = 10_000
+"""Photographs of one object: a video of five minutes, frame by frame. Splatting uses some hundreds."""
 
 
 @dataclass(frozen=True)
@@ -152,3 +157,49 @@ def _sources(
     maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
     across, down = maps(old, coefficients, np.eye(3), new, size, cv2.CV_32FC1)
     return across, down
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """An image file with the camera that took it."""
+
+    name: str
+    """Its path below `images/`, with forward slashes: its name in messages and for masks."""
+    image: Path
+    world_to_camera: Float[Tensor, "4 4"]
+    """Rigid, OpenCV's axes; in the file's unit of length."""
+    lens_of: Callable[[int, int], Lens]
+    """The lens, given the image's width and height, which are used only where the camera file has no size."""
+    mask: Path | None = None
+    """The mask that the file names for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFile:
+    """All that a camera file names."""
+
+    path: Path
+    """The file, or the folder that holds its parts."""
+    folder: Path
+    """Where `images/` and `masks/` are."""
+    photographs: tuple[Photograph, ...]
+    scaled: tuple[str, ...] = ()
+    """Names of photographs of which a scale was removed from the pose's rotation, with the scale."""
+
+    def without_camera(self) -> list[str]:
+        """Return the names of image files that lie among the photographs but have no camera."""
+        known = {path.resolve() for each in self.photographs for path in (each.image, each.mask) if path is not None}
+        images = self.folder / "images"
+        if images.is_dir():
+            found = {path: path.relative_to(images).as_posix() for path in pictures_in(images, deep=True)}
+        else:
+            parents = {each.image.parent for each in self.photographs}
+            found = {path: path.name for parent in parents for path in pictures_in(parent, deep=False)}
+        return sorted(name for path, name in found.items() if path.resolve() not in known)
+
+
+def check_count(count: int, file: Path) -> None:
+    """Raise CaptureError for more than `MAX_PHOTOGRAPHS` in a camera file."""
+    if count > MAX_PHOTOGRAPHS:
+        wanted, advice = f"at most {MAX_PHOTOGRAPHS:,} photographs", "select some hundreds"
+        raise CaptureError.expected(wanted, count, file=file, name="photographs", advice=advice)

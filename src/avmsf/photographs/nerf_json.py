@@ -17,8 +17,7 @@ from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import FrameMismatch
 from avmsf.errors import CaptureError
 from avmsf.mesh.io import load_parts
-from avmsf.photographs.lenses import Lens, Location
-from avmsf.photographs.photograph import CameraFile, Photograph, check_count
+from avmsf.photographs.lenses import CameraFile, Lens, Location, Photograph, check_count
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")

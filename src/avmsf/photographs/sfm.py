@@ -18,8 +18,8 @@ from avmsf._utils.processes import end_child, ending_of, start_child
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, Remark
+from avmsf.photographs.folder import mask_paths
 from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, size_of
-from avmsf.photographs.photograph import mask_paths
 
 WORKER = Path(__file__).with_name("sfm_worker.py")
 MIN_IMAGES = 3

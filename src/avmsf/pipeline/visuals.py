@@ -18,9 +18,8 @@ from avmsf.capture.table import read_rows
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import surface_points
-from avmsf.photographs.folder import read_camera_file, read_views
+from avmsf.photographs.folder import mask_paths, read_camera_file, read_views
 from avmsf.photographs.nerf_json import stated_moves
-from avmsf.photographs.photograph import mask_paths
 from avmsf.photographs.segmentation import find_foreground
 from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import scaled, without_far
