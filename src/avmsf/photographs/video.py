@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
 
 import cv2
@@ -64,26 +65,20 @@ def sharpness(frame: np.ndarray) -> float:
 
 def _pick(path: Path, folder: Path, *, total: int, count: int) -> int:
     """Write the sharpest frame of each span of a video of `total` frames; return how many it had."""
-    read, span, sharpest, best = 0, 0, -1.0, (0, np.empty(0))
-    for number, frame in enumerate(_frames(path)):
-        # The last span takes in frames beyond the total, should there be any.
-        own = min(number * count // total, count - 1)
-        if own > span:
-            _write(folder, *best)
-            span, sharpest = own, -1.0
-        value = sharpness(frame)
-        if value > sharpest:
-            sharpest, best = value, (number, frame)
-        read = number + 1
-    if read:
-        _write(folder, *best)
+    read = 0
+
+    def numbered() -> Iterator[tuple[int, np.ndarray]]:
+        nonlocal read
+        for read, frame in enumerate(_frames(path), start=1):
+            yield read - 1, frame
+
+    # The last span takes in frames beyond the total, should there be any.
+    for _, span in groupby(numbered(), lambda frame: min(frame[0] * count // total, count - 1)):
+        number, sharpest = max(span, key=lambda frame: sharpness(frame[1]))
+        target = folder / f"frame_{number:06d}.png"
+        if not cv2.imwrite(str(target), sharpest):
+            raise OSError(f"{target.name} was not written")
     return read
-
-
-def _write(folder: Path, number: int, frame: np.ndarray) -> None:
-    target = folder / f"frame_{number:06d}.png"
-    if not cv2.imwrite(str(target), frame):
-        raise OSError(f"{target.name} was not written")
 
 
 def _frames(path: Path) -> Iterator[np.ndarray]:
