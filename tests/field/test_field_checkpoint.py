@@ -11,8 +11,9 @@ import torch
 
 from avmsf.errors import FieldFileError, FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fit
+from avmsf.field.fit import fingerprint, fit
 from avmsf.field.gains.attention import Attention
+from avmsf.field.gains.data import gain_data
 from avmsf.field.sound_field import SoundField
 from avmsf.field.trainer import Progress
 from avmsf.field.training import AdamW, TrainingRun
@@ -174,32 +175,30 @@ def test_a_fit_that_diverged_between_two_reads_of_the_loss_leaves_no_checkpoint(
     assert all(bool(each.isfinite().all()) for each in tensors)
 
 
-def _bank(modes, factor):
-    return replace(modes, bank=replace(modes.bank, damping=modes.bank.damping * factor))
+def test_all_that_decides_a_fit_tells_its_checkpoint_from_others():
+    impacts, features = plate_impacts(6, seconds=0.1), plate_features(60)
+    modes = plate_extraction(impacts)
+    other_bank = replace(modes, bank=replace(modes.bank, damping=2 * modes.bank.damping))
+    other_noise = replace(modes, residual=replace(modes.residual, magnitude=2 * modes.residual.magnitude))
+    fits = [
+        *((each, features, modes, CONFIG) for each in (impacts, replace(impacts, sounds=impacts.sounds * 1.5))),
+        (replace(impacts, sample_rate=9000.0), features, modes, CONFIG),
+        *((replace(impacts, directions=each), features, modes, CONFIG) for each in (-impacts.directions, None)),
+        (impacts, plate_features(50), modes, CONFIG),
+        *((impacts, features, each, CONFIG) for each in (other_bank, other_noise)),
+        (impacts, features, modes, replace(CONFIG, seed=1)),
+    ]
+    keys = [fingerprint(gain_data(*each), Attention()) for each in fits]
+    assert len(set(keys)) == len(fits)
+    assert fingerprint(gain_data(*fits[0]), Attention()) == keys[0]
+    assert fingerprint(gain_data(*fits[0]), Attention(plate_features(50))) not in keys
 
 
-def _noise(modes, factor):
-    return replace(modes, residual=replace(modes.residual, magnitude=modes.residual.magnitude * factor))
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        lambda impacts, features, modes: (replace(impacts, sounds=impacts.sounds * 1.5), features, modes, CONFIG),
-        lambda impacts, features, modes: (replace(impacts, sample_rate=9000.0), features, modes, CONFIG),
-        lambda impacts, features, modes: (replace(impacts, directions=-impacts.directions), features, modes, CONFIG),
-        lambda impacts, features, modes: (replace(impacts, directions=None), features, modes, CONFIG),
-        lambda impacts, features, modes: (impacts, plate_features(50), modes, CONFIG),
-        lambda impacts, features, modes: (impacts, features, _bank(modes, 2), CONFIG),
-        lambda impacts, features, modes: (impacts, features, _noise(modes, 2), CONFIG),
-        lambda impacts, features, modes: (impacts, features, modes, replace(CONFIG, seed=1)),
-    ],
-)
-def test_a_checkpoint_of_other_arguments_is_refused_and_kept(tmp_path, other):
-    checkpoint, impacts = tmp_path / "fit.checkpoint", plate_impacts(6, seconds=0.1)
+def test_the_checkpoint_of_another_fit_is_refused_and_kept(tmp_path):
+    checkpoint = tmp_path / "fit.checkpoint"
     with pytest.raises(KeyboardInterrupt):
         fitted(checkpoint, Interruption((STAGES[0], 1)))
     before = checkpoint.read_bytes()
     with raises(FieldFileError, file="fit.checkpoint", value=["input, configuration or version"]):
-        fit(*other(impacts, plate_features(60), plate_extraction(impacts)), gains=Attention(), checkpoint=checkpoint)
+        fitted(checkpoint, config=replace(CONFIG, seed=1))
     assert checkpoint.read_bytes() == before

@@ -48,9 +48,8 @@ def other_field() -> SoundField:
     return replace(field(), bank=replace(field().bank, damping=field().bank.damping * 2))
 
 
-@pytest.mark.parametrize("damping", ["shared", "per-contact", "validated"])
-def test_a_field_comes_back_to_the_last_bit(tmp_path, damping):
-    saved, path, chance = field(damping), tmp_path / "plate.safetensors", torch.get_rng_state()
+def test_a_field_comes_back_to_the_last_bit(tmp_path):
+    saved, path, chance = field("validated"), tmp_path / "plate.safetensors", torch.get_rng_state()
     save(saved, path)
     loaded = load(str(path))
     assert torch.equal(torch.get_rng_state(), chance)
