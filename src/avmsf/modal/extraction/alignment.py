@@ -37,34 +37,34 @@ from avmsf.modal.extraction.phase_likelihood import FIRST_SPREAD, DelayPrior, Me
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import background_power
 
-_MODES = 32
+_MAX_MODES = 32
 """Modes to align by, the strongest: more cost time and hardly narrow the posterior."""
-_LEAST_SEARCHED, _SEARCHED_SAMPLES = 32, 1_400_000
+_MIN_SEARCHED_RECORDINGS, _MIN_SEARCHED_SAMPLES = 32, 1_400_000
 """Modes are looked for in so many recordings, or in as many as hold so many samples together, whichever is more. Where
 this leaves recordings out the delays differ by less than .02 samples."""
-_RANGE_DB = 40.0
+_MODE_RANGE_DB = 40.0
 """Modes this far below the strongest, in energy, are left out."""
-_REFERENCES = 6
+_MAX_REFERENCES = 6
 """Recordings to start from in turn, the most energetic in their modes first."""
-_ROUNDS = 40
+_MAX_ROUNDS = 40
 """Most passes over all recordings."""
-_FIRST_JITTER = 2.0
+_MAX_JITTER_SAMPLES = 2.0
 """Scale of the delays before anything is known of them, samples: what a threshold of a tenth of the peak leaves."""
-_CLOSE = 1.0
+_LAST_REACH_SAMPLES = 1.0
 """Longest delay of the last search, samples."""
-_EXACT = 3.0
+_STILL_LOG_ODDS = 3.0
 """Log odds, per recording, of no delays at all where every file starts with its impact, as impulse responses do. The
 aircraft's and the ruler's, whose modes have no exact phases, seem to have delays by up to 2.5 in 4 of 49 splits; files
 of 20 modes that were trimmed 1 to 2 samples apart gain 6 to 25."""
-_VAGUE = 2.0
+_USUAL_RECORDINGS = 2.0
 """Recordings of the usual spread that a mode's own is mixed with: of few, some modes agree by chance."""
-_LEAST_JITTER = 0.5
+_MIN_JITTER_SAMPLES = 0.5
 """Least scale of the delays, samples: an onset that is found at a sample is off by a part of one."""
-_SETTLING = 4
+_ROUNDS_OF_FIXED_JITTER = 4
 """Passes before the delays' own scale counts."""
-_FRACTIONS = 16
+_ONSET_FRACTIONS = 16
 """Places between two samples where the common start is looked for."""
-_CONVERGED = 1e-3
+_CONVERGED_SAMPLES = 1e-3
 """Samples by which delays still move when the search ends."""
 
 
@@ -177,10 +177,10 @@ def align(impacts: Impacts) -> Alignment | None:
     reach, background = _reach(impacts), background_power(impacts.sounds, bank, impacts.sample_rate)
     measured = MeasuredPhases(impacts, bank, reach=reach, background=background)
     before = after = coherence(measured.amplitude, bank.damping)
-    delays, agreement, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _EXACT)
+    delays, agreement, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _STILL_LOG_ODDS)
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
-        for reached, vague in ((reach, _VAGUE), (_CLOSE, 0.0)):
+        for reached, vague in ((reach, _USUAL_RECORDINGS), (_LAST_REACH_SAMPLES, 0.0)):
             measured = MeasuredPhases(impacts.delayed(delays), bank, reach=reached, background=background)
             further, agreement, phases = _estimate(measured, earlier=delays, vague=vague)
             delays = delays + further
@@ -199,9 +199,9 @@ def align(impacts: Impacts) -> Alignment | None:
 def strongest_modes(impacts: Impacts) -> ModalBank:
     """Return the modes to align by, found in some of the recordings: they are the same in all."""
     # Drawn at random: rows may be ordered by place, in which every third may lie on the same nodal lines.
-    count = max(_LEAST_SEARCHED, _SEARCHED_SAMPLES // impacts.sounds.shape[1])
+    count = max(_MIN_SEARCHED_RECORDINGS, _MIN_SEARCHED_SAMPLES // impacts.sounds.shape[1])
     drawn = torch.randperm(len(impacts), generator=torch.Generator().manual_seed(0))[:count].sort().values
-    return HighResolution(modes=_MODES, range_db=_RANGE_DB).find(impacts.sounds[drawn], impacts.sample_rate)
+    return HighResolution(modes=_MAX_MODES, range_db=_MODE_RANGE_DB).find(impacts.sounds[drawn], impacts.sample_rate)
 
 
 def recording_keys(impacts: Impacts) -> tuple[str, ...]:
@@ -246,15 +246,15 @@ def _common_onset(
     assert impacts.after is not None
     lead = impacts.before.shape[1]
     early = replace(impacts, sounds=impacts.sounds[:, : 3 * lead], after=impacts.after[:, :0])
-    fractions = torch.arange(_FRACTIONS, dtype=torch.float64) / _FRACTIONS
+    fractions = torch.arange(_ONSET_FRACTIONS, dtype=torch.float64) / _ONSET_FRACTIONS
     power = torch.stack(
         [early.delayed(delays - lead + each).sounds[:, : 2 * lead].double().square() for each in fractions], dim=2
     ).flatten(1)
     mean = agreement @ (power / power.sum(1, keepdim=True).clamp_min(1e-300)) / agreement.sum()
     highest = float(mean.max())
     # Noise within 10 dB of the sounds hides all but their loudest.
-    threshold = min(max(0.01 * highest, 10 * float(mean[: _FRACTIONS * lead // 2].median())), highest)
-    return float((mean >= threshold).nonzero()[0, 0]) / _FRACTIONS - lead
+    threshold = min(max(0.01 * highest, 10 * float(mean[: _ONSET_FRACTIONS * lead // 2].median())), highest)
+    return float((mean >= threshold).nonzero()[0, 0]) / _ONSET_FRACTIONS - lead
 
 
 def _has_lead(impacts: Impacts) -> bool:
@@ -293,7 +293,7 @@ def _estimate(
     measured: MeasuredPhases,
     *,
     earlier: Float64[Tensor, " contacts"] | None = None,
-    vague: float = _VAGUE,
+    vague: float = _USUAL_RECORDINGS,
     exact: float = 0.0,
 ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"], Phases]:
     """Return the delays' medians, the probabilities that recordings agree, and the phases at the delayed starts.
@@ -302,9 +302,9 @@ def _estimate(
     zero where that is likelier, with `exact` added to its log odds a recording. `vague` as in `MeasuredPhases.spread`.
     """
     if earlier is None:
-        prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _FIRST_JITTER)
+        prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _MAX_JITTER_SAMPLES)
         energy = measured.squares / measured.bank.damping
-        broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_REFERENCES]
+        broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_MAX_REFERENCES]
         fits: list[_Fit] = []
         for reference in broadest.tolist():
             fits.append(_climb(measured, prior, reference=reference, known=fits))
@@ -312,12 +312,12 @@ def _estimate(
         fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(measured))]
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
-        fit = _climb(measured, DelayPrior(-earlier, _FIRST_JITTER), vague=vague)
+        fit = _climb(measured, DelayPrior(-earlier, _MAX_JITTER_SAMPLES), vague=vague)
     turned = fit.weights * measured.doubled(fit.delays)
     _, odds, _ = measured.search(fit.spread, turned.sum(0) - turned, fit.prior)
     agreement = odds.sigmoid()
     # The share that agrees is learned from all: without common phases single recordings may agree by chance.
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         share = (agreement.sum() + 1) / (len(odds) + 2)
         agreement = (odds + share.logit()).sigmoid()
     doubled = (agreement[:, None] * turned).sum(0)
@@ -330,7 +330,7 @@ def _climb(
     prior: DelayPrior,
     *,
     reference: int | None = None,
-    vague: float = _VAGUE,
+    vague: float = _USUAL_RECORDINGS,
     known: Sequence[_Fit] = (),
 ) -> _Fit:
     """Return the delays of a highest posterior, climbed from all recordings aligned with one, or as they are.
@@ -343,7 +343,7 @@ def _climb(
     if reference is not None:
         alone = (weights[reference] * measured.doubled(delays)[reference]).expand(len(measured), -1)
         delays, _, _ = measured.search(spread, alone, prior)
-    for turn in range(_ROUNDS):
+    for turn in range(_MAX_ROUNDS):
         turned = weights * measured.doubled(delays)
         found, _, spreads = measured.search(spread, turned.sum(0) - turned, prior)
         if reference is not None:
@@ -354,10 +354,10 @@ def _climb(
         moved = float((found - delays).abs().max())
         delays, spread = found, measured.spread(weights, found, vague=vague)
         weights = measured.concentration(spreads)
-        if turn >= _SETTLING:
+        if turn >= _ROUNDS_OF_FIXED_JITTER:
             scale = float((delays - prior.middle).abs().median())
-            prior = replace(prior, scale=min(max(_LEAST_JITTER, scale), _FIRST_JITTER))
-            if moved < _CONVERGED:
+            prior = replace(prior, scale=min(max(_MIN_JITTER_SAMPLES, scale), _MAX_JITTER_SAMPLES))
+            if moved < _CONVERGED_SAMPLES:
                 break
     turned = weights * measured.doubled(delays)
     total = turned.sum(0)
@@ -369,9 +369,9 @@ def _climb(
 def _unmoved(measured: MeasuredPhases) -> _Fit:
     """Return the fit without any delay."""
     delays, spread = torch.zeros(len(measured), dtype=torch.float64), torch.full_like(measured.power, FIRST_SPREAD)
-    for _ in range(_SETTLING):
-        spread = measured.spread(measured.concentration(spread), delays, vague=_VAGUE)
+    for _ in range(_ROUNDS_OF_FIXED_JITTER):
+        spread = measured.spread(measured.concentration(spread), delays, vague=_USUAL_RECORDINGS)
     weights = measured.concentration(spread)
     total = (weights * measured.doubled(delays)).sum(0)
-    prior = DelayPrior(delays[:1], _LEAST_JITTER)
+    prior = DelayPrior(delays[:1], _MIN_JITTER_SAMPLES)
     return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total))

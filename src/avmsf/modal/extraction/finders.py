@@ -20,12 +20,12 @@ from avmsf.modal.residual_noise import noise_bins, noise_power
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 _MIN_NOISE_POWER = 1e-12
 """Least power of the noise, of sounds of mean power one: rounding of what is recorded without any."""
-_LEAST_FALL = 0.3
+_MIN_FALL_NEPERS = 0.3
 """A mode that falls by fewer nepers over the whole sound is not told from hum."""
-_LEAST_TURN = 0.5
+_MIN_TURN_RADIANS = 0.5
 """Radians by which a mode turns against half the sample rate while it falls to 1/e: with fewer its samples are all but
 nothing in sine phase, and the gain of what is heard would be enormous."""
-_PERIODS = 50
+_MIN_PERIODS = 50
 """How many periods of the lowest frequency the sounds last: with fewer, a mode is not told from rumble."""
 
 
@@ -78,8 +78,8 @@ class HighResolution(ModeFinder):
         bank = self._select(selection, merge(found, duration=samples / sample_rate), lowest)
         # Hum and thuds are fitted beside the modes, or modes that are not there would stand in for them.
         toned = math.pi * bank.frequency > self.least_quality * bank.damping
-        turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _LEAST_TURN * bank.damping
-        return bank.take(toned & turning & (bank.damping >= _LEAST_FALL * sample_rate / samples))
+        turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _MIN_TURN_RADIANS * bank.damping
+        return bank.take(toned & turning & (bank.damping >= _MIN_FALL_NEPERS * sample_rate / samples))
 
     def _select(self, selection: Selection, found: ModalBank, lowest: float) -> ModalBank:
         """Return those of `found` that the sounds need, refined.
@@ -142,7 +142,7 @@ def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
 
 def lowest_frequency(samples: int, sample_rate: float) -> float:
     """Return the lowest frequency (Hz) at which sounds of this length let a mode be told from rumble."""
-    return _PERIODS * sample_rate / samples
+    return _MIN_PERIODS * sample_rate / samples
 
 
 def _power_of_two(value: float, *, least: int) -> int:

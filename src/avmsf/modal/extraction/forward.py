@@ -8,7 +8,7 @@ from torch import Tensor
 
 from avmsf._utils.compiled import compiled
 
-_DISTINCT = 1e-6
+_MIN_INDEPENDENT_AREA = 1e-6
 """Part of a candidate's (sine, cosine) area that the chosen ones must leave for it to count as another mode."""
 
 
@@ -50,7 +50,7 @@ def _choose(inner, products, noise, given, significance, reach, whole, rows, own
     for mode in range(modes):
         if given[mode]:
             done[mode] = True
-            if _area(inner, mode) > _DISTINCT * whole[mode]:
+            if _area(inner, mode) > _MIN_INDEPENDENT_AREA * whole[mode]:
                 _eliminate(mode, inner, products, done, rows, own)
     greatest = 0.0
     for _ in range(modes):
@@ -59,7 +59,7 @@ def _choose(inner, products, noise, given, significance, reach, whole, rows, own
         for mode in range(modes):
             area = _area(inner, mode)
             # What the chosen ones span already cannot be judged: only rounding is left of it.
-            if done[mode] or not area > _DISTINCT * whole[mode]:
+            if done[mode] or not area > _MIN_INDEPENDENT_AREA * whole[mode]:
                 continue
             sine, cosine = 2 * mode, 2 * mode + 1
             crossed = inner[sine, cosine] + inner[cosine, sine]

@@ -11,15 +11,15 @@ from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 
-_CANDIDATES = 8
+_MAX_CANDIDATES = 8
 """Highest peaks of the density among which a delay is chosen."""
-_NEWTON_STEPS = 8
+_MAX_NEWTON_STEPS = 8
 """Of each search, at most one grid step long each."""
-_EXACT = 1e-6
+_CONVERGED_SAMPLES = 1e-6
 """They end earlier where all delays move by less than this, samples."""
-_GRID_PER_PERIOD = 10
+_GRID_STEPS_PER_PERIOD = 10
 """Grid points in half a period of the highest mode, after which its doubled phase repeats."""
-_RELATIVE = 0.05
+_RELATIVE_ERROR = 0.05
 """Error across the phase of any amplitude, over the amplitude: frequencies and dampings are never exact."""
 _OUTLIER_SHARE = 0.2
 """Part of the phases that lie anywhere: of modes that are hardly excited, or that two close modes are taken for. And of
@@ -28,7 +28,7 @@ _USUAL_SPREAD = 0.05
 """Spread of a mode of which little is known: phases to .2 rad."""
 FIRST_SPREAD = 0.25
 """The spread of a mode before anything is known of it: half of what phases without a mean would have."""
-_WIDE = 4.0
+_WIDE_RATIO = 4.0
 """A recording's own spread over that of most, if it is one of the part that is wide: of close modes that a contact
 excites differently the phases are others there."""
 _MEDIAN_OF_SQUARE = 0.455
@@ -95,7 +95,7 @@ class MeasuredPhases:
         scaled = self.amplitude / scale
         self.phase, self.squares = scaled.angle(), scaled.abs().square()
         self.power = self.squares.mean(0) if power is None else power
-        self.step = min(0.5, rate / (2 * _GRID_PER_PERIOD * float(bank.frequency.max())))
+        self.step = min(0.5, rate / (2 * _GRID_STEPS_PER_PERIOD * float(bank.frequency.max())))
         steps = math.ceil(reach / self.step)
         self.grid = self.step * torch.arange(-steps, steps + 1, dtype=torch.float64)
         """Delays that are searched, samples."""
@@ -111,7 +111,7 @@ class MeasuredPhases:
     def variance(self, spread: Float64[Tensor, "*#contacts modes"]) -> Float64[Tensor, "contacts modes"]:
         """Return the variance across the phase."""
         shared = spread * torch.sqrt(self.squares * self.power)
-        return (self.noise + shared + _RELATIVE**2 * self.squares).clamp_min(torch.finfo(torch.float64).tiny)
+        return (self.noise + shared + _RELATIVE_ERROR**2 * self.squares).clamp_min(torch.finfo(torch.float64).tiny)
 
     def concentration(self, spread: Float64[Tensor, "*#contacts modes"]) -> Float64[Tensor, "contacts modes"]:
         """Return the concentrations of the doubled phases."""
@@ -157,7 +157,7 @@ class MeasuredPhases:
         `doubled` is the sum of the others' weights times exp(2 i phase), for each recording. The odds compare phases
         about these, over all delays of the prior and both spreads, with phases that are anything.
         """
-        spreads = torch.stack([spread, torch.maximum(spread, (_WIDE * spread).clamp_max(FIRST_SPREAD))])
+        spreads = torch.stack([spread, torch.maximum(spread, (_WIDE_RATIO * spread).clamp_max(FIRST_SPREAD))])
         found = [self._search(self.concentration(each), doubled, prior) for each in spreads]
         delays, odds = (torch.stack(each) for each in zip(*found, strict=True))
         odds = odds + torch.tensor([[1 - _OUTLIER_SHARE], [_OUTLIER_SHARE]], dtype=torch.float64).log()
@@ -185,11 +185,11 @@ class MeasuredPhases:
             likely = turned * _inlier_probability(turned, level)
             return turned, -(self.turn * likely.imag).sum(1), (self.turn.square() * likely.real).sum(1)
 
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(_MAX_NEWTON_STEPS):
             _, slope, bend = derivatives()
             step = torch.where(bend > 0, (prior.slope(delays) + slope) / bend, 0.0).clamp(-self.step, self.step)
             delays = delays + step
-            if float(step.abs().max()) < _EXACT:
+            if float(step.abs().max()) < _CONVERGED_SAMPLES:
                 break
         turned, _, bend = derivatives()
         return delays, _agreement(turned, level) + occam_factor(prior, delays, bend)
@@ -204,7 +204,7 @@ class MeasuredPhases:
         rises = torch.nn.functional.pad(score[:, 1:] >= score[:, :-1], (1, 0), value=True)
         falls = torch.nn.functional.pad(score[:, :-1] >= score[:, 1:], (0, 1), value=True)
         peaks = torch.where(rises & falls, score, -math.inf)
-        return self.grid[torch.topk(peaks, min(_CANDIDATES, len(self.grid)), dim=1).indices]
+        return self.grid[torch.topk(peaks, min(_MAX_CANDIDATES, len(self.grid)), dim=1).indices]
 
 
 def _agreement(

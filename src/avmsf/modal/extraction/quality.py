@@ -38,7 +38,7 @@ from avmsf.modal.inner_products import poles_of
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import background_power
 
-_FALSE_MODES = 0.1
+_MAX_FALSE_MODES = 0.1
 """Expected number of wrong decisions in a capture, by each of the two tests: as for selection (`chance_ratio`)."""
 
 
@@ -83,7 +83,7 @@ def measure_quality(
     standing = torch.nonzero(pitched & _stands_out(explained, moves.unexplained(), noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
     part = bank.take(standing)
-    double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_FALSE_MODES / len(bank))
+    double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_MAX_FALSE_MODES / len(bank))
     is_mode = torch.zeros(len(bank), dtype=torch.bool)
     is_mode[standing[~double]] = True
     spread = moves.spread()
@@ -137,7 +137,7 @@ def _stands_out(
     has no more misfit than that, selection has already tested what it explains.
     """
     contacts, modes = explained.shape
-    level = _FALSE_MODES / modes
+    level = _MAX_FALSE_MODES / modes
     logarithms = torch.log1p(explained / unexplained.clamp_min(torch.finfo(torch.float64).tiny)).sum(0)
     by_energy = torch.from_numpy(gammaincc(contacts, logarithms.numpy())) < level
     only_noise = torch.from_numpy(gammaincc(contacts, (unexplained / noise).sum(0).numpy() / 2)) > level

@@ -16,11 +16,11 @@ from avmsf.modal.residual_noise import noise_at
 
 _CHUNK, _SHARED = 120, 30
 """Candidates judged together, in order of frequency, and how many of them the next chunk judges again."""
-_APART = 0.01
+_MIN_APART = 0.01
 """Least part of a mode that the others must not span: with less, gains of large and opposite modes would cancel."""
-_SAME = 0.03
+_MERGED_WIDTHS = 0.03
 """Candidates closer than this part of their width, with dampings as close, are one."""
-_NEIGHBORS = 30
+_MAX_NEIGHBORS = 30
 """Kept candidates just below a new one among which it may find its double."""
 
 
@@ -34,11 +34,14 @@ def merge(bank: ModalBank, *, duration: float) -> ModalBank:
 
     def repeats(row: int, other: int) -> bool:
         narrow = max(min(rates[row], rates[other]), 1 / duration) / (2 * math.pi)
-        return ascending[row] - ascending[other] < _SAME * narrow and abs(math.log(rates[row] / rates[other])) < _SAME
+        return (
+            ascending[row] - ascending[other] < _MERGED_WIDTHS * narrow
+            and abs(math.log(rates[row] / rates[other])) < _MERGED_WIDTHS
+        )
 
     kept: list[int] = []
     for row in range(len(ascending)):
-        if not any(repeats(row, other) for other in kept[-_NEIGHBORS:]):
+        if not any(repeats(row, other) for other in kept[-_MAX_NEIGHBORS:]):
             kept.append(row)
     return bank.take(torch.tensor(kept, dtype=torch.long))
 
@@ -137,7 +140,7 @@ class Selection:
             lost, apart = system.lost_without()
             ratio = (lost / noise).mean(0) / 2
             total = lost.sum(0)
-            weak = (ratio < self.significance) | (total < total.max() * 10 ** (-range_db / 10)) | (apart < _APART)
+            weak = (ratio < self.significance) | (total < total.max() * 10 ** (-range_db / 10)) | (apart < _MIN_APART)
             if not weak.any():
                 break
             width = torch.maximum(bank.damping[:, None], bank.damping[None, :]) * (3 / (2 * math.pi))
