@@ -18,7 +18,7 @@ MAX_CONTACT_SECONDS = 0.02
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-def _expect(fits: bool, wanted: str, value: object, name: str) -> None:
+def _expect(fits: object, wanted: str, value: object, name: str) -> None:
     if not fits:
         raise SimulationError.expected(wanted, value, name=name)
 

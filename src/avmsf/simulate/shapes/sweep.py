@@ -24,7 +24,7 @@ def swept(
     heights: Float64[np.ndarray, " layers"],
     start: Float64[np.ndarray, "columns 3"],
     end: Float64[np.ndarray, "columns 3"] | None = None,
-) -> Float64[np.ndarray, "layers columns 3"]:
+) -> Float64[np.ndarray, "inner columns 3"]:
     """Return where the columns of a patch of `_BANDS` pass that grows to a rod, without the patches at both ends.
 
     The rod lies in the plane y = 0: `curve` is its middle, x and z, from the patch it leaves; its cross-section is an
