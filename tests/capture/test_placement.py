@@ -66,22 +66,22 @@ def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_i
     assert not placement.off
     assert placement.fault != "none"
     assert "multiplied by 1000" in placement.describe()
-    assert "is the surface's unit mm?" in placement.describe()
+    assert 'is the surface\'s unit "mm"?' in placement.describe()
 
 
 EYE, HERE = torch.eye(3, dtype=torch.float64), (0.0, 0.0, 0.0)
 MISTAKES = {
-    "mm": (1e-3, EYE, HERE, "is their unit mm?", True),
-    "cm": (1e-2, EYE, HERE, "is their unit cm?", True),
-    "inches": (0.0254, EYE, HERE, "is their unit in?", True),
-    "feet": (0.3048, EYE, HERE, "is their unit ft?", True),
+    "mm": (1e-3, EYE, HERE, 'is their unit "mm"?', True),
+    "cm": (1e-2, EYE, HERE, 'is their unit "cm"?', True),
+    "inches": (0.0254, EYE, HERE, 'is their unit "in"?', True),
+    "feet": (0.3048, EYE, HERE, 'is their unit "ft"?', True),
     "y up": (1.0, Y_UP, HERE, "(x, -z, y)", True),
     "z up for y up": (1.0, Y_UP.T, HERE, "(x, z, -y)", True),
     "upside down": (1.0, torch.diag(EYE.new_tensor([1, -1, -1])), HERE, "(x, -y, -z)", True),
     "mirrored": (1.0, torch.diag(EYE.new_tensor([-1, 1, 1])), HERE, "mirrored?", True),
     "other origin": (1.0, EYE, (0.7, -0.2, 0.4), "moved by (0.", True),
     "displaced by 4 %": (1.0, EYE, (0.017, 0.0, 0.0), "moved by (0.0", False),
-    "unit, axes and origin": (1e-3, Y_UP, (0.5, 0.1, -0.3), "multiplied by 0.001 (is their unit mm?), with", True),
+    "unit, axes and origin": (1e-3, Y_UP, (0.5, 0.1, -0.3), 'multiplied by 0.001 (is their unit "mm"?), with', True),
     "12 % too small": (1.12, EYE, HERE, "multiplied by 1.1", False),
     "7.3 times too small": (7.3, EYE, HERE, "multiplied by 7", True),
 }
@@ -192,7 +192,7 @@ def test_the_aircrafts_contacts_lie_on_it_and_its_mistakes_are_named(shared: Pat
     placement = check_placement(contacts, points)
     assert placement.fault == "none"
     assert float(placement.distances.max()) < 0.01
-    assert "is their unit mm?" in check_placement(1000 * contacts, points).describe()
+    assert 'is their unit "mm"?' in check_placement(1000 * contacts, points).describe()
     assert "(x, -z, y)" in check_placement(contacts @ Y_UP, points).describe()
 
 

@@ -191,7 +191,7 @@ def test_a_force_channel_says_where_an_impulse_response_starts(tmp_path: Path) -
 def test_a_dataset_s_recordings_have_margins_in_the_sounds_unit() -> None:
     files = {name: each.astype(np.float64) for name, each in pre_triggered(40, 300, 1000).items()}
     recordings = [
-        (Impact(name, [row] * 3, gain_db=20.0), Recording(name, each[None], float(RATE), "FLOAT"))
+        (Impact(name, [float(row)] * 3, gain_db=20.0), Recording(name, each[None], float(RATE), "FLOAT"))
         for row, (name, each) in enumerate(files.items())
     ]
     impacts = build_capture(

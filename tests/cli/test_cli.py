@@ -414,7 +414,7 @@ def test_a_surface_in_another_unit_is_refused_once(tmp_path: Path, capsys: Strea
     output = tmp_path / "field.safetensors"
     assert main(["fit", str(folder), "--output", str(output), "--gain-model", "smooth", *TINY]) == 2
     _, err = capsys.readouterr()
-    assert err.count("is the surface's unit mm?") == 1
+    assert err.count('is the surface\'s unit "mm"?') == 1
     assert not output.exists()
 
 

@@ -93,7 +93,8 @@ class FrameMismatch:
             return f"{within} once moved as {self.stated} says that the object was: give both in one frame"
         if self.factor != 1:
             whose = "the surface's" if self.factor > 1 else "their"
-            steps.append(f"multiplied by {self.factor:.4g}" + (f" (is {whose} unit {self.unit}?)" if self.unit else ""))
+            unit = f' (is {whose} unit "{self.unit}"?)' if self.unit else ""
+            steps.append(f"multiplied by {self.factor:.4g}{unit}")
         if self.turned:
             names = ["-" * bool(row.min() < 0) + "xyz"[int(np.abs(row).argmax())] for row in self.axes]
             mirrored = " (are they mirrored?)" if np.linalg.det(self.axes) < 0 else ""
