@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture import Impacts
+from avmsf.evaluation.objects import roughened
 from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
@@ -28,7 +29,7 @@ from avmsf.field.gains.symmetry import Symmetric
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.pipeline.bodies import candidate_bodies, roughened
+from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.recipe import ABLATED
 from avmsf.simulate.shapes import make_shape

@@ -206,10 +206,10 @@ def _visual(options: Options) -> Report:
         lifted = lift_pictures(surface, views)
         variants = {
             "positions": geometry,
-            "visual": finish(lifted, symmetry=False).features,
-            "visual_symmetric": finish(lifted, symmetry=True).features,
-            "visual_alone": finish(lifted, symmetry=False, positions=False).features,
-            "visual_alone_symmetric": finish(lifted, symmetry=True, positions=False).features,
+            "visual": finish(lifted, symmetry=False),
+            "visual_symmetric": finish(lifted, symmetry=True),
+            "visual_alone": finish(lifted, symmetry=False, positions=False),
+            "visual_alone_symmetric": finish(lifted, symmetry=True, positions=False),
         }
         modes, config = extract_modes(train), QUICK_LOOK if options.quick_look else FitConfig()
         train, test = modes.aligned(train), modes.aligned(test)

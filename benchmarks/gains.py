@@ -15,6 +15,7 @@ import torch
 from avmsf.capture import Impacts
 from avmsf.errors import CaptureWarning
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample
+from avmsf.evaluation.objects import roughened
 from avmsf.evaluation.scores import evaluate, score
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import split
@@ -33,7 +34,6 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.pipeline.bodies import roughened
 from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth

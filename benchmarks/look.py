@@ -9,13 +9,14 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.feature_field import FeatureField
 from avmsf.features.lift import Lifted
 from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.pipeline.config import LiftConfig
-from avmsf.pipeline.features import MadeFeatures, finish_features, lift_to_surface
+from avmsf.pipeline.features import finish_features, lift_features
 from tests.oracles.plate import Plate
 
 AMBIENT = 0.3
@@ -50,12 +51,12 @@ def pictures(mesh: TexturedMesh, *, count: int, size: int) -> tuple[View, ...]:
 
 def lift_pictures(surface: Surface, views: tuple[View, ...], *, points: int = 8192) -> Lifted:
     """Lift the built-in descriptors onto points of the surface."""
-    return lift_to_surface(surface, views, ImageDescriptors(), LiftConfig(points=points))
+    return lift_features(surface, views, ImageDescriptors(), LiftConfig(points=points))
 
 
-def finish(lifted: Lifted, *, symmetry: bool, positions: bool = True) -> MadeFeatures:
+def finish(lifted: Lifted, *, symmetry: bool, positions: bool = True) -> FeatureField:
     """Make features of the default settings with or without pooling over symmetries."""
-    return finish_features(lifted, LiftConfig(symmetry=symmetry, positions=positions))
+    return finish_features(lifted, LiftConfig(symmetry=symmetry, positions=positions))[0]
 
 
 def _bowl() -> trimesh.Trimesh:

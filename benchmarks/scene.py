@@ -18,11 +18,13 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.features import finish_features
 from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.scene import ProgressListener
+from avmsf.pipeline.progress import ProgressListener
 from avmsf.pipeline.stages import StageFolder
+from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.dino import measure_dino
-from benchmarks.look import SHAPES, finish, lift_pictures, pictures, shape, slab, speckled
+from benchmarks.look import SHAPES, lift_pictures, pictures, shape, slab, speckled
 from benchmarks.material import STRUCK
 from benchmarks.rasterizer import measure_rasterizer
 from benchmarks.report import Options, Report, Table, log
@@ -54,12 +56,12 @@ def _consistency(options: Options) -> Report:
         surface = shape(name)
         views = pictures(TexturedMesh.plain(surface), count=count, size=size)
         lifted = lift_pictures(surface, views, points=points)
-        made = finish(lifted, symmetry=True, positions=False)
-        assert made.symmetries is not None
-        found = len(made.symmetries.rotations), len(made.symmetries.mirrors)
-        if made.symmetries:
-            before = orbit_spread(lifted.features, made.symmetries)
-            after = orbit_spread(refine(lifted.features, made.symmetries), made.symmetries)
+        _, made = finish_features(lifted, LiftConfig(positions=False))
+        symmetries = Symmetries.from_dict(made["symmetries"])
+        found = len(symmetries.rotations), len(symmetries.mirrors)
+        if symmetries:
+            before = orbit_spread(lifted.features, symmetries)
+            after = orbit_spread(refine(lifted.features, symmetries), symmetries)
         else:
             before = after = float("nan")
         key = f"consistency.{name.replace(' ', '_')}"
@@ -93,10 +95,10 @@ def _pipeline(options: Options) -> Report:
         made = fit_in_stages(capture, config, StageFolder(Path(place) / "cache"), listener=ProgressListener(log))
         taken = time.perf_counter() - begun
         error = evaluate(load(made.field), test).mean()["relative_stft"]
-    rows: list[list[str | float]] = [[each.stage, each.seconds] for each in made.stages]
+    rows: list[list[str | float]] = [[name, each.seconds] for name, each in made.stages.items()]
     title = f"{count} pictures of {size} x {size}, 8 recordings of {seconds:g} s: images to field, seconds"
     figures = {"pipeline.seconds": taken, "pipeline.error": error}
-    figures |= {f"pipeline.{each.stage}_seconds": each.seconds for each in made.stages}
+    figures |= {f"pipeline.{Path(name).stem}_seconds": each.seconds for name, each in made.stages.items()}
     convention = (
         f"pipeline: default settings, built-in descriptors; {torch.get_num_threads()} threads; pipeline.error: "
         f"relative STFT error at the {len(test)} contacts that were not recorded."

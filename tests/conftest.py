@@ -1,15 +1,12 @@
 """Where the tests find measured data, which is not part of the package."""
 
 import gc
-import math
 import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from avmsf.cli import heartbeat
 
 
 @pytest.hookimpl(wrapper=True)
@@ -45,9 +42,3 @@ def _seed_of_torch() -> None:
     """Give each test the same random numbers, whichever tests ran before it in its process."""
     if (torch := sys.modules.get("torch")) is not None:
         torch.manual_seed(0)
-
-
-@pytest.fixture(autouse=True)
-def _no_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep a busy machine from adding lines to what verbs print."""
-    monkeypatch.setattr(heartbeat, "SILENCE_SECONDS", math.inf)

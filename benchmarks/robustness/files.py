@@ -25,6 +25,7 @@ from pathlib import Path
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
+from avmsf.cli import options_of
 from avmsf.errors import AvmsfError
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.textured_mesh import read_textured_mesh
@@ -67,9 +68,9 @@ class Family:
 
 def run_verb(*words: str) -> None:
     """Run a verb in this process, without what turns errors into exit codes; raises AvmsfError for a refusal."""
-    verb, options = (import_module(f"avmsf.cli.{home}{words[0]}") for home in ("", "options."))
+    verb = import_module(f"avmsf.cli.{words[0]}")
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        code = verb.run(options.Options.parse(words[1:]))
+        code = verb.run(options_of(words[0], words[1:]))
     # `check` refuses a capture by its code: its report says why.
     if code == 2:
         raise AvmsfError(" ".join(words))

@@ -8,7 +8,7 @@ import pytest
 from avmsf.datasets.objectfolder import CONTACT_LISTS, read_contacts
 from avmsf.errors import AvmsfError, DatasetError, EvaluationError
 from avmsf.evaluation.results import IDENTITY, ResultsFolder
-from avmsf.pipeline.stages import StageFolder
+from avmsf.pipeline.stages import Stage, StageFolder
 
 NESTED = "[" * 100_000
 
@@ -42,7 +42,7 @@ def test_a_stage_whose_record_is_nested_runs_again(tmp_path: Path) -> None:
         path.write_text("made")
 
     for _ in range(2):
-        StageFolder(tmp_path).keep("stage", {}, make)
+        StageFolder(tmp_path).keep(Stage("stage", make))
         (record,) = tmp_path.glob("*.json")
         record.write_text(NESTED)
     assert len(made) == 2

@@ -6,15 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli.evaluate import run
-from avmsf.cli.options.evaluate import Options
+from avmsf.cli.evaluate import Options, run
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.task import Task
 from avmsf.modal.extraction.finders import ShortTime
-from avmsf.simulate.recipe import ABLATED
 from factories.plate_set import fill_plates
 from factories.raising import raises
 from factories.settings import sets
@@ -96,39 +94,6 @@ def test_files_are_of_one_set_of_training_recordings(plates: Path, tmp_path: Pat
     with raises(EvaluationError, name="method", value=method):
         options.check_inputs()
     Options.parse(["closest", str(plates), "--methods", method]).check_inputs()
-
-
-def test_what_is_taken_without_being_asked_for_is_printed(
-    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stop(*given: object, **settings: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
-    chosen, others = ABLATED[:2], ("spare", "extra")
-    plates = fill_plates(tmp_path / "plates", (*chosen, *others), count=2, truth=True)
-    words = ["closest", str(plates), "--no-cdpam", "--methods", f"recorded:{plates}", "--quiet"]
-    words += ["--output", str(tmp_path / "results")]
-    assert run(Options.parse([*words, "--time-zero", "peak"])) == 130
-    objects, start = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note:")]
-    assert all(name in objects for name in (*chosen, "--objects"))
-    assert not any(name in objects for name in others)
-    assert f"recorded:{plates}" in start
-    assert run(Options.parse([*words, "--objects", others[0]])) == 130
-    assert "note:" not in capsys.readouterr().err
-
-
-def test_options_of_another_protocol_are_noted(
-    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = ["farthest", str(plates), *CHEAP, "--objects", "a", "--output", "results"]
-    assert run(Options.parse([*words, "--starts", "2", "--test", "001.wav"])) == 0
-    notes = [line for line in capsys.readouterr().err.splitlines() if line.startswith("note")]
-    assert [[name for name in ("--test", "--starts", "--counts") if name in note] for note in notes] == [
-        ["--test"],
-        ["--starts"],
-    ]
 
 
 @pytest.mark.parametrize("words", WRONG)
@@ -237,7 +202,7 @@ def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: py
         asked.append(evaluation)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("avmsf.cli.evaluate.run_objects", stop)
+    monkeypatch.setattr("avmsf.evaluation.runner.run_objects", stop)
     words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--set", "body.wall=0"]
     assert run(Options.parse([*words, "--set", "geometry=noisy"])) == 130
     inputs = asked[0].inputs

@@ -15,8 +15,7 @@ import torch
 import trimesh
 
 from avmsf.cli import main
-from avmsf.cli.export import run
-from avmsf.cli.options.export import Options
+from avmsf.cli.export import Options, run
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, CaptureWarning
@@ -200,15 +199,6 @@ def test_sfz_is_refused_with_the_format_that_holds_it(field_file: Path, tmp_path
     assert "wavs" in capsys.readouterr().err
 
 
-def test_a_new_parent_folder_is_said_once(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    folder = str(tmp_path / "new" / "dir")
-    said = []
-    for name in ("a.uff", "b.uff"):
-        assert main(["export", str(field_file), "--to", "uff", "--output", f"{folder}/{name}"]) == 0
-        said.append([line.endswith(folder) for line in capsys.readouterr().err.splitlines()].count(True))
-    assert said == [1, 0]
-
-
 def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     words = ["export", str(field_file), "--to", "web", "--contacts", "30"]
     for name in ("page", "page.html"):
@@ -222,30 +212,6 @@ def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys
     (*_, served, opened) = [line for line in err.splitlines() if line.startswith("next: ")]
     assert f"http.server --directory {tmp_path / 'page'}" in served
     assert str(tmp_path / "page.html") in opened
-
-
-@pytest.mark.parametrize(
-    ("to", "name", "named"),
-    [
-        ("gltf", "a.glb", "a.glb"),
-        ("faust", "a.dsp", "a.dsp"),
-        ("faust", "a.lib", "a.lib"),
-        ("wavs", "samples", "samples/instrument.sfz"),
-        ("uff", "a.uff", "a.uff"),
-        ("avmsf-demo", "demo", "demo"),
-    ],
-)
-def test_the_size_is_said_and_what_follows_names_what_was_written(
-    to: str, name: str, named: str, field_file: Path, tmp_path: Path, capsys: Streams
-) -> None:
-    words = ["export", str(field_file), "--to", to, "--output", str(tmp_path / name), "--contacts", "4"]
-    assert main([*words, *(["--forces", "1", "2", "--seconds", "0.01"] if to == "wavs" else [])]) == 0
-    out, err = capsys.readouterr()
-    size = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
-    assert f"{to}, {size / 1e6:.3g} MB, " in out
-    (following,) = [line for line in err.splitlines() if line.startswith("next: ")]
-    assert named in following
-    assert "avmsf" not in following.replace(str(tmp_path), "")
 
 
 def export(words: list[str]) -> None:
@@ -365,13 +331,6 @@ def test_contacts_are_given_in_one_way(field_file: Path, tmp_path: Path) -> None
     assert (far.name, far.value) == ("--position", [50.0, 30.0, 2.0])
 
 
-def test_an_option_that_a_format_does_not_use_is_noted(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    words = ["export", str(field_file), "--to", "faust", "-o", str(tmp_path / "a.dsp"), "--contacts", "3", "--quiet"]
-    assert main([*words, "--variant", "wood", "--seconds", "1"]) == 0
-    notes = [line for line in capsys.readouterr().err.splitlines() if "is not used by --to faust" in line]
-    assert [line.split()[1] for line in notes] == ["--seconds", "--variant"]
-
-
 def test_a_captures_surface_is_shown(field_file: Path, tmp_path: Path) -> None:
     folder = tmp_path / "capture"
     folder.mkdir()
@@ -419,16 +378,6 @@ def test_the_body_of_the_gains_is_shown_before_a_reconstruction(to: str, tmp_pat
     assert len(shown.faces) == len(bar().triangles)
     if to == "web":
         assert json.loads((output / "manifest.json").read_text())["points"] == len(bar_points())
-
-
-@pytest.mark.parametrize("captured", [True, False])
-def test_points_alone_are_noted(captured: bool, field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    folder = tmp_path / "capture"
-    folder.mkdir()
-    words = ["export", str(field_file), "--to", "gltf", "--output", str(tmp_path / "a.glb")]
-    assert main([*words, *(["--capture", str(folder)] if captured else [])]) == 0
-    (note,) = [line for line in capsys.readouterr().err.splitlines() if "points are shown" in line]
-    assert (f"avmsf fit {folder} --until surface" in note) == captured
 
 
 def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_path: Path, capsys: Streams) -> None:

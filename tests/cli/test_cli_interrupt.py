@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from avmsf.cli import main
-from avmsf.cli.progress import ProgressBar
 from avmsf.field.store import load
+from avmsf.pipeline.progress import ProgressDisplay
 from factories.plate_capture import TINY, fill_plate
 
 NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
@@ -24,12 +24,12 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> list[int]:
     """Let Ctrl-C come while a step is shown, once; return the steps that are shown."""
     shown: list[int] = []
 
-    def show(self: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
+    def show(self: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
         shown.append(done)
         if len(shown) == step:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(ProgressBar, "step", show)
+    monkeypatch.setattr(ProgressDisplay, "step", show)
     return shown
 
 

@@ -1,7 +1,7 @@
 """`avmsf locate`: text, JSON, heat maps and clouds; and recordings without an impact on the object."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,10 @@ import trimesh
 from torch import Tensor
 
 from avmsf.cli import main
-from avmsf.cli.locate import run
-from avmsf.cli.options.locate import Options
+from avmsf.cli.locate import Options, run
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.field.store import load, save
+from avmsf.field.store import save
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -108,13 +107,6 @@ def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
     assert shares[0][1] < shares[1][1]
 
 
-def test_plain_words_go_to_the_standard_output(place: Place, capsys: Streams) -> None:
-    assert run(Options.parse([place.field, place.wav("plain.wav", place.blow(STRUCK))])) == 0
-    out, _ = capsys.readouterr()
-    assert "impact at (" in out
-    assert "90 % within" in out
-
-
 def test_several_blows_are_told_apart(place: Place, capsys: Streams) -> None:
     first, second = place.blow(STRUCK, before=0.1), place.blow(SECOND, before=0.4)
     both = torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second
@@ -197,18 +189,6 @@ def test_one_bad_recording_does_not_cost_the_others(place: Place, capsys: Stream
     assert [blow["status"] for blow in printed["impacts"]] == ["not located", "located"]
     assert [each["recording"] for each in printed["failures"]] == [str(unreadable), *missing]
     assert "text.wav" in err
-
-
-def test_the_fields_quality_is_said_once(place: Place, tmp_path: Path, capsys: Streams) -> None:
-    known = load(Path(place.field))
-    quality = {"positions": 9, "error": 0.321, "nearest_mean": 0.72}
-    judged = replace(known, origin=replace(known.origin, report={"quality": quality}))
-    save(judged, tmp_path / "judged.safetensors")
-    hits = [place.wav(f"judged-{row}.wav", place.blow(row)) for row in (STRUCK, SECOND)]
-    printed, err = located([str(tmp_path / "judged.safetensors"), *hits], capsys)
-    assert err.count("0.32") == 1
-    assert "0.32" in printed["quality"]
-    assert located([place.field, hits[0]], capsys)[0]["quality"] is None
 
 
 def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path: Path, capsys: Streams) -> None:

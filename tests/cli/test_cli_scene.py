@@ -1,7 +1,6 @@
 """From pictures, a mesh or Gaussians to a field on the command line: what is made, kept, made anew and refused."""
 
 import json
-import re
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -10,14 +9,14 @@ import pytest
 import torch
 
 from avmsf.cli import main
-from avmsf.cli.info import describe
-from avmsf.cli.progress import ProgressBar
+from avmsf.cli.report import describe
 from avmsf.features.store import load_features, read_report
 from avmsf.field.store import load
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
 from avmsf.photographs.folder import write_views
+from avmsf.pipeline.progress import ProgressDisplay
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.settings import sets
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
@@ -51,11 +50,6 @@ def kept(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cache = tmp_path_factory.mktemp("cache") / "kept"
     assert main(["fit", str(capture), "--cache", str(cache), *SMALL]) == 0
     return cache
-
-
-def counts(messages: str) -> list[tuple[str, str, str, str]]:
-    """Return the number, total, name and mark of each stage that was counted."""
-    return re.findall(r"^(\d+) of (\d+): (\w+)( \(cached\))?$", messages, re.MULTILINE)
 
 
 def made_now(streams: Streams) -> dict[str, bool]:
@@ -94,10 +88,7 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "fit"), False)
     assert made_now(capsys) == kept_all
     assert main([*words, "--set", "fit.learning_rate=2e-3"]) == 0
-    found, messages = capsys.readouterr()
-    assert {each["stage"]: each["fresh"] for each in json.loads(found)["stages"]} == kept_all | {"fit": True}
-    cached = [(str(row), "5", name, " (cached)") for row, name in enumerate(("views", "cloud", "features", "modes"), 1)]
-    assert counts(messages) == [*cached, ("5", "5", "field", "")]
+    assert made_now(capsys) == kept_all | {"fit": True}
     assert main([*words, "--set", "lift.components=4"]) == 0
     assert made_now(capsys) == kept_all | {"features": True, "fit": True}
 
@@ -124,16 +115,16 @@ def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
     capture: Path, kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache = tmp_path / "cache"
-    show = ProgressBar.step
+    show = ProgressDisplay.step
     seen: list[int] = []
 
-    def interrupt(self: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
+    def interrupt(self: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
         seen.append(done)
         if len(seen) == 3:
             raise KeyboardInterrupt
         show(self, stage, done, total, message)
 
-    monkeypatch.setattr(ProgressBar, "step", interrupt)
+    monkeypatch.setattr(ProgressDisplay, "step", interrupt)
     words = ["fit", str(capture), "--until", "gaussians", "--cache", str(cache), *SMALL_SPLAT]
     words += ["--output", str(tmp_path / "cloud.ply")]
     assert main(words) == 130
@@ -233,7 +224,10 @@ def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, caps
         folder / "surface.ply",
     )
     assert main(["fit", str(folder), *FIT, *MODES]) == 0
-    assert counts(capsys.readouterr().err) == [("1", "2", "modes", ""), ("2", "2", "field", "")]
+    assert sorted(each.name for each in (folder / ".avmsf").glob("*.stage.json")) == [
+        "field.safetensors.stage.json",
+        "modes.safetensors.stage.json",
+    ]
     assert len(load(folder / ".avmsf" / "field.safetensors").gain_field.points) == 500
 
 

@@ -3,18 +3,14 @@
 import csv
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import torch
 
-from avmsf.cli import suggest as command
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.suggest import Options
-from avmsf.cli.suggest import run
+from avmsf.cli.suggest import Options, run
 from avmsf.errors import FitError
 from avmsf.field.store import save
-from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
+from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.raising import raises
 
 Streams = pytest.CaptureFixture[str]
@@ -42,37 +38,6 @@ def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, cap
     errors = [printed["error_before"], *(each["error_after"] for each in printed["suggestions"])]
     assert errors == sorted(errors, reverse=True)
     assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(("value", "words"), [(-1e-9, "0.0000"), (-0.0, "0.0000"), (-0.00006, "-0.0001"), (3, "3")])
-def test_nothing_that_is_printed_is_minus_nought(value: float, words: str) -> None:
-    assert command._cell(value) == words
-
-
-def test_directions_that_candidates_bring_are_not_said_to_go_straight_in(
-    field: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    contacts = bar_contacts(12)[6:].float()
-    slanted = torch.tensor([[0.6, 0.0, -0.8]])
-    for directions, straight in ((None, True), (slanted.expand(6, 3), False)):
-        impacts = SimpleNamespace(contacts=contacts, directions=directions, names=tuple("abcdef"))
-        monkeypatch.setattr(command, "read_capture", lambda *_, made=impacts: SimpleNamespace(impacts=made))
-        assert run(Options.parse([str(field), "--count", "2", "--candidates", str(tmp_path)])) == 0
-        out, _ = capsys.readouterr()
-        assert "nx, ny, nz" in out
-        assert ("perpendicular" in out) == straight
-        assert ("0.6000" in out) != straight
-
-
-def test_gains_without_directions_say_none(tmp_path: Path, capsys: Streams) -> None:
-    contacts = bar_contacts(6)
-    path = tmp_path / "bar.safetensors"
-    save(sound_field(positional_field(contacts, drawn_gains(contacts, seed=1))), path)
-    assert run(Options.parse([str(path), "--count", "1"])) == 0
-    out, _ = capsys.readouterr()
-    assert "after" in out.splitlines()[3]
-    assert "nx" not in out
-    assert not list(tmp_path.glob("*.png"))
 
 
 def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:

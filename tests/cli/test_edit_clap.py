@@ -7,14 +7,14 @@ import pytest
 from matplotlib.figure import Figure
 from test_cli_edit import PLACES, RATE, Echo, ceramic
 
-from avmsf.cli import edit, main
-from avmsf.cli.edit import run
-from avmsf.cli.options.edit import Options
-from avmsf.cli.progress import ProgressBar
+from avmsf.cli import main
+from avmsf.cli.edit import Options, run
 from avmsf.editing.modal_edit import EDITS, adjust_modes
+from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError
 from avmsf.evaluation.clap import Clap
 from avmsf.field.store import load, save
+from avmsf.pipeline.progress import ProgressDisplay
 from factories.made_clap import save_clap
 from factories.raising import raises
 from factories.settings import sets
@@ -30,7 +30,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     save_clap(tmp_path / "clap")
     save(ceramic(), tmp_path / "plate.safetensors")
     model = Echo(adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0])
-    monkeypatch.setattr(edit.StableAudio, "load", lambda *_, **__: model)
+    monkeypatch.setattr(StableAudio, "load", lambda *_, **__: model)
     return [str(tmp_path / "plate.safetensors"), *QUICK, "--set", f"prompt.clap={tmp_path / 'clap'}"]
 
 
@@ -38,7 +38,7 @@ def test_the_curve_is_stored_drawn_and_shown(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn: dict[str, Figure] = {}
-    monkeypatch.setattr(edit, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
+    monkeypatch.setattr("avmsf.plotting.pictures.save_picture", lambda figure, path: drawn.update({path.name: figure}))
     output, folder = tmp_path / "new.safetensors", tmp_path / "look"
     assert run(Options.parse([*words, "--output", str(output), "--plots", str(folder)])) == 0
     new, clap = load(output), Clap.load(tmp_path / "clap")
@@ -65,16 +65,16 @@ def test_an_interrupted_edit_has_the_whole_curve(
         return found
 
     assert run(Options.parse([*words, "--output", str(tmp_path / "whole.safetensors")])) == 0
-    shown = ProgressBar.step
+    shown = ProgressDisplay.step
 
-    def impatient(bar: ProgressBar, stage: str, done: int, total: int, message: str) -> None:
+    def impatient(bar: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
         shown(bar, stage, done, total, message)
         if done == 3:
             raise KeyboardInterrupt
 
     part = [*words, "--output", str(tmp_path / "part.safetensors")]
     with monkeypatch.context() as patched:
-        patched.setattr(ProgressBar, "step", impatient)
+        patched.setattr(ProgressDisplay, "step", impatient)
         assert run(Options.parse(part)) == 130
     kept = tmp_path / "part.safetensors.clap.json"
     save_clap(tmp_path / "other", seed=1)

@@ -9,14 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import FrameType
 
 import pytest
 import torch
 
-from avmsf.cli import check, main, modes
-from avmsf.cli.printing import console, next_command, print_json, print_text, say, table
+from avmsf.cli import check, main
+from avmsf.cli.printing import print_json, show, table
+from avmsf.cli.progress import say
 from avmsf.errors import CaptureError
 
 Streams = pytest.CaptureFixture[str]
@@ -134,11 +134,8 @@ def test_a_terminal_obeys_nothing_that_stands_in_a_file(run: Callable[..., int],
 
     assert run(fail) == 2
     say(EVIL)
-    print_text(EVIL)
     print_json({"name": EVIL})
-    screen = console(errors=False)
-    screen.print(EVIL)
-    screen.print(table(EVIL, ["mode"], [[EVIL]]))
+    show(table(EVIL, ["mode"], [[EVIL]]))
     out, err = capsys.readouterr()
     assert not {*out, *err} & set("\x1b\x07\x9b\u202e")
     assert "title" in out
@@ -184,23 +181,6 @@ def test_an_error_is_one_json_object_where_json_is_asked_for(
         # tyro's box, which explains more.
         assert error["message"].startswith(f"{error['name']}")
         assert str(error["value"] or "got") in error["message"]
-
-
-def test_the_last_line_is_the_next_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Streams) -> None:
-    def write(options: modes.Options) -> int:
-        (tmp_path / "new").mkdir()
-        say("wrote new/report.md")
-        next_command("avmsf modes", tmp_path)
-        return 0
-
-    monkeypatch.setattr(modes, "run", write)
-    monkeypatch.setattr(modes.Options, "check_inputs", lambda options: None)
-    assert main(["modes", ".", "--plots", str(tmp_path / "new" / "plots")]) == 0
-    assert capsys.readouterr().err.splitlines() == [
-        "wrote new/report.md",
-        f"created folder {tmp_path / 'new'}",
-        f"next: avmsf modes {tmp_path}",
-    ]
 
 
 @pytest.mark.parametrize("closing", [">&-", "2>&-", ">&- 2>&-"])

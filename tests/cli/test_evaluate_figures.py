@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from avmsf.cli.evaluate import run
-from avmsf.cli.options.evaluate import Options
+from avmsf.cli.evaluate import Options, run
 from avmsf.evaluation import report
 from avmsf.evaluation.results import ResultsFolder
 from factories.plate_set import RATE, fill_plates

@@ -2,17 +2,14 @@
 
 import json
 import math
-import shlex
 from pathlib import Path
 
 import pytest
 import torch
 
 from avmsf.cli import main
-from avmsf.cli.fit import summary
-from avmsf.cli.heartbeat import verbosity
-from avmsf.cli.options import suggest
-from avmsf.cli.scores import advice_on_labels, body_warnings, outlier_words, quality_words
+from avmsf.cli.progress import display
+from avmsf.cli.report import field_lines, outlier_words, quality_words
 from avmsf.errors import FieldFileError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
@@ -25,21 +22,6 @@ FOUND = {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "next_contact": [0.0
 def field_with(report: dict[str, object]) -> SoundField:
     zero = torch.zeros(len(BANK), dtype=torch.float64)
     return SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), 8000.0, 400, Origin(report=report))
-
-
-def test_the_command_can_be_given_as_it_stands(tmp_path: Path) -> None:
-    path = tmp_path / "my bowl.safetensors"
-    (words,) = quality_words(field_with({"quality": FOUND}), path)
-    assert "41 mm" in words
-    program, verb, *arguments = shlex.split(words[words.index("avmsf suggest") :])
-    assert (program, verb) == ("avmsf", "suggest")
-    assert suggest.Options.parse(arguments).field == path
-
-
-def test_without_a_contact_no_command_is_named() -> None:
-    found = {name: FOUND[name] for name in ("positions", "error", "nearest_mean")}
-    (words,) = quality_words(field_with({"quality": found}), Path("f"))
-    assert "suggest" not in words
 
 
 @pytest.mark.parametrize(("error", "words"), [(0.3, ""), (0.69, "hardly better than"), (0.9, "worse than")])
@@ -55,13 +37,14 @@ def test_an_edited_or_unjudged_field_gets_no_words() -> None:
     assert quality_words(field_with({"quality": FOUND, "edits": [{"edit": "x"}]}), Path("f")) == []
 
 
-def test_the_summary_gives_the_ratio_of_stiffness_to_density() -> None:
+def test_the_body_is_named_with_the_ratio_of_stiffness_to_density_and_what_it_explains() -> None:
     # Frequencies of one shape scale with the square root of the ratio: half of aluminum's is a quarter of it.
     body = {"body": "solid", "wall_thickness": None, "frequency_factor": 0.5}
     credibility = {"credible": True, "with_body": 2.5, "without_body": 0.75}
-    words = summary(field_with({"gain_model": "mixture", "bodies": [body], "credibility": credibility}), 9)
-    assert "6.5 MJ/kg: as no material" in words
-    assert "by 1.8 per mode" in words
+    field = field_with({"gain_model": "mixture", "bodies": [body], "credibility": credibility})
+    (line,) = [each for each in field_lines(field, Path("f"), settings=False) if each.split()[0] == "body"]
+    assert "6.5 MJ/kg" in line
+    assert "1.8 per mode" in line
 
 
 def body_report(*, wall: float | None, ratio: float, searched: bool) -> dict[str, object]:
@@ -82,14 +65,10 @@ def test_a_body_stiffer_than_every_material_warns_and_a_plausible_one_does_not()
     ):
         for ratio in (*warned, *silent):
             field = field_with(body_report(wall=wall, ratio=ratio, searched=searched))
-            assert bool(body_warnings(field)) is (ratio in warned)
             assert field.body is not None
+            assert bool(field.body.warning) is (ratio in warned)
             assert field.body.record()["warning"] == (field.body.warning or None)
             assert field.body.warning in repr(field)
-    (words,) = body_warnings(field_with(body_report(wall=0.0013, ratio=3.67, searched=True)))
-    assert "3.6 times" in words
-    assert "1.3 mm" in words
-    assert "body.wall" in words
 
 
 def test_a_body_that_is_not_credible_or_edited_is_not_named() -> None:
@@ -132,13 +111,8 @@ def test_an_outlier_says_first_what_was_done_and_has_figures_only_for_verbose(mo
     assert left_out.startswith("left out")
     assert used.startswith("used")
     assert "1.9" not in left_out
-    monkeypatch.setattr(verbosity, "verbose", True)
+    monkeypatch.setattr(display, "verbose", True)
     left_out, used = outlier_words(field_with(report))
     assert "-1.9" in left_out
     assert "(0.046, -0.003, 0.1) m" in left_out
     assert used.endswith("contradicts")
-
-
-def test_another_order_of_the_recordings_is_told_if_there_is_one() -> None:
-    assert advice_on_labels(field_with({"advice": "sorted by number"})) == ["sorted by number"]
-    assert advice_on_labels(field_with({"advice": None})) == advice_on_labels(field_with({})) == []

@@ -51,12 +51,6 @@ def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level:
     assert len(advised) == (0 if level == -10 else 1)
 
 
-def test_a_quiet_level_that_is_normalized_is_not_noted(path: Path, capsys: Streams) -> None:
-    _, told, notes = rendered(path, capsys, "--normalize", "peak", "--level-db", "-30")
-    assert told["peak_dbfs"] == pytest.approx(-30, abs=1e-3)
-    assert not any("--normalize" in note for note in notes)
-
-
 def test_columns_that_are_not_used_are_named(path: Path, tmp_path: Path, capsys: Streams) -> None:
     table = tmp_path / "places.csv"
     table.write_text("File,x,y,z,nz,Hammer,force_newtons\na,0.05,0.03,0.002,1,felt,2\nb,0.02,0.03,0.002,1,felt,2\n")

@@ -3,7 +3,7 @@
 import pytest
 
 from avmsf.capture.impacts import Impacts
-from avmsf.cli.scores import compare
+from avmsf.cli.report import compare
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit

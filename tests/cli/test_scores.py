@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.cli.scores import compare
+from avmsf.cli.report import compare
 from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import split

@@ -10,9 +10,9 @@ import torch
 import trimesh
 
 from avmsf.cli import main
+from avmsf.cli.fit import Options
 from avmsf.cli.info import gains_at
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.fit import Options
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from avmsf.mesh import Surface, read_surface

@@ -12,9 +12,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from avmsf.cli.contacts import Contacts, rows_of
-from avmsf.cli.locate import run
+from avmsf.cli.locate import Options, run
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.locate import Options
 from avmsf.errors import CaptureError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save

@@ -21,7 +21,7 @@ from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
-from avmsf.pipeline.sources import find_source
+from avmsf.pipeline.views import find_source
 from factories.raising import raises
 from factories.small_scene import slab, slab_views, write_surface_file
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from avmsf.capture.impacts import Impacts
-from avmsf.cli.scores import parts_words
+from avmsf.cli.report import parts_words
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.splits import Choosing, Closest, DistinctContacts, Farthest, LeaveOneOut, Shots, split
 from factories.raising import raises

@@ -8,15 +8,15 @@ import pytest
 
 import avmsf
 from avmsf.capture import Capture, CaptureSettings
-from avmsf.cli.options.fit import Options as FitOptions
-from avmsf.cli.options.modes import Options as ModesOptions
+from avmsf.cli.fit import Options as FitOptions
+from avmsf.cli.modes import Options as ModesOptions
 from avmsf.errors import FitError, SceneError
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
-from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.extraction.finders import ShortTime, finder_named
 from avmsf.pipeline.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
-from avmsf.pipeline.record import capture_settings_of, finder_of, recorded, with_record
+from avmsf.pipeline.record import recorded, with_record
 from factories.plate_field import plate_impacts
 from factories.raising import raises
 
@@ -31,7 +31,7 @@ def test_the_default_preset_is_the_default() -> None:
 
 def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
     paper, usual = PRESETS["paper"], FitConfig()
-    assert finder_of(paper) == ShortTime(modes=128)
+    assert finder_named(paper.extraction, paper.modes) == ShortTime(modes=128)
     assert paper.gain_model == "network"
     assert all(getattr(paper.fit, name) != getattr(usual, name) for name in PUBLISHED)
     assert (paper.fit.clusters, paper.fit.learning_rate, paper.fit.steps, paper.fit.early_weight) == (
@@ -79,11 +79,10 @@ def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
     own = CaptureSettings(seconds=1.0, time_zero="peak")
-    assert capture_settings_of(PipelineConfig(), own) == own
-    assert capture_settings_of(PRESETS["paper"], replace(own, time_zero="onset")) == own
-    assert capture_settings_of(
-        FitOptions.parse(["mug", "--output", "f", "--time-zero", "onset"]).all_settings, own
-    ) == replace(own, time_zero="onset")
+    assert own.starting(PipelineConfig().time_zero) == own
+    assert replace(own, time_zero="onset").starting(PRESETS["paper"].time_zero) == own
+    onset = FitOptions.parse(["mug", "--output", "f", "--time-zero", "onset"]).all_settings.time_zero
+    assert own.starting(onset) == replace(own, time_zero="onset")
 
 
 def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_open() -> None:

@@ -1,11 +1,13 @@
 """A stage runs when something that decides its output changed, and only then."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from avmsf.errors import CaptureError
-from avmsf.pipeline.stages import StageFolder, digest_files
+from avmsf.pipeline.progress import ProgressListener
+from avmsf.pipeline.stages import Pipeline, Stage, StageFolder, digest_files
 from factories.raising import raises
 
 
@@ -21,10 +23,14 @@ class Maker:
         path.write_text(self.words)
 
 
+def stage(make: Callable[[Path], object], *, name: str = "cloud.ply", **recipe: object) -> Stage:
+    return Stage(name, make, recipe=lambda: recipe)
+
+
 def test_an_unchanged_recipe_runs_once(tmp_path: Path) -> None:
     make = Maker()
-    first = StageFolder(tmp_path / "kept").keep("cloud.ply", {"steps": 3}, make)
-    second = StageFolder(tmp_path / "kept").keep("cloud.ply", {"steps": 3}, make)
+    first = StageFolder(tmp_path / "kept").keep(stage(make, steps=3))
+    second = StageFolder(tmp_path / "kept").keep(stage(make, steps=3))
     assert (make.runs, first.fresh, second.fresh) == (1, True, False)
     assert second.digest == first.digest
     assert second.seconds == pytest.approx(first.seconds, abs=1e-3)  # seconds; the record rounds to milliseconds
@@ -33,47 +39,61 @@ def test_an_unchanged_recipe_runs_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("recipe", [{"steps": 4}, {"steps": 3, "more": None}, {}])
 def test_another_recipe_runs_again(tmp_path: Path, recipe: dict) -> None:
     make, folder = Maker(), StageFolder(tmp_path)
-    folder.keep("cloud.ply", {"steps": 3}, make)
-    assert folder.keep("cloud.ply", recipe, make).fresh
+    folder.keep(stage(make, steps=3))
+    assert folder.keep(stage(make, **recipe)).fresh
     assert make.runs == 2
 
 
-def test_outputs_that_were_announced_are_counted_when_their_turn_comes(tmp_path: Path) -> None:
-    make, folder, told = Maker(), StageFolder(tmp_path), list[str]()
-    folder.keep("modes.safetensors", {}, make)
-    folder.count(("modes.safetensors", "field.safetensors"), told.append)
-    for name in ("modes.safetensors", "other", "field.safetensors"):
-        folder.keep(name, {}, make)
-    assert told == ["1 of 2: modes (cached)", "2 of 2: field"]
+def test_a_stage_is_made_once_after_those_that_it_depends_on_and_again_when_these_change(tmp_path: Path) -> None:
+    read, log = list[str](), list[str]()
+
+    def join(path: Path, *inputs: Path) -> None:
+        read.extend(each.name for each in inputs)
+        path.write_text("".join(each.read_text() for each in inputs))
+
+    def run(words: str) -> Pipeline:
+        stages = (Stage("b.txt", join, ("a.txt", "c.txt")), Stage("a.txt", Maker(words)), Stage("c.txt", Maker("c")))
+        listener = ProgressListener(ready=lambda name, seconds: log.append(name if seconds is None else f"{name} made"))
+        return Pipeline(StageFolder(tmp_path), stages, listener=listener)
+
+    pipeline = run("a")
+    assert pipeline["b.txt"].path.read_text() == "ac"
+    assert not run("a")["b.txt"].fresh
+    assert read == ["a.txt", "c.txt"]
+    assert list(pipeline.made) == ["a.txt", "c.txt", "b.txt"]
+    assert log == ["a made", "c made", "b made", "a", "c", "b"]
+    (tmp_path / "a.txt").write_text("changed")
+    (tmp_path / "a.txt.stage.json").unlink()
+    assert run("other")["b.txt"].path.read_text() == "otherc"
 
 
 def test_tuples_are_the_lists_that_they_are_read_back_as(tmp_path: Path) -> None:
     make, folder = Maker(), StageFolder(tmp_path)
-    folder.keep("cloud.ply", {"sizes": (1, 2)}, make)
-    assert not folder.keep("cloud.ply", {"sizes": (1, 2)}, make).fresh
+    folder.keep(stage(make, sizes=(1, 2)))
+    assert not folder.keep(stage(make, sizes=(1, 2))).fresh
 
 
 def test_an_output_that_was_changed_or_lost_is_made_again(tmp_path: Path) -> None:
     make, folder = Maker(), StageFolder(tmp_path)
-    kept = folder.keep("cloud.ply", {}, make)
+    kept = folder.keep(stage(make))
     kept.path.write_text("changed")
-    assert folder.keep("cloud.ply", {}, make).fresh
+    assert folder.keep(stage(make)).fresh
     assert kept.path.read_text() == "made"
     kept.path.unlink()
-    assert folder.keep("cloud.ply", {}, make).fresh
+    assert folder.keep(stage(make)).fresh
 
 
 def test_a_stage_that_fails_midway_runs_again_even_under_an_older_recipe(tmp_path: Path) -> None:
     make, folder = Maker("old"), StageFolder(tmp_path)
-    folder.keep("cloud.ply", {"steps": 1}, make)
+    folder.keep(stage(make, steps=1))
 
     def fail(path: Path) -> None:
         path.write_text("half of the new")
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        folder.keep("cloud.ply", {"steps": 2}, fail)
-    assert folder.keep("cloud.ply", {"steps": 1}, make).fresh
+        folder.keep(stage(fail, steps=2))
+    assert folder.keep(stage(make, steps=1)).fresh
     assert folder.path("cloud.ply").read_text() == "old"
 
 
@@ -81,11 +101,11 @@ def test_a_record_of_another_version_or_a_damaged_one_does_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make, folder = Maker(), StageFolder(tmp_path)
-    folder.keep("cloud.ply", {}, make)
+    folder.keep(stage(make))
     monkeypatch.setattr("avmsf.__version__", "0.0.0")
-    assert folder.keep("cloud.ply", {}, make).fresh
+    assert folder.keep(stage(make)).fresh
     (tmp_path / "cloud.ply.stage.json").write_text("[]")
-    assert folder.keep("cloud.ply", {}, make).fresh
+    assert folder.keep(stage(make)).fresh
 
 
 def test_a_folder_counts_by_the_names_and_contents_of_its_files(tmp_path: Path) -> None:
@@ -94,10 +114,10 @@ def test_a_folder_counts_by_the_names_and_contents_of_its_files(tmp_path: Path) 
         (path / "a.png").write_text("a")
 
     folder = StageFolder(tmp_path)
-    kept = folder.keep("frames", {}, make)
-    assert not folder.keep("frames", {}, make).fresh
+    kept = folder.keep(stage(make, name="frames"))
+    assert not folder.keep(stage(make, name="frames")).fresh
     (kept.path / "a.png").rename(kept.path / "b.png")
-    assert folder.keep("frames", {}, make).fresh
+    assert folder.keep(stage(make, name="frames")).fresh
 
 
 def test_the_order_of_files_does_not_matter_but_what_stands_in_which_does(tmp_path: Path) -> None:
@@ -127,8 +147,8 @@ def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed
 
     for begun, ended in ((1, 1), (2, 3)):
         with pytest.raises(KeyboardInterrupt):
-            folder.keep("cloud.ply", {"steps": begun}, stop)
-        folder.keep("cloud.ply", {"steps": ended}, go_on)
+            folder.keep(stage(stop, steps=begun))
+        folder.keep(stage(go_on, steps=ended))
         assert not checkpoint.exists()
     assert found == [True, False]
 
@@ -137,6 +157,6 @@ def test_a_folder_that_cannot_be_written_is_named_with_the_option_for_another(tm
     make = Maker()
     (tmp_path / "cloud.ply.stage.json").mkdir()
     with raises(CaptureError, file=tmp_path / "cloud.ply") as caught:
-        StageFolder(tmp_path).keep("cloud.ply", {}, make)
+        StageFolder(tmp_path).keep(stage(make))
     assert "--cache" in str(caught.value)
     assert make.runs == 0

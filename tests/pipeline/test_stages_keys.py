@@ -28,7 +28,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.pipeline import stages
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
-from avmsf.pipeline.stages import StageFolder
+from avmsf.pipeline.stages import Stage, StageFolder
 from avmsf.simulate import recipe
 from factories.plate_capture import fill_plate
 from factories.plate_field import plate_extraction, plate_features, plate_impacts
@@ -39,27 +39,31 @@ def write(path: Path) -> None:
     path.write_text("made")
 
 
+def stage(make: Callable[[Path], object], *, name: str = "cloud.ply", **recipe: object) -> Stage:
+    return Stage(name, make, recipe=lambda: recipe)
+
+
 def test_a_stale_stage_of_a_read_only_folder_is_refused_by_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = StageFolder(tmp_path)
-    folder.keep("cloud.ply", {"steps": 1}, write)
+    folder.keep(stage(write, steps=1))
 
     def refuse(self: Path, missing_ok: bool = False) -> None:
         raise OSError(30, os.strerror(30), str(self))
 
     monkeypatch.setattr(Path, "unlink", refuse)
     with pytest.raises(CaptureError):
-        folder.keep("cloud.ply", {"steps": 2}, write)
-    assert not folder.keep("cloud.ply", {"steps": 1}, write).fresh
+        folder.keep(stage(write, steps=2))
+    assert not folder.keep(stage(write, steps=1)).fresh
 
 
 def test_other_code_makes_a_stage_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = StageFolder(tmp_path)
-    folder.keep("cloud.ply", {}, write)
+    folder.keep(stage(write))
     monkeypatch.setattr(stages, "source_digest", lambda module: "changed")
-    assert folder.keep("cloud.ply", {}, write).fresh
-    assert not folder.keep("cloud.ply", {}, write).fresh
+    assert folder.keep(stage(write)).fresh
+    assert not folder.keep(stage(write)).fresh
 
 
 def body_key() -> set[str]:
@@ -135,7 +139,7 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
             ),
             StageFolder(tmp_path / "cache"),
         )
-        return {each.stage: each.fresh for each in made.stages}["fit"]
+        return made.stages["field.safetensors"].fresh
 
     failures[:] = [SimulationError("3.1 GB are free")]
     assert run()

@@ -13,7 +13,6 @@ import avmsf.simulate.simulation_folder as simulationset
 from avmsf._utils.caching import key_of
 from avmsf.capture import read_capture
 from avmsf.cli import simulate
-from avmsf.cli.options import simulate as options
 from avmsf.errors import AvmsfError, SimulationError
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
@@ -335,28 +334,28 @@ def test_the_command_makes_an_object_of_a_mesh_and_keeps_it(
     words = ["--mesh", str(recipe.mesh), "--thickness", "0.006", "--set", "detail=0.2", "--material", "glass"]
     words += ["--impacts", "4", "--seconds", "1", "--views", "0", "--set", "elastic_modes=6"]
     words += ["--output", str(tmp_path / "mine")]
-    assert simulate.run(options.Options.parse(words)) == 0
+    assert simulate.run(simulate.Options.parse(words)) == 0
     assert "mine: done (1 of 1" in capsys.readouterr().err
     assert len(read_capture(tmp_path / "mine").impacts) == 4
-    assert simulate.run(options.Options.parse(words)) == 0
+    assert simulate.run(simulate.Options.parse(words)) == 0
     assert "mine: exists (1 of 1" in capsys.readouterr().err
     with raises(SimulationError, file=tmp_path / "mine", value=["seed"]):
-        simulate.run(options.Options.parse([*words, "--seed", "3"]))
+        simulate.run(simulate.Options.parse([*words, "--seed", "3"]))
 
 
 def test_the_command_lists_and_knows_what_it_does_not_know(capsys: pytest.CaptureFixture[str]) -> None:
-    assert simulate.run(options.Options.parse(["--list"])) == 0
+    assert simulate.run(simulate.Options.parse(["--list"])) == 0
     assert "mug-ceramic" in capsys.readouterr().out
     with raises(SimulationError, name="object", value="mug-ceramics") as caught:
-        simulate.run(options.Options.parse(["mug-ceramics", "--output", "nowhere"]))
+        simulate.run(simulate.Options.parse(["mug-ceramics", "--output", "nowhere"]))
     assert "mug-ceramic," in str(caught.value)
     with raises(AvmsfError, name="output"):
-        options.Options.parse(["sim-20"]).check_inputs()
+        simulate.Options.parse(["sim-20"]).check_inputs()
 
 
 def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:
     # The example has 16 contacts at 44,100 Hz where a recipe usually has 40 at 48,000.
-    recipe = options.Options.parse(["example", "--impacts", "40"]).all_settings
+    recipe = simulate.Options.parse(["example", "--impacts", "40"]).all_settings
     assert (recipe.impacts, recipe.sample_rate, recipe.kind) == (40, 44100, "mug")
-    recipe = options.Options.parse(["mug-plastic", "--material", "ceramic"]).all_settings
+    recipe = simulate.Options.parse(["mug-plastic", "--material", "ceramic"]).all_settings
     assert recipe == replace(named_recipe("mug-plastic"), material="ceramic")

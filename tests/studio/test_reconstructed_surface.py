@@ -11,9 +11,8 @@ import trimesh
 from avmsf.field.store import save
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
-from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
-from avmsf.pipeline.shape import FIELD, SURFACE
 from avmsf.studio.opening import find_reconstructed, open_target
 from opened_plate import plate_field
 from served import served
@@ -37,7 +36,7 @@ def capture(tmp_path: Path) -> Path:
     box = trimesh.creation.box(np.ptp(points.numpy(), axis=0) + 0.01)
     box.apply_translation((points.amax(0) + points.amin(0)).numpy() / 2)
     box.export(kept / SURFACE)
-    save(plate_field(), kept / FIELD)
+    save(plate_field(), kept / CACHED_FIELD)
     # Coordinates of the capture's own files do not count for what was made of them.
     (folder / "capture.toml").write_text('unit = "mm"\n')
     return folder

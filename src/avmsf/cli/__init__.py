@@ -9,7 +9,7 @@ import textwrap
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
@@ -18,7 +18,8 @@ from typing import Any, TextIO
 
 import avmsf
 from avmsf._utils.text import printable
-from avmsf.cli.heartbeat import beating, verbosity
+from avmsf.cli.printing import announcing_folders, print_json
+from avmsf.cli.progress import display
 from avmsf.errors import NO_MEMORY, AvmsfError, AvmsfWarning, lacks_memory
 
 VERBS = {
@@ -36,7 +37,7 @@ VERBS = {
     "studio": "Open a web page that plays an object, locates impacts, edits fields and records captures.",
     "demo": "Run a complete example: from photographs and recordings of a mug to its sound field, sounds and images.",
 }
-"""Each verb's module in this package and in `options`, and the first sentence of its help, in the order of the work."""
+"""Each verb's module in this package, and the first sentence of its help, in the order of the work."""
 RENAMED = {
     "play": "studio",
     "dataset": "check",
@@ -61,8 +62,6 @@ TERMINATED = 143
 """The exit code that shells give a command ended by SIGTERM."""
 BAD_INPUT = 2
 """The exit code of input that cannot be used."""
-_COMPOSED = frozenset({"demo", "studio"})
-"""Verbs that run others or wait for their user; their modules import late what computes, and hold their options too."""
 _COMMON = frozenset({"--quiet", "--verbose", "--json"})
 """Options that may also stand before the verb."""
 _OUTPUTS = ("output", "plots")
@@ -103,19 +102,15 @@ def _run(words: list[str]) -> int:
         return _explain(words)
     # Threads that wait actively for each other make many small sums several times slower where other programs run.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    heart = nullcontext() if words[0] in _COMPOSED else beating(f"avmsf {words[0]}")
-    with warnings.catch_warnings(), _interrupting() as received, heart:
+    with warnings.catch_warnings(), _interrupting() as received:
         try:
-            # Options import nothing that computes: help and mistakes are answered before torch is loaded for seconds.
+            # A verb imports what computes when it runs: help and mistakes are answered before torch is loaded.
             options = options_of(words[0], words[1:])
             options.check_inputs()
-            verbosity.quiet, verbosity.verbose = options.quiet, options.verbose
-            with _loading(quiet=options.quiet):
-                verb = import_module(f"avmsf.cli.{words[0]}")
+            display.quiet, display.verbose = options.quiet, options.verbose
+            verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
-            # Imports rich, which help on the whole does not need, and every verb does.
-            from avmsf.cli.printing import announcing_folders
-
+            display.doing("loading")
             paths = [getattr(options, name, None) for name in _OUTPUTS]
             with announcing_folders(path.parent for path in paths if path is not None):
                 code: int = verb.run(options)
@@ -137,22 +132,20 @@ def _run(words: list[str]) -> int:
             print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
             code = INTERRUPTED
         finally:
-            verbosity.quiet = verbosity.verbose = False
+            display.close()
+            display.quiet = display.verbose = False
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
 
 
 def options_of(verb: str, words: Sequence[str]) -> Any:
     """Return a verb's options that the words spell. Raises SystemExit for help and for words that are no options."""
-    package = "avmsf.cli" if verb in _COMPOSED else "avmsf.cli.options"
-    return import_module(f"{package}.{verb}").Options.parse(words)
+    home = "avmsf.cli.options" if verb == "check" else "avmsf.cli"
+    return import_module(f"{home}.{verb}").Options.parse(words)
 
 
 def _report_error(error: AvmsfError, words: Sequence[str]) -> int:
     """Return the exit code of an error; where the words ask for JSON, print it as an object to the standard output."""
     if "--json" in words:
-        # Imports rich, which other errors do not need.
-        from avmsf.cli.printing import print_json
-
         print_json({"error": {"message": _sentence(error), **error.attributes}})
     return BAD_INPUT
 
@@ -205,19 +198,6 @@ def _interrupting() -> Iterator[list[int]]:
         if before is not None:
             signal.signal(signal.SIGTERM, before)
         sys.unraisablehook = report
-
-
-@contextmanager
-def _loading(*, quiet: bool) -> Iterator[None]:
-    """Print on a terminal that something is going on, for as long as it is."""
-    if quiet or not sys.stderr.isatty():
-        yield
-        return
-    print("loading ...", end="", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        print("\r           \r", end="", file=sys.stderr, flush=True)
 
 
 def _verb_first(words: Sequence[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from avmsf._utils.text import listed
 from avmsf.capture import Impacts
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.polarity import inverted_recordings
@@ -44,9 +45,18 @@ class AlignmentReport:
         levels = noise_drop(modes, impacts), gain_changes(impacts)
         return cls(found.coherence_before, found.coherence_after, delays, left, inverted, *faults, *levels)
 
+    @property
+    def _moved(self) -> list[float]:
+        """The delays of the recordings that are aligned, samples."""
+        return [delay for name, delay in self.delays.items() if name not in self.not_aligned]
+
     def sentences(self) -> list[str]:
         """Return the faults of recordings, and how coherent the modes' phases are."""
-        return [*self.faults(), *self._coherence()]
+        return [*self.faults(), self._coherence(), *self._exceptions()]
+
+    def warnings(self) -> list[str]:
+        """Return what is wrong alone."""
+        return [*self.faults(), *([] if self._moved else [self._coherence()]), *self._exceptions()]
 
     def faults(self) -> list[str]:
         """Return a sentence for each fault that recorders and editors make."""
@@ -73,40 +83,33 @@ class AlignmentReport:
             )
         return sentences
 
-    def _coherence(self) -> list[str]:
-        """Return how coherent the modes' phases are, and which recordings are not aligned or have the opposite sign."""
-        moved = [delay for name, delay in self.delays.items() if name not in self.not_aligned]
+    def _coherence(self) -> str:
+        """Return how coherent the modes' phases are."""
+        moved = self._moved
         if not moved:
-            return [
+            return (
                 f"the modes have no common phase (coherence {self.coherence_before:.2f}, 1 is one phase for each "
                 "mode): the recordings are not aligned. Check whether the sensor or the object was moved, and the "
                 "response channel"
-            ]
+            )
         how = "no delays make the modes' phases agree better than they do as read"
         coherence = f"coherence {self.coherence_before:.2f} as read"
         if any(moved):
             how = f"delays of {min(moved):.2f} to {max(moved):.2f} samples align the recordings"
             coherence += f", {self.coherence_after:.2f} aligned"
-        sentences = [f"{how}: {coherence} (1 is one phase for each mode)"]
-        if self.not_aligned:
-            sentences.append(
-                f"not aligned: {_listed(self.not_aligned)}; the phases of their modes agree with those of no other "
-                "recording"
+        return f"{how}: {coherence} (1 is one phase for each mode)"
+
+    def _exceptions(self) -> list[str]:
+        """Return which recordings are not aligned or have the opposite sign."""
+        found = []
+        if self.not_aligned and self._moved:
+            found.append(
+                f"not aligned: {listed(self.not_aligned, most=_SHOWN)}; the phases of their modes agree with those of "
+                "no other recording"
             )
-        if self.inverted:
-            sentences.append(
-                f"inverted polarity: {_listed(self.inverted)} have the opposite sign of the recordings near them; "
-                "check the cable and the file, or the direction in impacts.csv"
+        if self.inverted and self._moved:
+            found.append(
+                f"inverted polarity: {listed(self.inverted, most=_SHOWN)} have the opposite sign of the recordings "
+                "near them; check the cable and the file, or the direction in impacts.csv"
             )
-        return sentences
-
-
-def describe_alignment(modes: Extraction, impacts: Impacts) -> list[str]:
-    """Return the sentences of the report on the recordings that the modes are of; none where nothing was aligned."""
-    report = AlignmentReport.of(modes, impacts)
-    return [] if report is None else report.sentences()
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
+        return found

@@ -1,40 +1,46 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
 import shlex
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, replace
-from functools import partial
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from rich.console import Console
+import tyro
 
-from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.text import counted
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.options.evaluate import Options, words_of
-from avmsf.cli.printing import console, next_command, next_step, print_json, say, table
-from avmsf.cli.progress import ProgressBar
-from avmsf.datasets import CaptureCollection, open_dataset
-from avmsf.datasets.dataset import Dataset
+from avmsf.cli.options.checks import expect_device, expect_modes
+from avmsf.cli.options.common import Configured, Flag
+from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
+from avmsf.cli.options.settings import with_settings
+from avmsf.cli.printing import next_command, next_step, print_json, show, table
+from avmsf.cli.progress import display, say
+from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.case_run import Evaluation
-from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.objects import SUBSETS, ObjectInputs, choose_objects, members
-from avmsf.evaluation.published import PUBLISHED
-from avmsf.evaluation.recorded import RecordedMethod
-from avmsf.evaluation.registry import Protocol, protocol_named
-from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
-from avmsf.evaluation.report_tables import Section
-from avmsf.evaluation.results import IDENTITY, ResultsFolder
-from avmsf.evaluation.runner import run_objects
-from avmsf.evaluation.scores import MetricSettings
-from avmsf.evaluation.splits import Predefined, Shots
-from avmsf.evaluation.task import Method, VisualInput
-from avmsf.modal.extraction.finders import finder_named
-from avmsf.pipeline.config import AUTO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
-from avmsf.pipeline.features import choose_encoder, settled
+from avmsf.evaluation.registry import PROTOCOLS, expect_suited, method_entry, protocol_named
+from avmsf.gaussians.config import SplatConfig
+from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import (
+    AUTO,
+    DESCRIPTORS,
+    DINO,
+    PRESETS,
+    BodyConfig,
+    Geometry,
+    LiftConfig,
+    SceneConfig,
+    TimeZero,
+    ViewsConfig,
+)
+
+if TYPE_CHECKING:
+    from avmsf.datasets.dataset import Dataset
+    from avmsf.evaluation.case_run import Evaluation
+    from avmsf.evaluation.registry import Protocol
+    from avmsf.evaluation.results import ResultsFolder
+    from avmsf.evaluation.task import Method, VisualInput
 
 OPTIONS = {"predefined": ("test",), "shots": ("counts", "starts")}
 """Options of one protocol alone."""
@@ -42,8 +48,122 @@ _SHOWN = 5
 """Failures that are printed; the report lists all."""
 
 
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What methods share."""
+
+    geometry: Geometry = "mesh"
+    """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
+    noisy: its mesh with vertices displaced by 2 % of its size."""
+    amplitude_scale: Literal["full-scale", "raw"] = "full-scale"
+    """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
+    values of different objects can be averaged. raw: in the recordings' unit."""
+    extraction: ExtractionMethod = "high-resolution"
+    """How the modes that methods share are extracted; see `avmsf modes --help`. The methods `paper` have their own."""
+    modes: int = 128
+    """Maximum number of the modes that methods share."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """How features are made. The methods `paper` use the paper's own settings and only the encoder given here: DINOv2
+    without `lift.encoder`, which then has to be installed."""
+    body: BodyConfig = field(default_factory=BodyConfig)
+    """Elastic bodies."""
+
+    def __post_init__(self) -> None:
+        expect_modes(self.modes)
+
+
+@dataclass(frozen=True)
+class Options(Configured):
+    """Evaluate methods at held-out contacts, on all objects of a dataset.
+
+    Every value is kept as it is computed: repeat an interrupted command to continue it, and add methods or objects
+    later. The folder of results holds summary.json, report.md and report.html, which shows and plays sounds.
+    """
+
+    protocol: tyro.conf.Positional[
+        Annotated[str, tyro.conf.arg(metavar="PROTOCOL", help=f"The experiment: {', '.join(PROTOCOLS)}.")]
+    ]
+    data: tyro.conf.Positional[
+        Annotated[
+            Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture", ("a folder",))
+        ]
+    ]
+    """Folder of a dataset, of capture folders, or of one capture."""
+    methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """Methods, separated by commas or blanks; by default those of the protocol."""
+    objects: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """Objects, likewise."""
+    output: OutputFolder = None
+    """Folder of results, by default evaluation/DATASET/PROTOCOL."""
+    cache: CacheFolder = None
+    """Folder of the objects' features, which several evaluations may share; by default in the results."""
+    test: Annotated[tuple[str, ...], tyro.conf.arg(metavar="RECORDING ...")] = ()
+    """predefined: names of the recordings to test on, such as 009.wav, separated by commas or blanks."""
+    counts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (16, 8, 4, 2, 1)
+    """shots: numbers of training contacts."""
+    starts: int = 1
+    """shots: number of first contacts that the choices start from."""
+    visual_source: Literal["best", "mesh"] = "best"
+    """Features of photographs, if there are any, by Gaussians (best), or always of the mesh."""
+    workers: int = 1
+    """Objects computed at a time, each on one thread; more than one needs the extra `scale`."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Address of a ray cluster, or auto; its computers have to see data and results at the same paths."""
+    seed: int = 0
+    """Seed of all methods."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
+    """Device for Gaussians, DINOv2 and training; by default the GPU if there is one."""
+    no_cdpam: Flag = False
+    """Do not compute the metric CDPAM, which needs the extra `eval`."""
+    cdpam_contacts: int = 8
+    """Test contacts per case at which CDPAM is computed, evenly spaced; 0 for all."""
+    time_zero: TimeZero | None = None
+    """Start of the sounds that are scored; with peak (paper) without comparison with ground truth."""
+    contact_data: Annotated[
+        Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))
+    ] = None
+    """ObjectFolder Real's contacts: SonicGauss's lists in a folder, or one of them."""
+    figures: Flag = False
+    """Also draw spectrograms of all methods, and heat maps with localize, to figures/ in the folder of results."""
+
+    usual = EvaluationSettings()
+
+    @cached_property
+    def all_settings(self) -> EvaluationSettings:
+        """What methods share."""
+        return with_settings(self.usual, self.set, self.config)
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        protocol_named(self.protocol)
+        for name in words_of(self.methods):
+            method_entry(name)
+            expect_suited(name, self.protocol)
+        if self.protocol == "predefined" and not self.test:
+            raise EvaluationError.expected(
+                "names of the recordings to test on", name="--test", advice="such as --test 009.wav,010.wav"
+            )
+        expect_device(self.device, raising=EvaluationError)
+        _ = self.all_settings
+        detect_dataset(self.data)
+
+
+def words_of(given: Sequence[str]) -> tuple[str, ...]:
+    """Return words that commas or blanks separate."""
+    return tuple(word for each in given for word in each.split(",") if word)
+
+
 def run(options: Options) -> int:
     """Evaluate, and print the results; return 130 where Ctrl-C stopped it."""
+    from avmsf.datasets import open_dataset
+    from avmsf.evaluation.methods import method_named
+    from avmsf.evaluation.objects import choose_objects, members
+    from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
+    from avmsf.evaluation.results import IDENTITY, ResultsFolder
+
     protocol = _protocol_of(options)
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
     # All paths are made absolute: workers may run in folders of their own.
@@ -78,17 +198,20 @@ def run(options: Options) -> int:
         return INTERRUPTED
     if not summary["methods"]:
         first = summary["failures"][0]["failure"] if summary["failures"] else "no object"
-        count = len(summary["failures"])
-        raise EvaluationError.expected(
-            "a result of a method", count, got=f"none: {first}", file=folder, name="failures"
-        )
-    screen = console(errors=options.json)
-    for part in parts[1:3]:
-        _print(part, screen)
-    _print_failures(summary["failures"], screen)
-    screen.print(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", soft_wrap=True)
-    for path in figures:
-        screen.print(f"wrote {path}", soft_wrap=True)
+        count, got = len(summary["failures"]), f"none: {first}"
+        raise EvaluationError.expected("a result of a method", count, got=got, file=folder, name="failures")
+    lines = [
+        # Standard errors, which are in the reports, would fold every line of a narrow screen.
+        table(part.title, part.columns, [[cell.partition(" ±")[0] for cell in row] for row in part.rows])
+        for part in parts[1:3]
+        if part.columns
+    ]
+    failures = summary["failures"]
+    lines += [f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}" for each in failures[:_SHOWN]]
+    if failures:
+        lines.append(f"{counted(len(failures), 'failure')}, listed in {TABLES}; run the command again to retry")
+    lines += [f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", *(f"wrote {path}" for path in figures)]
+    show("\n".join(lines), json=options.json)
     if options.json:
         print_json({**summary, "results": str(folder)})
     next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
@@ -96,8 +219,10 @@ def run(options: Options) -> int:
     return 0
 
 
-def _protocol_of(options: Options) -> Protocol:
+def _protocol_of(options: Options) -> "Protocol":
     """Return the protocol with its own options, and print which of those that were given it does not use."""
+    from avmsf.evaluation.splits import Predefined, Shots
+
     protocol, usual = protocol_named(options.protocol), Options(options.protocol, options.data)
     for owner, names in OPTIONS.items():
         unused = [f"--{name}" for name in names if getattr(options, name) != getattr(usual, name)]
@@ -108,27 +233,24 @@ def _protocol_of(options: Options) -> Protocol:
     return replace(protocol, cases=Predefined(words_of(options.test))) if protocol.name == "predefined" else protocol
 
 
-def _print_failures(failures: Sequence[Mapping[str, Any]], screen: Console) -> None:
-    """Print the first failures, and how many there are."""
-    for each in failures[:_SHOWN]:
-        screen.print(f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}", soft_wrap=True)
-    if failures:
-        failed = counted(len(failures), "failure")
-        screen.print(f"{failed}, listed in {TABLES}; run the command again to retry", soft_wrap=True)
-
-
 def evaluation_of(
     options: Options,
-    dataset: Dataset,
+    dataset: "Dataset",
     title: str,
-    protocol: Protocol,
-    methods: tuple[Method, ...],
+    protocol: "Protocol",
+    methods: "tuple[Method, ...]",
     folder: Path,
-) -> Evaluation:
+) -> "Evaluation":
     """Return the plan of an evaluation with results in a folder, and features in it unless the options name another.
 
     Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
     """
+    from avmsf._utils.device import TRAINABLE, usable_device
+    from avmsf.evaluation.case_run import Evaluation
+    from avmsf.evaluation.objects import ObjectInputs
+    from avmsf.evaluation.scores import MetricSettings
+    from avmsf.modal.extraction.finders import finder_named
+
     device, shared = options.device, options.all_settings
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
@@ -155,8 +277,10 @@ def evaluation_of(
     )
 
 
-def _note_subset(dataset: Dataset, protocol: Protocol, objects: Sequence[str]) -> None:
+def _note_subset(dataset: "Dataset", protocol: "Protocol", objects: Sequence[str]) -> None:
     """Print which objects a protocol takes of a dataset, where it does not take all."""
+    from avmsf.evaluation.objects import SUBSETS
+
     total = len(dataset.objects())
     if protocol.subset is not None and len(objects) < total:
         say(
@@ -165,8 +289,11 @@ def _note_subset(dataset: Dataset, protocol: Protocol, objects: Sequence[str]) -
         )
 
 
-def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
+def _note_start(methods: "Sequence[Method]", time_zero: TimeZero | None) -> None:
     """Print which methods are configured for, or may have, another start of sounds than the evaluation has."""
+    from avmsf.evaluation.field_methods import FieldMethod
+    from avmsf.evaluation.recorded import RecordedMethod
+
     for method in methods:
         if isinstance(method, RecordedMethod) and time_zero == "peak":
             say(
@@ -179,58 +306,65 @@ def _note_start(methods: Sequence[Method], time_zero: TimeZero | None) -> None:
 
 
 def run_shown(
-    evaluation: Evaluation,
+    evaluation: "Evaluation",
     objects: Sequence[str],
-    results: ResultsFolder,
+    results: "ResultsFolder",
     workers: int,
     address: str | None,
     *,
     after_each: Callable[[], object] = lambda: None,
 ) -> None:
     """Run an evaluation under a progress bar, and call `after_each` after each object."""
-    with ProgressBar() as bar:
+    from avmsf.evaluation.runner import run_objects
 
-        def show(message: str, done: int, total: int) -> None:
-            if done > bar.done:
-                after_each()
-            bar.objects(message, done, total)
+    finished = [0]
 
-        run_objects(evaluation, objects, results, workers=workers, address=address, progress=show)
+    def show(message: str, done: int, total: int) -> None:
+        if done > finished[0]:
+            after_each()
+        finished[0] = done
+        display.objects(message, done, total)
+
+    run_objects(evaluation, objects, results, workers=workers, address=address, progress=show)
 
 
 def settled_lifts(
-    lift: LiftConfig, inputs: Collection[VisualInput], *, device: str | None = None
+    lift: LiftConfig, inputs: "Collection[VisualInput]", *, device: str | None = None
 ) -> tuple[LiftConfig, LiftConfig]:
     """Return the settings of features, and those of the paper's form, with the encoders that `inputs` are made with.
 
     Where no method reads views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where one
     reads the paper's features and their encoder is not available.
     """
+    from avmsf.features.descriptors import ImageDescriptors
+    from avmsf.pipeline.features import choose_encoder
+
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
         return lift, replace(paper, encoder=lift.encoder)
     if any(visual_input.startswith("paper") for visual_input in inputs):
         choose_encoder(paper, log=say, device=device)
         return replace(lift, encoder=paper.encoder), paper
-    return settled(lift, log=say, device=device) if set(inputs) - {"surface"} else lift, paper
+    if not set(inputs) - {"surface"}:
+        return lift, paper
+    built_in = isinstance(choose_encoder(lift, log=say, device=device), ImageDescriptors)
+    return replace(lift, encoder=DESCRIPTORS if built_in else DINO), paper
 
 
-def inputs_of(methods: Sequence[Method], protocol: Protocol) -> frozenset[VisualInput]:
+def inputs_of(methods: "Sequence[Method]", protocol: "Protocol") -> "frozenset[VisualInput]":
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
+    from avmsf.evaluation.field_methods import FieldMethod
+
     read = {method.visual_input for method in methods if isinstance(method, FieldMethod)}
     return frozenset(read | {"surface"} if protocol.locating else read)
 
 
-def title_of(dataset: Dataset, folder: Path) -> str:
+def title_of(dataset: "Dataset", folder: Path) -> str:
     """Return a dataset's name in reports: captures by their folder, which identifies them."""
+    from avmsf.datasets import CaptureCollection
+    from avmsf.evaluation.published import PUBLISHED
+
     if not isinstance(dataset, CaptureCollection):
         return dataset.name
     name = folder.resolve().name
     return f"{name} (captures)" if name in {dataset for dataset, _ in PUBLISHED} else name
-
-
-def _print(part: Section, screen: Console) -> None:
-    if part.columns:
-        # Standard errors, which are in the reports, would fold every cell of a narrow screen.
-        rows = [[cell.partition(" ±")[0] for cell in row] for row in part.rows]
-        screen.print(table(part.title, part.columns, rows))

@@ -1,48 +1,168 @@
 """`avmsf export`: a field in the formats of other tools."""
 
+import math
 import shlex
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
+import tyro
 
 from avmsf._utils.text import counted, format_number
 from avmsf.capture.filenames import find_surface_file
-from avmsf.capture.folder import read_capture
-from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import METRES, settings_of
-from avmsf.cli.contacts import given_contacts, note_off, refuse_far
-from avmsf.cli.options.export import Options, unused_options
-from avmsf.cli.printing import next_step, print_result, say
-from avmsf.editing.modal_edit import EDITS
+from avmsf.cli.options.common import Flag, Printing, Unit, option_of
+from avmsf.cli.options.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
+from avmsf.cli.printing import next_step, print_result
+from avmsf.cli.progress import say
 from avmsf.errors import ExportError
-from avmsf.export.faust import contacts_path, fitted
-from avmsf.export.geometry import read_gaussians
-from avmsf.export.sampled_field import SampledField, spread_rows
-from avmsf.export.samples import INSTRUMENT, Layer, hertz_layers
-from avmsf.export.write import WRITERS
-from avmsf.export.writing import POINTS, SUFFIXES, Format, Written
-from avmsf.field.positions import points_on_object
-from avmsf.field.sound_field import SoundField
-from avmsf.field.store import load
-from avmsf.gaussians.ply import holds_gaussians
-from avmsf.mesh.surface import Surface
-from avmsf.pipeline.config import CACHE
-from avmsf.pipeline.shape import SURFACE
+from avmsf.export.writing import SUFFIXES, Axis, Format, Precision, check_free
+from avmsf.field.header import FIELD
+from avmsf.modal.config import PulseShape
+from avmsf.pipeline.config import CACHE, SURFACE
 
+if TYPE_CHECKING:
+    from avmsf.export.sampled_field import SampledField
+    from avmsf.export.writing import Written
+    from avmsf.field.sound_field import SoundField
+    from avmsf.mesh.surface import Surface
+
+    _Prepared = tuple[SoundField | SampledField, dict[str, Any]]
+    """What a writer writes, and its settings."""
+
+_CONTACTS = ("position", "contact_table", "unit")
+_USED: dict[Format, tuple[str, ...]] = {
+    "web": ("object", "object_unit", "capture"),
+    "gltf": ("object", "object_unit", "capture", "up", *_CONTACTS),
+    "faust": ("no_noise", *_CONTACTS),
+    "avmsf-demo": ("object", "variant", "precision"),
+    "wavs": ("forces", "contact_times", "pulse", "seconds", "no_noise", *_CONTACTS),
+    "uff": ("functions", *_CONTACTS),
+}
+"""Options that each format uses, in addition to those that all use."""
+CHOOSING = frozenset(name for name, used in _USED.items() if "position" in used)
+"""Formats whose contacts can be given."""
 _DEAD_DB = 40.0
 """Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""
-_Prepared = tuple[SoundField | SampledField, dict[str, Any]]
-"""What a writer writes, and its settings."""
+_OF_SOME = {name for used in _USED.values() for name in used}
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.
+
+    web: a page that plays impacts on the object, as a folder for any static host or as one .html file. gltf: a .glb
+    that any viewer shows, with the draft extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib
+    without. avmsf-demo: the layout of the paper's own demo. wavs: sounds with a table and an SFZ instrument, for
+    samplers. uff: the universal file format, for modal analysis. What a format cannot hold is printed.
+    """
+
+    field: tyro.conf.Positional[
+        Annotated[
+            Path,
+            tyro.conf.arg(metavar="FIELD"),
+            Existing("a sound field, as avmsf fit writes it", ("a sound field",)),
+        ]
+    ]
+    """Field file, as `avmsf fit` writes it."""
+    to: Format
+    """Format to write."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
+    """A folder, or a file for gltf (.glb), faust (.dsp, .lib), uff (.uff) or a page in one file (.html)."""
+    object: ShapeFile = None
+    """Mesh, or Gaussians as a .ply, to show; by default the capture's, else the field's body, else points."""
+    object_unit: Unit = "m"
+    """Unit of the coordinates of the object's mesh."""
+    capture: OtherCapture = None
+    """Capture folder: its mesh is shown, and a page offers its recordings."""
+    contacts: int | None = None
+    """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
+    position: PositionList = ()
+    """faust, gltf, uff, wavs: a contact in the object's frame, in place of these; once per contact."""
+    contact_table: ContactTable = None
+    """Table of such contacts: x,y,z, and nx,ny,nz for directions, such as impacts.csv."""
+    unit: Unit = "m"
+    """Unit of --position and --contact-table."""
+    overwrite: Flag = False
+    """Replace a file, or the folder of an earlier export, that exists."""
+    forces: tuple[float, ...] = (1.0,)
+    """wavs: forces of the layers, newtons if the field knows forces, else relative."""
+    contact_times: tuple[float, ...] = ()
+    """wavs: contact time of each layer's hammer, seconds; 0 as recorded; by default by Hertz's law."""
+    seconds: float | None = None
+    """wavs: length of the sounds; by default that of the training sounds."""
+    pulse: PulseShape = "half-sine"
+    """wavs: force over the contact time, as in `avmsf render`."""
+    up: Axis = "z"
+    """gltf: axis of the object's frame that points up."""
+    no_noise: Flag = False
+    """faust, wavs: write the modes without the residual noise."""
+    functions: int = 16
+    """uff: points whose frequency response functions are written in addition to the mode shapes."""
+    variant: Annotated[str, tyro.conf.arg(metavar="NAME")] = "original"
+    """avmsf-demo: name of the sound among those of one object."""
+    precision: Precision = "float32"
+    """avmsf-demo: number format of the gains."""
+
+    @property
+    def contacts_given(self) -> bool:
+        """Whether the contacts are given, and used by the format."""
+        return self.to in CHOOSING and bool(self.position or self.contact_table)
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        given = sum((bool(self.position), self.contact_table is not None, self.contacts is not None))
+        if self.contacts_given and given > 1:
+            raise ExportError.expected(
+                "contacts by one of --position, --contact-table and --contacts",
+                given,
+                name="--position" if self.position else "--contact-table",
+                advice="leave out the others",
+            )
+        for row, place in enumerate(self.position):
+            if not all(map(math.isfinite, place)):
+                raise ExportError.expected("finite coordinates", list(place), row=row, name="--position")
+        if self.contacts is not None and self.contacts < 1:
+            raise ExportError.expected("1 or more", self.contacts, name="--contacts")
+        # A web page is a file or, by a name without its suffix, a folder.
+        suffixes = SUFFIXES.get(self.to, ())
+        (NewFile(suffixes, or_folder=self.to == "web") if suffixes else NewFolder()).check(self.output)
+        check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
+        FIELD.read_record(self.field)
+
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> "Options":
+        """Return the options that the words spell."""
+        if ("--to", "sfz") in pairwise(words):
+            raise ExportError.expected("--to wavs, which writes an SFZ instrument too", "sfz", name="--to")
+        return super().parse(words)
+
+
+def unused_options(options: Options) -> list[str]:
+    """Return a sentence for each given option that the format does not use."""
+    used = _USED[options.to]
+    sentences = []
+    for each in fields(options):
+        if each.name in _OF_SOME and each.name not in used and getattr(options, each.name) != each.default:
+            others = ", ".join(name for name, known in _USED.items() if each.name in known)
+            sentences.append(f"{option_of(each.name)} is not used by --to {options.to}, only by {others}")
+    return sentences
 
 
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
+    from avmsf.export.faust import contacts_path
+    from avmsf.export.samples import INSTRUMENT
+    from avmsf.export.write import WRITERS
+    from avmsf.field.store import load
+
     for sentence in unused_options(options):
         say(f"note: {sentence}")
     field = load(options.field)
-    source, settings = _PREPARED[options.to](field, options)
+    source, settings = _prepare(field, options)
     written: Written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
     for remark in written.remarks:
         say(f"note: {remark}")
@@ -78,6 +198,8 @@ def run(options: Options) -> int:
 
 def _following(options: Options) -> str:
     """Return what to do with the files of a format."""
+    from avmsf.export.samples import INSTRUMENT
+
     output = shlex.quote(str(options.output))
     match options.to:
         case "web" if options.output.suffix.lower() in SUFFIXES["web"]:
@@ -99,8 +221,31 @@ def _following(options: Options) -> str:
             return f"open {output} in the paper's web demo"
 
 
-def _sampled(field: SoundField, options: Options) -> SampledField:
+def _prepare(field: "SoundField", options: Options) -> "_Prepared":
+    """Return what a format's writer writes, and its settings."""
+    match options.to:
+        case "web":
+            return _web(field, options)
+        case "gltf":
+            shown, meters = _object(field, options)
+            return _sampled(field, options), {"object": shown, "meters": meters, "up": options.up}
+        case "faust":
+            return _faust(field, options)
+        case "wavs":
+            return _wavs(field, options)
+        case "uff":
+            return _sampled(field, options), {"functions": options.functions}
+        case _:
+            return _demo(field, options)
+
+
+def _sampled(field: "SoundField", options: Options) -> "SampledField":
     """Return the field at the contacts of the options, or at its own points spread over the object."""
+    from avmsf.cli.contacts import given_contacts, note_off, refuse_far
+    from avmsf.export.sampled_field import SampledField
+    from avmsf.export.writing import POINTS
+    from avmsf.field.positions import points_on_object
+
     if options.contacts_given:
         contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
         refuse_far(contacts, field, advice=", see --unit")
@@ -114,7 +259,7 @@ def _sampled(field: SoundField, options: Options) -> SampledField:
     return sampled
 
 
-def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None, float]:
+def _object(field: "SoundField", options: Options) -> "tuple[Path | Surface | None, float]":
     """Return what shows the object, and what its coordinates count in meters; print where there is nothing.
 
     A capture's own mesh is shown, otherwise the surface of the body that the field's gains are computed on, otherwise
@@ -122,16 +267,19 @@ def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None,
     recorded: of a field edited to another size its mesh is scaled alike. Raises `ExportError` for a capture's Gaussians
     then.
     """
+    from avmsf.gaussians.ply import holds_gaussians
+
+    length, path, meters = field.gain_field.length, None, 1.0
     if options.object is not None:
         _note_size(field, options.object)
         return options.object, METRES[options.object_unit]
-    path, meters = _captured(options)
+    if options.capture is not None:
+        settings = settings_of(options.capture)
+        path, meters = find_surface_file(options.capture, settings), settings.surface_meters
     if path is None:
-        body = field.gain_field.surface
-        if body is not None:
-            return body, 1.0
+        if field.gain_field.surface is not None:
+            return field.gain_field.surface, 1.0
         path, meters = _reconstructed(options), 1.0
-    length = field.gain_field.length
     if length == 1.0 or path is None:
         return path, meters
     if holds_gaussians(path):
@@ -142,17 +290,9 @@ def _object(field: SoundField, options: Options) -> tuple[Path | Surface | None,
     return path, meters * length
 
 
-def _note_size(field: SoundField, path: Path) -> None:
+def _note_size(field: "SoundField", path: Path) -> None:
     if (length := field.gain_field.length) != 1.0:
         say(f"note: the field was edited to {length:g} times its size; {path} is not scaled and has to have it")
-
-
-def _captured(options: Options) -> tuple[Path | None, float]:
-    """Return the capture's own mesh or Gaussians, and what its coordinates count in meters."""
-    if options.capture is None:
-        return None, 1.0
-    settings = settings_of(options.capture)
-    return find_surface_file(options.capture, settings), settings.surface_meters
 
 
 def _reconstructed(options: Options) -> Path | None:
@@ -164,36 +304,34 @@ def _reconstructed(options: Options) -> Path | None:
     caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
     made = next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
     if made is None:
-        say(
-            f"note: {capture} has no surface: only the field's points are shown; make one by avmsf fit {capture} "
-            "--until surface, or give --object"
-        )
+        advice = f"make one by avmsf fit {capture} --until surface, or give --object"
+        say(f"note: {capture} has no surface: only the field's points are shown; {advice}")
     return made
 
 
-def _web(field: SoundField, options: Options) -> _Prepared:
+def _web(field: "SoundField", options: Options) -> "_Prepared":
+    from avmsf.capture.folder import read_capture
+    from avmsf.editing.modal_edit import EDITS
+    from avmsf.export.writing import POINTS
+    from avmsf.mesh.surface import Surface
+
     source, meters = _object(field, options)
-    body = None if isinstance(source, Surface) else field.gain_field.surface
-    strikes = _recordings(field, options.capture)
-    limit = options.contacts or POINTS["web"]
-    return field, {"object": source, "meters": meters, "surface": body, "strikes": strikes, "limit": limit}
-
-
-def _recordings(field: SoundField, capture: Path | None) -> Impacts | None:
-    """Return a capture's recordings; None for an edited field, which is not to sound like them."""
-    if capture is not None and field.origin.report.get(EDITS):
+    recorded = options.capture
+    if recorded is not None and field.origin.report.get(EDITS):
         say("note: the field is edited, so the page has no recordings to compare it with")
-        return None
-    return None if capture is None else read_capture(capture).impacts
+        recorded = None
+    return field, {
+        "object": source,
+        "meters": meters,
+        "surface": None if isinstance(source, Surface) else field.gain_field.surface,
+        "strikes": None if recorded is None else read_capture(recorded).impacts,
+        "limit": options.contacts or POINTS["web"],
+    }
 
 
-def _gltf(field: SoundField, options: Options) -> _Prepared:
-    sampled = _sampled(field, options)
-    source, meters = _object(field, options)
-    return sampled, {"object": source, "meters": meters, "up": options.up}
+def _faust(field: "SoundField", options: Options) -> "_Prepared":
+    from avmsf.export.faust import fitted
 
-
-def _faust(field: SoundField, options: Options) -> _Prepared:
     sampled, noise = _sampled(field, options), not options.no_noise
     if options.contacts is None and not options.contacts_given:
         asked = len(sampled)
@@ -203,17 +341,19 @@ def _faust(field: SoundField, options: Options) -> _Prepared:
     return sampled, {"noise": noise}
 
 
-def _demo(field: SoundField, options: Options) -> _Prepared:
+def _demo(field: "SoundField", options: Options) -> "_Prepared":
+    from avmsf.export.geometry import read_gaussians
+    from avmsf.export.sampled_field import SampledField, spread_rows
+    from avmsf.export.writing import POINTS
+    from avmsf.field.positions import points_on_object
+
     source, most = options.object, options.contacts or POINTS["avmsf-demo"]
     settings = {"variant": options.variant, "precision": options.precision}
     if source is None:
         return _sampled(field, options), settings
     cloud = read_gaussians(source, points_on_object(field.gain_field))
     if cloud is None:
-        wanted, advice = (
-            "a .ply of Gaussians for the demo",
-            "name one, or leave --object out for a disc at each contact",
-        )
+        wanted, advice = "a .ply of Gaussians", "name one, or leave --object out for a disc at each contact"
         raise ExportError.expected(wanted, got="another file", file=source, name="--object", advice=advice)
     _note_size(field, source)
     if len(cloud) > most:
@@ -221,42 +361,24 @@ def _demo(field: SoundField, options: Options) -> _Prepared:
     return SampledField.of(field, cloud.centers), {**settings, "cloud": cloud}
 
 
-def _wavs(field: SoundField, options: Options) -> _Prepared:
+def _wavs(field: "SoundField", options: Options) -> "_Prepared":
+    from avmsf.export.samples import Layer, hertz_layers
+
     forces, times = options.forces, options.contact_times
     if len(times) == 1:
         times = times * len(forces)
     if times and len(times) != len(forces):
-        raise ExportError.expected(
-            f"one, or one for each of {len(forces)} --forces", len(times), name="--contact-times"
-        )
+        wanted = f"one, or one for each of {len(forces)} --forces"
+        raise ExportError.expected(wanted, len(times), name="--contact-times")
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=False))
-    layers = layers or hertz_layers(forces, options.pulse)
     sampled = _sampled(field, options)
     if not options.contacts_given:
-        sampled = _loud(sampled)
-    settings = {"layers": layers, "seconds": options.seconds, "noise": not options.no_noise}
-    return sampled, {**settings, "contacts": len(sampled)}
-
-
-def _loud(sampled: SampledField) -> SampledField:
-    """Return the field at contacts that are heard beside the loudest; says how many are left out."""
-    level = 10 * torch.log10(sampled.energy.clamp_min(torch.finfo(torch.float64).tiny))
-    loud = torch.nonzero(level >= level.max() - _DEAD_DB).flatten()
-    if len(loud) < len(sampled):
-        left = counted(len(sampled) - len(loud), "contact")
-        say(f"note: {left} left out, {_DEAD_DB:g} dB or more below the loudest; --position writes any")
-    return sampled.take(loud)
-
-
-def _uff(field: SoundField, options: Options) -> _Prepared:
-    return _sampled(field, options), {"functions": options.functions}
-
-
-_PREPARED: dict[Format, Callable[[SoundField, Options], _Prepared]] = {
-    "web": _web,
-    "gltf": _gltf,
-    "faust": _faust,
-    "avmsf-demo": _demo,
-    "wavs": _wavs,
-    "uff": _uff,
-}
+        # Those that are heard beside the loudest.
+        level = 10 * sampled.energy.clamp_min(1e-300).log10()
+        loud = (level >= level.max() - _DEAD_DB).nonzero().flatten()
+        if len(loud) < len(sampled):
+            left = counted(len(sampled) - len(loud), "contact")
+            say(f"note: {left} left out, {_DEAD_DB:g} dB or more below the loudest; --position writes any")
+        sampled = sampled.take(loud)
+    settings = {"layers": layers or hertz_layers(forces, options.pulse), "seconds": options.seconds}
+    return sampled, {**settings, "noise": not options.no_noise, "contacts": len(sampled)}

@@ -2,64 +2,187 @@
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
-import trimesh
-from rich.console import Console
+import tyro
 
-from avmsf._utils.device import TRAINABLE, usable_device
-from avmsf._utils.files import copy_whole, write_whole
-from avmsf._utils.text import counted, format_number
-from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
-from avmsf.capture.checks import check_one_unit, find_surface
-from avmsf.capture.settings import TABLE
-from avmsf.capture.table import in_folder, parse_row, read_rows
+from avmsf._utils.text import counted, listed
+from avmsf.capture.filenames import expect_views
+from avmsf.capture.settings import CaptureSettings
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.alignment import describe_alignment
-from avmsf.cli.heartbeat import doing
-from avmsf.cli.options.checks import OutputError, read_settings
-from avmsf.cli.options.fit import Options
-from avmsf.cli.printing import console, next_command, next_step, print_json, print_result, say, table
-from avmsf.cli.progress import ProgressBar
-from avmsf.cli.scores import (
-    advice_on_labels,
-    body_warnings,
-    compare,
-    outlier_words,
-    parts_words,
-    quality_words,
-    score_table,
-    score_values,
-)
-from avmsf.errors import FitError
-from avmsf.evaluation.scores import Scores
-from avmsf.evaluation.splits import split
-from avmsf.features.store import load_features, read_report
-from avmsf.field.sound_field import SoundField
-from avmsf.field.store import load
-from avmsf.gaussians.ply import read_splats
-from avmsf.mesh.surface import Surface, SurfaceKind, read_surface, write_surface
-from avmsf.pipeline.fit import StagedFit, fit_in_stages, guess_in_stages
-from avmsf.pipeline.record import capture_settings_of, modes_words
-from avmsf.pipeline.scene import SceneStages
-from avmsf.pipeline.shape import keep_surface, object_shape
-from avmsf.pipeline.stages import Kept, StageFolder
-from avmsf.pipeline.visuals import expect_shape
-from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.surfaces import draw_surface
-from avmsf.symmetry.symmetries import Symmetries
+from avmsf.cli.options.checks import OutputError, expect_device, expect_rows, read_settings
+from avmsf.cli.options.common import Configured, Flag, option_of
+from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
+from avmsf.cli.options.settings import with_settings
+from avmsf.cli.printing import next_command, next_step, print_json, print_result, show
+from avmsf.cli.progress import display, doing, say
+from avmsf.errors import EvaluationError, FitError
+from avmsf.fem.material import material_named
+from avmsf.field.config import GainModelName
+from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset, TimeZero
 
-_SHOWN = 8
-"""Names of recordings in a line, at most."""
+if TYPE_CHECKING:
+    from avmsf.capture import Impacts
+    from avmsf.evaluation.scores import Scores
+    from avmsf.field.sound_field import SoundField
+    from avmsf.mesh.surface import Surface
+    from avmsf.pipeline.fit import StagedFit
+
+_STAGES = {"field.safetensors": "fit", "points.safetensors": "features"}
+"""Names of stages that are not those of their files."""
+Stage = Literal["gaussians", "features", "surface"]
+_SUFFIXES: dict[Stage | None, tuple[str, ...]] = {
+    None: (".safetensors",),
+    "gaussians": (".ply",),
+    "features": (".safetensors",),
+    "surface": (".ply", ".obj", ".glb"),
+}
+"""Endings of the output, by the stage that is the last."""
+
+
+@dataclass(frozen=True)
+class Options(Configured):
+    """Fit a sound field to a capture and write it to one file.
+
+    CAPTURE holds impacts.csv, the recordings that it names, and what shows the object: a mesh, photographs, a video or
+    Gaussians. A mesh is used before photographs. Without recordings, --material gives an approximate field. The output
+    of each stage is cached, only what changed is computed again, and repeating an interrupted command continues it.
+    """
+
+    capture: tyro.conf.Positional[
+        Annotated[
+            Path,
+            tyro.conf.arg(metavar="CAPTURE"),
+            Existing("a capture folder, or a mesh with --material", ("a folder", "a mesh or Gaussians")),
+        ]
+    ]
+    """Capture folder; with --material also a folder without recordings, or a mesh."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")] = None
+    """File of the field, by default only in the cache; with --until what that stage makes (.ply, .obj, .glb ...)."""
+    until: Stage | None = None
+    """Stop after a stage that needs no recordings: 3D Gaussians, image features, or the object's surface."""
+    cache: CacheFolder = None
+    """Cache of the stages' outputs, by default CAPTURE/.avmsf."""
+    settings: SettingsFile = None
+    """A capture.toml in place of the folder's own."""
+    plots: PlotsFolder = None
+    """With --until surface: draw it with two cross-sections to surface.png in this folder."""
+    material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Approximate field without recordings, of ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
+    train_fraction: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Fit to this fraction of the contacts (those within 1 % of the extent are one), and score the others."""
+    train_count: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Fit to this number of contacts, spread as far apart as possible, and score the others."""
+    start: int = 0
+    """Row of impacts.csv, from 0, whose contact this choice starts from."""
+    features: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FEATURES.safetensors"),
+        Existing("features, as avmsf fit --until features writes them", ("features",)),
+    ] = None
+    """Features by --until features, by default those of the folder's views where the gain model reads any."""
+    without_shape: Flag = False
+    """Fit to the positions of the contacts alone."""
+    gain_model: GainModelName | None = None
+    """By default auto: a Gaussian process over all families, by evidence. network: the paper's. Others: one family."""
+    extraction: ExtractionMethod | None = None
+    """How modes are extracted, see `avmsf modes --help`; by default high-resolution."""
+    modes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Modes at most, by default 128."""
+    time_zero: TimeZero | None = None
+    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
+    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
+    """Device for Gaussians, DINOv2 and training, by default the GPU; all else runs on the CPU."""
+    seed: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Random seed of all stages, by default 0."""
+    preset: Preset = "default"
+    """All settings: the default, or everything as published, the middle of each published list, which takes hours."""
+
+    usual = PRESETS["default"]
+
+    @cached_property
+    def all_settings(self) -> PipelineConfig:
+        """The preset with the settings that are given."""
+        seeds = ("fit.seed", "scene.views.seed", "scene.splat.seed", "scene.lift.seed")
+        options = {name: getattr(self, name) for name in ("gain_model", "extraction", "modes", "time_zero", "device")}
+        return with_settings(
+            PRESETS[self.preset], self.set, self.config, {**options, **dict.fromkeys(seeds, self.seed)}
+        )
+
+    @property
+    def kept(self) -> Path:
+        """The folder that caches the stages' outputs."""
+        if self.cache is not None:
+            return self.cache
+        return self.capture / CACHE if self.capture.is_dir() else self.capture.parent / CACHE / self.capture.stem
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if self.output is not None:
+            NewFile(_SUFFIXES[self.until]).check(self.output)
+        if self.plots is not None and self.until != "surface":
+            raise OutputError.expected("--until surface with it", self.until, name="--plots")
+        config = self.all_settings
+        expect_device(config.device, raising=FitError)
+        self._check_split()
+        settings = read_settings(self.capture, self.settings)
+        if self.material is not None:
+            material_named(self.material, option="--material")
+        self._check_unused(config)
+        if self.until is not None or (self.material is not None and self.capture.is_dir()):
+            expect_views(self.capture, settings)
+        elif self.material is None:
+            if not self.capture.is_dir():
+                advice = "--material NAME computes a field of a mesh without recordings"
+                raise FitError.expected(
+                    "a capture folder", got="a file", file=self.capture, name="--material", advice=advice
+                )
+            expect_rows(self.capture, settings)
+
+    def _check_split(self) -> None:
+        if self.train_count is not None and self.train_fraction is not None:
+            raise FitError.expected("it or --train-fraction", got="both", name="--train-count", advice="leave one out")
+        if self.train_fraction is not None and not 0.0 < self.train_fraction < 1.0:
+            raise EvaluationError.expected(
+                "a fraction of training contacts between 0 and 1, such as 0.75",
+                self.train_fraction,
+                name="--train-fraction",
+            )
+
+    def _check_unused(self, config: PipelineConfig) -> None:
+        """Raise FitError for options that nothing would read."""
+        given = {each.name for each in fields(self) if getattr(self, each.name) != each.default}
+        for name in ("gain_model", "time_zero"):
+            if getattr(config, name) != getattr(self.usual, name):
+                given.add(name)
+        if config.gain_model in ("auto", "elastic"):
+            given.discard("gain_model")
+        if config.body.supports == "try":
+            given.add("body.supports")
+        fitted = ("train_fraction", "train_count", "start", "features", "without_shape")
+        unread = {"until": fitted, "material": (*fitted, "until", "time_zero", "gain_model", "body.supports")}
+        for other, names in unread.items():
+            for name in names if getattr(self, other) else ():
+                if name in given:
+                    chosen = getattr(self, other)
+                    raise FitError.expected(
+                        f"no --{other} with it", chosen, name=option_of(name), advice="leave one out"
+                    )
+        if self.start and self.train_fraction is None and self.train_count is None:
+            raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
 
 
 def run(options: Options) -> int:
     """Fit, write, and print a summary; return 130 where Ctrl-C stopped it."""
+    from avmsf._utils.device import TRAINABLE, usable_device
+
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
-    settings = capture_settings_of(options.all_settings, read_settings(options.capture, options.settings))
+    settings = read_settings(options.capture, options.settings).starting(options.all_settings.time_zero)
     try:
         if options.until is not None:
             _make_stage(options, settings)
@@ -74,17 +197,29 @@ def run(options: Options) -> int:
 
 
 def _fit(options: Options, settings: CaptureSettings) -> None:
+    from avmsf._utils.files import copy_whole
+    from avmsf.capture import read_capture
+    from avmsf.cli.alignment import AlignmentReport
+    from avmsf.cli.report import compare, features_lines, field_lines, parts_words, score_table
+    from avmsf.evaluation.splits import split
+    from avmsf.features.store import load_features, read_report
+    from avmsf.field.store import load
+    from avmsf.pipeline.fit import fit_in_stages
+    from avmsf.pipeline.stages import StageFolder
+    from avmsf.pipeline.visuals import expect_shape
+
     capture = read_capture(options.capture, settings)
     if options.without_shape:
         capture = replace(capture, surface=None, folder=None)
     elif options.features is None:
         expect_shape(capture)
-    train, test = _parts(capture, options)
+    size = options.train_count if options.train_fraction is None else options.train_fraction
+    train, test = (capture.impacts, None) if size is None else split(capture.impacts, size, start=options.start)
     features, described = None, None
     if options.features is not None:
         features, described = load_features(options.features), read_report(options.features)
     stages = StageFolder(options.kept)
-    with ProgressBar() as bar, stages.lock("avmsf fit"):
+    with stages.lock("avmsf fit"):
         made = fit_in_stages(
             capture,
             options.all_settings,
@@ -92,42 +227,45 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
             train=train,
             features=features,
             features_report=described,
-            listener=bar.listener,
+            listener=display.listener,
         )
         fitted = load(made.field)
         if options.output is not None:
             copy_whole(made.field, options.output)
-    screen, path = console(errors=options.json), options.output or made.field
-    for sentence in (*advice_on_labels(fitted), *describe_alignment(made.modes, train)):
-        screen.print(sentence, soft_wrap=True)
-    doing("comparing the field with the recordings that it was not fitted to")
-    scores = {} if test is None else compare(fitted, train, test, made.modes)
+    path, aligned = options.output or made.field, AlignmentReport.of(made.modes, train)
+    lines = [fitted.origin.report["advice"]] if fitted.origin.report.get("advice") else []
+    if aligned is not None:
+        lines += aligned.sentences() if display.verbose else aligned.warnings()
+    lines += features_lines(made.report) if made.report and display.verbose else []
+    scores: dict[str, Scores] = {}
     if test is not None:
-        shown = ", ".join(test.names[:_SHOWN]) + f" and {len(test) - _SHOWN} more" * (len(test) > _SHOWN)
-        say(f"not trained on: {shown}")
-    if made.report:
-        screen.print(features_words(made.report), soft_wrap=True)
-    rows = [[each.stage, format_number(each.seconds), "computed" if each.fresh else "cached"] for each in made.stages]
-    screen.print(table("stages", ["stage", "seconds", "source"], rows))
-    print_fitted(screen, fitted, train, test, scores, path)
-    if made.surface is not None:
-        screen.print(f"the object's surface is {made.surface}", soft_wrap=True)
-    screen.print(f"wrote {path}", soft_wrap=True)
-    if test is not None:
-        next_step(
-            "the same command without --train-fraction and --train-count, and another --output, fits all recordings"
-        )
-    else:
-        next_command("avmsf render", path, "--position X Y Z -o impact.wav")
-    if fitted.quality is not None and fitted.quality.level > 0:
-        # Last, so that it is read: the field is not better than averaging recordings.
-        say(str(fitted.quality))
+        doing("comparing the field with the recordings that it was not fitted to")
+        scores = compare(fitted, train, test, made.modes)
+        lines.append(score_table(f"{parts_words(train, test)}; lower is better", scores))
+        lines += [f"not trained on: {listed(test.names, most=8)}"] if display.verbose else []
+    lines += field_lines(fitted, path, settings=display.verbose)
+    lines += [f"wrote {path}", *([] if made.surface is None else [f"the object's surface is {made.surface}"])]
+    show("\n".join(lines), json=options.json)
     if options.json:
-        print_json(_values(options, path, fitted, made) | _split_values(train, test, scores))
+        print_json(_values(options, path, fitted, made, train, test, scores))
+    if test is None:
+        next_command("avmsf render", path, "--position X Y Z -o impact.wav")
+    else:
+        next_step("the same command without --train-fraction and --train-count fits all recordings")
 
 
-def _values(options: Options, path: Path, fitted: SoundField, made: StagedFit) -> dict[str, Any]:
+def _values(
+    options: Options,
+    path: Path,
+    fitted: "SoundField",
+    made: "StagedFit",
+    train: "Impacts",
+    test: "Impacts | None",
+    scores: Mapping[str, "Scores"],
+) -> dict[str, Any]:
     """Return what a fit made, as plain values."""
+    from avmsf.cli.report import score_values
+
     return {
         "field": str(path),
         "capture": fitted.origin.capture,
@@ -140,96 +278,76 @@ def _values(options: Options, path: Path, fitted: SoundField, made: StagedFit) -
         "preset": options.preset,
         "config": asdict(options.all_settings.fit),
         "features_report": made.report,
-        "stages": [asdict(each) for each in made.stages],
+        "stages": [
+            {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
+            for name, each in made.stages.items()
+        ],
         "sample_rate": fitted.sample_rate,
+        "trained_on": list(train.names),
+        "tested_on": [] if test is None else list(test.names),
+        "scores": score_values(scores),
     }
-
-
-def _split_values(train: Impacts, test: Impacts | None, scores: Mapping[str, Scores]) -> dict[str, Any]:
-    names = {"trained_on": list(train.names), "tested_on": [] if test is None else list(test.names)}
-    return {**names, "scores": score_values(scores)}
-
-
-def _parts(capture: Capture, options: Options) -> tuple[Impacts, Impacts | None]:
-    """Return the recordings to fit to and those to score on, None where all are fitted to."""
-    size = options.train_count if options.train_fraction is None else options.train_fraction
-    return (capture.impacts, None) if size is None else split(capture.impacts, size, start=options.start)
-
-
-def print_fitted(
-    screen: Console, fitted: SoundField, train: Impacts, test: Impacts | None, scores: Mapping[str, Scores], path: Path
-) -> None:
-    """Print the errors of a field in the file `path` at held-out recordings, the outliers, and its quality."""
-    if test is not None:
-        screen.print(score_table(f"{parts_words(train, test)}; lower is better", scores))
-    poor = fitted.quality is not None and fitted.quality.level > 0
-    for words in (
-        *outlier_words(fitted),
-        summary(fitted, len(train)),
-        *body_warnings(fitted),
-        *(() if poor else quality_words(fitted, path)),
-    ):
-        screen.print(words, soft_wrap=True)
 
 
 def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
     """Compute a field without recordings, and print a summary."""
+    from avmsf._utils.files import copy_whole
+    from avmsf.cli.report import quality_words
+    from avmsf.field.store import load
+    from avmsf.pipeline.fit import guess_in_stages
+    from avmsf.pipeline.stages import StageFolder
+
     stages = StageFolder(options.kept)
-    with ProgressBar() as bar, stages.lock("avmsf fit"):
+    with stages.lock("avmsf fit"):
         made = guess_in_stages(
-            options.capture, material, options.all_settings, stages, settings=settings, listener=bar.listener
+            options.capture, material, options.all_settings, stages, settings=settings, listener=display.listener
         )
         guessed, path = load(made), options.output or made
         if options.output is not None:
             copy_whole(made, options.output)
-    screen = console(errors=options.json)
-    for words in quality_words(guessed, path):
-        screen.print(words, soft_wrap=True)
-    screen.print(f"wrote {path}", soft_wrap=True)
+    values = {"field": str(path), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
+    values |= {"sample_rate": guessed.sample_rate, "trained_on": [], "report": guessed.origin.report}
+    print_result("\n".join([*quality_words(guessed, path), f"wrote {path}"]), values, json=options.json)
     next_command("avmsf render", path, "--position X Y Z -o impact.wav")
-    if options.json:
-        values = {"field": str(path), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
-        values |= {"sample_rate": guessed.sample_rate, "trained_on": [], "report": guessed.origin.report}
-        print_json(values)
 
 
 def _make_stage(options: Options, settings: CaptureSettings) -> None:
     """Make Gaussians, features or a surface of the folder's views, and print what they are."""
+    from avmsf.capture.checks import check_one_unit, find_surface
+    from avmsf.cli.report import features_lines
+    from avmsf.features.store import read_report
+    from avmsf.gaussians.ply import read_splats
+    from avmsf.mesh.surface import read_surface
+    from avmsf.pipeline.scene import SceneStages
+    from avmsf.pipeline.shape import keep_surface, object_shape
+    from avmsf.pipeline.stages import StageFolder
+
     check_one_unit(options.capture, settings)
-    stages = StageFolder(options.kept)
-    with ProgressBar() as bar:
-        scene = SceneStages(
-            options.capture,
-            stages,
-            options.all_settings.scene,
-            settings=settings,
-            listener=bar.listener,
-            device=options.device,
-        )
-        scene.expect_any()
-        with stages.lock("avmsf fit"):
-            match options.until:
-                case "gaussians":
-                    made, key, values = scene.cloud, "cloud", {"gaussians": len(read_splats(scene.cloud.path))}
-                    words = counted(values["gaussians"], "Gaussian")
-                case "features":
-                    made, key, values = scene.features, "features", read_report(scene.features.path)
-                    words = features_words(values)
-                case _:
-                    made = keep_surface(stages, *object_shape(find_surface(options.capture, settings), scene))
-                    surface = read_surface(made.path)
-                    key, values, words = "surface", {"triangles": len(surface.faces)}, surface_words(surface)
-                    if options.plots is not None:
-                        _draw(surface, options.capture, settings, options.plots / "surface.png")
-            if options.output is not None:
-                _write_stage(made.path, options.output)
-    lines = [words, *(stage_line(name, each) for name, each in {**scene.made(), key: made}.items())]
-    if options.plots is not None:
-        lines.append(f"wrote {options.plots / 'surface.png'}")
-    if options.output is not None:
-        lines.append(f"wrote {options.output}")
+    stages, config = StageFolder(options.kept), options.all_settings.scene
+    scene = SceneStages(
+        options.capture, stages, config, settings=settings, listener=display.listener, device=options.device
+    )
+    scene.expect_any()
+    values: dict[str, Any]
+    with stages.lock("avmsf fit"):
+        match options.until:
+            case "gaussians":
+                made, key, values = scene.cloud, "cloud", {"gaussians": len(read_splats(scene.cloud.path))}
+                lines = [counted(values["gaussians"], "Gaussian")]
+            case "features":
+                made, key, values = scene.features, "features", read_report(scene.features.path)
+                lines = features_lines(values)
+            case _:
+                made = keep_surface(scene, *object_shape(find_surface(options.capture, settings), scene))
+                surface = read_surface(made.path)
+                key, values, lines = "surface", {"triangles": len(surface.faces)}, [surface_words(surface)]
+                if options.plots is not None:
+                    _draw(surface, options.capture, settings, options.plots / "surface.png")
+                    lines.append(f"wrote {options.plots / 'surface.png'}")
+        if options.output is not None:
+            _write_stage(made.path, options.output)
     path = options.output or made.path
-    print_result("\n".join(lines), {key: str(path), **values}, json=options.json)
+    print_result("\n".join([*lines, f"wrote {path}"]), {key: str(path), **values}, json=options.json)
     match options.until:
         case "gaussians":
             next_command("avmsf info", path, "--plots plots")
@@ -243,6 +361,9 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
 
 def _write_stage(made: Path, output: Path) -> None:
     """Copy what a stage made; a surface is written in the format of the output."""
+    from avmsf._utils.files import copy_whole, write_whole
+    from avmsf.mesh.surface import SurfaceKind, read_surface, write_surface
+
     suffix = output.suffix.lower()
     if suffix == ".obj" or suffix == ".glb":
         kind: SurfaceKind = "obj" if suffix == ".obj" else "glb"
@@ -252,8 +373,15 @@ def _write_stage(made: Path, output: Path) -> None:
         copy_whole(made, output)
 
 
-def _draw(surface: Surface, folder: Path, settings: CaptureSettings, picture: Path) -> None:
+def _draw(surface: "Surface", folder: Path, settings: CaptureSettings, picture: Path) -> None:
     """Draw a surface with the contacts of the folder's table. Raises CaptureError for a bad table."""
+    import torch
+
+    from avmsf.capture.settings import TABLE
+    from avmsf.capture.table import in_folder, parse_row, read_rows
+    from avmsf.plotting.pictures import save_picture
+    from avmsf.plotting.surfaces import draw_surface
+
     contacts = None
     if (folder / TABLE).is_file():
         with in_folder(folder):
@@ -262,54 +390,12 @@ def _draw(surface: Surface, folder: Path, settings: CaptureSettings, picture: Pa
     save_picture(draw_surface(surface, title=f"{folder.resolve().name}: surface", contacts=contacts), picture)
 
 
-def surface_words(surface: Surface) -> str:
+def surface_words(surface: "Surface") -> str:
     """Return a message on a surface's size, and on whether it is closed."""
+    import trimesh
+
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
     extent = " x ".join(f"{1000 * side:.3g}" for side in mesh.extents)
     words = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2"
     closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
     return f"{words}, {closed}"
-
-
-def stage_line(name: str, kept: Kept) -> str:
-    """Return a message on a stage's time and output."""
-    return f"{name:9} {kept.seconds:7.1f} s{'' if kept.fresh else ' (cached)'}  {kept.path}"
-
-
-def features_words(report: Mapping[str, Any]) -> str:
-    """Return a message on the features, their consistency over the views, and their symmetries."""
-    lines = [
-        f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of them in no view; "
-        f"consistency of the views {100 * report['agreement']:.0f} % of the features' variance"
-    ]
-    if report.get("dropped"):
-        lines.append(
-            f"removed: {counted(report['dropped'], 'Gaussian')} inside the object or behind its surface in the views"
-        )
-    if "symmetries" in report:
-        lines.append(Symmetries.from_dict(report["symmetries"]).summary())
-    if "orbit_spread" in report:
-        before, after = report["orbit_spread"]
-        lines.append(
-            f"deviation over symmetric points, relative to all: {before:.3f} before pooling, {after:.3f} after"
-        )
-    return "\n".join(lines)
-
-
-def summary(fitted: SoundField, contacts: int) -> str:
-    """Return the summary of a fit."""
-    report, body = fitted.origin.report, fitted.body
-    reason = f" ({report['damping_reason']})" if "damping_reason" in report else ""
-    gains = report.get("gain_model", "attention")
-    if body is not None:
-        gained = report["credibility"]["with_body"] - report["credibility"]["without_body"]
-        gains += (
-            f" (most probable body: {body}; it raises the log likelihood of the gains at left-out contacts by "
-            f"{gained:.1f} per mode)"
-        )
-    modes = modes_words(len(fitted.bank), int((~fitted.is_mode).sum()))
-    return (
-        f"field of {fitted.origin.capture}: {modes} from "
-        f"{counted(contacts, 'recording')}, gains by {gains}, {report.get('damping', 'shared')} damping{reason}, "
-        f"{counted(report.get('steps', fitted.origin.config.steps), 'step')} end to end"
-    )

@@ -1,120 +1,145 @@
 """`avmsf info`: what a field, Gaussians or features hold, as text and pictures."""
 
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
+import tyro
 
 from avmsf._utils.text import counted
-from avmsf.capture import CaptureSettings, Impacts, read_capture
-from avmsf.cli.heartbeat import doing
-from avmsf.cli.mode_table import levels, listed, mode_rows, mode_table
-from avmsf.cli.options.info import Options
-from avmsf.cli.options.paths import kind_of
-from avmsf.cli.printing import console, next_command, print_json, say
-from avmsf.cli.scores import body_warnings, outlier_words, quality_words, score_table, score_values
-from avmsf.evaluation.scores import evaluate
-from avmsf.field.config import NETWORK
-from avmsf.field.gains.attention import AttentionGains
-from avmsf.field.gains.scaled import BodyGains
-from avmsf.field.posterior import has_posterior, relative_gain_std, spectrum_band
-from avmsf.field.sound_field import SoundField
-from avmsf.field.store import load
-from avmsf.gaussians.points import farthest_points
-from avmsf.pipeline.record import RECORD, modes_words, recorded
+from avmsf.cli.options.checks import expect_capture, read_settings
+from avmsf.cli.options.common import Printing
+from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
+from avmsf.cli.printing import next_command, print_json, show
+from avmsf.cli.progress import doing, say
+from avmsf.errors import SceneError
+from avmsf.field.header import FIELD
+from avmsf.gaussians.ply_header import read_header
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from avmsf.capture import Impacts
+    from avmsf.features.feature_field import FeatureField
+    from avmsf.field.sound_field import SoundField
 
 _DRAWN_POINTS, _LISTED_POINTS = 4000, 500
 """Of the surface: for pictures, and for the mean levels in a table."""
 _DRAWN_CONTACTS = 4
 _BATCH = 1024
 """Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
+_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Describe a field, Gaussians or features, and draw them with --plots."""
+
+    file: tyro.conf.Positional[
+        Annotated[
+            Path,
+            tyro.conf.arg(metavar="FILE"),
+            Existing("a field, Gaussians or features", ("a sound field", "features", "a mesh or Gaussians")),
+        ]
+    ]
+    """A field (.safetensors), Gaussians (.ply) or features (.safetensors), as `avmsf fit` writes them."""
+    capture: OtherCapture = None
+    """Field: compare it with a capture's recordings that it was not fitted to, or with all if there are none."""
+    settings: SettingsFile = None
+    """Field: use this capture.toml instead of the capture's own."""
+    plots: PlotsFolder = None
+    """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
+    posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
+    cloud.png. Features: features.png."""
+    cloud: Annotated[
+        Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file", ("a mesh or Gaussians",))
+    ] = None
+    """Features: also draw the colors of the Gaussians that the features lie on."""
+    up: Literal["x", "y", "z"] = "z"
+    """Gaussians and features: axis that points up."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        suffix = self.file.suffix.lower()
+        for cloud in (self.file if suffix == ".ply" else None, self.cloud):
+            if cloud is not None:
+                read_header(cloud)
+        if suffix != ".ply" and kind_of(self.file) != "features":
+            FIELD.read_record(self.file)
+            if self.capture is not None:
+                expect_capture(self.capture, self.settings)
 
 
 def run(options: Options) -> int:
     """Describe and draw a file, whose kind its content shows."""
-    suffix = options.file.suffix.lower()
-    if suffix == ".ply" or kind_of(options.file) == "features":
-        from avmsf.cli.info_clouds import describe_cloud, describe_features
+    if options.file.suffix.lower() == ".ply":
+        values = _describe_gaussians(options)
+    elif kind_of(options.file) == "features":
+        values = _describe_features(options)
+    else:
+        return _describe_field(options)
+    if options.json:
+        print_json(values)
+    elif options.plots is None:
+        next_command("avmsf info", options.file, "--plots plots")
+    return 0
 
-        values = describe_cloud(options) if suffix == ".ply" else describe_features(options)
-        if options.json:
-            print_json(values)
-        elif options.plots is None:
-            next_command("avmsf info", options.file, "--plots plots")
-        return 0
+
+def _describe_field(options: Options) -> int:
+    from avmsf.capture import read_capture
+    from avmsf.cli.report import describe, field_lines, levels, mode_rows, mode_table, score_table, score_values
+    from avmsf.evaluation.scores import evaluate
+    from avmsf.field.store import load
+
     field = load(options.file)
-    points = _some(field.gain_field.points, _LISTED_POINTS if options.plots is None else _DRAWN_POINTS)
+    points = field.gain_field.points
+    points = points[:: max(1, len(points) // (_LISTED_POINTS if options.plots is None else _DRAWN_POINTS))]
     gains = gains_at(field, points)
     level = levels(gains)
     every = list(zip(mode_rows(field.bank, level), field.is_mode.tolist(), strict=True))
     rows, supporting = ([row for row, is_mode in every if is_mode is part] for part in (True, False))
     values = describe(field)
-    screen = console(errors=options.json)
-    screen.print(_words(field, values, quality_words(field, options.file)), soft_wrap=True)
-    title, most, rest = listed(", levels on average over the object", rows, len(supporting))
-    screen.print(mode_table(title, most))
-    if rest:
-        screen.print(rest)
-    recorded = None
+    lines = [*field_lines(field, options.file)]
+    lines.append(mode_table(", levels on average over the object", rows, len(supporting)))
+    compared = None
     if options.capture is not None:
-        settings = None if options.settings is None else CaptureSettings.read(options.settings)
         doing("comparing the field with the capture's recordings")
-        recorded, what = _held_out(read_capture(options.capture, settings).impacts, field)
-        recorded = field.aligned(recorded)
-        scores = {"field": evaluate(field, recorded)}
-        screen.print(score_table(f"{counted(len(recorded), 'contact')}, {what}; lower is better", scores))
-        values |= {"compared_with": {"recordings": list(recorded.names), "which": what, "scores": score_values(scores)}}
+        settings = read_settings(options.capture, options.settings)
+        compared, what = _held_out(read_capture(options.capture, settings).impacts, field)
+        compared = field.aligned(compared)
+        scores = {"field": evaluate(field, compared)}
+        lines.append(score_table(f"{counted(len(compared), 'contact')}, {what}; lower is better", scores))
+        values |= {"compared_with": {"recordings": list(compared.names), "which": what, "scores": score_values(scores)}}
+    show("\n".join(lines), json=options.json)
     if options.plots is not None:
-        doing("drawing the figures")
-        draw_field(field, options.plots, points=points, gains=gains, level=level, recorded=recorded)
-    next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
+        _draw_field(field, options.plots, points=points, gains=gains, level=level, recorded=compared)
     if options.json:
-        print_json(values | {"modes": list(map(asdict, rows)), "supporting_poles": list(map(asdict, supporting))})
+        print_json(values | {"modes": rows, "supporting_poles": supporting})
+    next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
     return 0
 
 
-def describe(field: SoundField) -> dict[str, Any]:
-    """Return what the field is, as plain values."""
-    points = field.gain_field.points
-    noise = float(field.residual.magnitude.square().mean().sqrt())
-    return {
-        "capture": field.origin.capture,
-        "sample_rate": field.sample_rate,
-        "seconds": field.samples / field.sample_rate,
-        "mode_count": int(field.is_mode.sum()),
-        "supporting_pole_count": int((~field.is_mode).sum()),
-        "points": len(points),
-        "extent_meters": (points.amax(0) - points.amin(0)).tolist(),
-        "bounds_meters": [points.amin(0).tolist(), points.amax(0).tolist()],
-        "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
-        "residual_rms": noise,
-        "per_newton": field.origin.per_newton,
-        "trained_on": list(field.origin.trained_on),
-        "pipeline": {**recorded(field), "fit": asdict(field.origin.config)},
-        "body": None if field.body is None else field.body.record(),
-        "report": {name: value for name, value in field.origin.report.items() if name != RECORD},
-    }
+def gains_at(field: "SoundField", points: "Tensor") -> "Tensor":
+    """Return the gains [points, modes] at many points, without a warning for one that is off the surface."""
+    import torch
 
-
-def gains_at(field: SoundField, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points modes"]:
-    """Return the gains at many points, without a warning for a point of the field's own that is off its surface."""
     return torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])
 
 
-def draw_field(
-    field: SoundField,
+def _draw_field(
+    field: "SoundField",
     folder: Path,
     *,
-    points: Float[Tensor, "points 3"],
-    gains: Float[Tensor, "points modes"],
-    level: Float[Tensor, " modes"],
-    recorded: Impacts | None,
+    points: "Tensor",
+    gains: "Tensor",
+    level: "Tensor",
+    recorded: "Impacts | None",
 ) -> None:
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
-    # Drawing imports matplotlib, which text does without.
+    from avmsf.field.posterior import has_posterior, relative_gain_std, spectrum_band
+    from avmsf.gaussians.points import farthest_points
+    from avmsf.pipeline.record import modes_words
     from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
     from avmsf.plotting.spectrograms import draw_spectrograms
     from avmsf.plotting.surfaces import draw_surface
@@ -153,12 +178,7 @@ def draw_field(
         say(f"wrote {path}")
 
 
-def _some(points: Float[Tensor, "points 3"], most: int) -> Float[Tensor, "chosen 3"]:
-    step = max(1, len(points) // most)
-    return points[::step]
-
-
-def _held_out(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
+def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
     known = set(field.origin.trained_on)
     rows = [row for row, name in enumerate(impacts.names) if name not in known]
     if not rows:
@@ -166,91 +186,65 @@ def _held_out(impacts: Impacts, field: SoundField) -> tuple[Impacts, str]:
     return impacts.take(rows), "not training recordings" if len(rows) < len(impacts) else "none a training recording"
 
 
-def _gains_words(gains: dict[str, Any]) -> str:
-    if gains.get("inner", gains["kind"]) == AttentionGains.kind:
-        return f"attention network on features: {gains['encoder']}"
-    if gains.get("inner", gains["kind"]) == BodyGains.kind:
-        return "computed without recordings: mode shapes of a body, each times its level"
-    families = ", ".join(dict.fromkeys(gains["families"]))
-    return f"Gaussian process over {families} kernels, by {counted(gains['contacts'], 'contact')}"
+def _describe_gaussians(options: Options) -> dict[str, Any]:
+    """Print a description of Gaussians, draw them with --plots, and return their values."""
+    from avmsf.gaussians.ply import read_splats
+    from avmsf.plotting.clouds import draw_cloud
+    from avmsf.plotting.pictures import save_picture
+
+    cloud = read_splats(options.file)
+    extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
+    count = counted(len(cloud), "Gaussian")
+    show(f"{options.file}: {count}, {' x '.join(f'{side:.3g}' for side in extent)} m", json=options.json)
+    if options.plots is not None:
+        title, picture = f"{options.file.name}: {count}", options.plots / "cloud.png"
+        save_picture(draw_cloud(cloud.centers, {"color": cloud.colors}, title=title, up=_UP[options.up]), picture)
+        say(f"wrote {picture}")
+    return {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_meters": extent}
 
 
-def _words(field: SoundField, values: dict[str, Any], quality: list[str]) -> str:
-    sides = zip("xyz", *values["bounds_meters"], strict=True)
-    extent = ", ".join(f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in sides)
-    report = values["report"]
-    supporting = values["supporting_pole_count"]
-    poles = f" and {counted(supporting, 'supporting pole')}" if supporting else ""
-    lines = [
-        f"field of {values['capture'] or 'an unnamed capture'}",
-        f"  sounds     {values['seconds']:.3g} s at {values['sample_rate']:g} Hz, "
-        f"{'per newton' if values['per_newton'] else 'on the scale of the recordings'}",
-        f"  modes      {values['mode_count']}{poles}, {report.get('damping', 'shared')} damping",
-        f"  noise      {values['residual_rms']:.2g} (root mean square of the residual)",
-        f"  object     {values['points']} points, {extent} m",
-        f"  gains      {_gains_words(values['gain_field'])}",
-        f"  fitted to  {counted(len(values['trained_on']), 'recording')}",
-    ]
-    lines += [] if "guess" in report else _pipeline_lines(values["pipeline"])
-    if field.body is not None:
-        lines.append(f"  body       {field.body} (the most probable one)")
-    lines += [f"  {words}" for words in body_warnings(field)]
-    lines += [f"  quality    {words}" for words in quality]
-    lines += [f"  {words}" for words in outlier_words(field)]
-    for edit in report.get("edits", []):
-        lines.append(f"  edited     {_edit_words(edit)}")
-    if report.get("validated"):
-        held = report.get("validation_spectral", {})
-        errors = ", ".join(f"{name} {float(error):.3g}" for name, error in held.items())
-        lines.append(f"  chosen on  {len(report['validation_contacts'])} validation contacts, spectral error {errors}")
-    return "\n".join(lines)
+def _describe_features(options: Options) -> dict[str, Any]:
+    """Print a description of features, draw them with --plots, and return their values."""
+    from avmsf.cli.report import features_lines
+    from avmsf.features.store import load_features, read_report
+
+    features, report = load_features(options.file), read_report(options.file)
+    count, dim = features.features.shape
+    lines = [f"{options.file}: {dim} features of {features.encoder} on {count} points"]
+    show("\n".join(lines + (features_lines(report) if "encoder" in report else [])), json=options.json)
+    if options.plots is not None:
+        _draw_features(features, report, options, options.plots / "features.png")
+    values = {"kind": "features", "file": str(options.file), "encoder": features.encoder, "points": count, "dim": dim}
+    return {**values, "report": report}
 
 
-def _pipeline_lines(pipeline: dict[str, Any]) -> list[str]:
-    """Return lines on the stages that made the field, if its file names them."""
-    fit, scene = pipeline["fit"], pipeline.get("scene")
-    lines = []
-    if "extraction" in pipeline:
-        lines.append(f"  extraction {pipeline['extraction']}, {pipeline['modes']} modes at most")
-        lines.append(f"  gain model {pipeline['gain_model']}")
-    if scene is not None:
-        lift, count = scene["lift"], scene["views"]["count"]
-        lines.append(
-            f"  features   {pipeline['encoder']}, {lift['weighting']} mean over {count or 'all'} views, "
-            f"{lift['components'] or 'all'} components, onto {lift['onto']}"
-        )
-    learned = f"{fit['clusters']} clusters, {fit['warmup_steps']} steps of warm-up, "
-    network = pipeline.get("gain_model") == NETWORK
-    lines.append(
-        f"  fit        {learned if network else ''}{counted(fit['steps'], 'step')} end to end, seed {fit['seed']}"
-    )
-    return lines
+def _draw_features(features: "FeatureField", report: dict[str, Any], options: Options, picture: Path) -> None:
+    from avmsf.features.feature_field import GEOMETRY
+    from avmsf.plotting.clouds import component_colors, draw_cloud
+    from avmsf.plotting.pictures import save_picture
+    from avmsf.symmetry.symmetries import Symmetries
+
+    symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
+    rows = {} if options.cloud is None else {"color": _colors_of(options.cloud, features)}
+    # The positions would outweigh the other features.
+    positions = 3 if features.encoder.startswith(f"{GEOMETRY} and ") else 0
+    rows["features"] = component_colors(features.features[:, positions:])
+    title = f"{options.file.name}: {features.encoder} on {len(features.points)} points"
+    save_picture(draw_cloud(features.points, rows, title=title, symmetries=symmetries, up=_UP[options.up]), picture)
+    say(f"wrote {picture}")
 
 
-def _edit_words(edit: dict[str, Any]) -> str:
-    """Return the description of an edit, without settings that change nothing."""
-    parts = [str(edit.get("edit"))]
-    if "from" in edit:
-        parts.append(f"from {edit['from']['name']} to {edit['to']['name']}")
-    parts += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
-    usual = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
-    parts += [f"{name} {_by_mode(edit[name])}" for name, same in usual.items() if edit.get(name, same) != same]
-    parts += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
-    for name, what in (
-        ("silent_hertz", "beyond half the sample rate"),
-        ("overdamped_hertz", "overdamped"),
-    ):
-        if edit.get(name):
-            parts.append(f"modes {what}: {len(edit[name])}")
-    if scores := edit.get("clap", {}).get("scores"):
-        parts.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
-    return ", ".join(parts)
+def _colors_of(path: Path, features: "FeatureField") -> "Tensor":
+    """Return the colors of the Gaussians that the features lie on."""
+    import torch
+    from scipy.spatial import cKDTree
 
+    from avmsf.gaussians.ply import read_splats
 
-def _by_mode(values: float | list[float | None] | None) -> str:
-    """Return one value, or the range of those of single modes; None is what is muted."""
-    if not isinstance(values, list):
-        return "-inf" if values is None else f"{values:.4g}"
-    low, high = (min(known), max(known)) if (known := [each for each in values if each is not None]) else (0.0, 0.0)
-    mute = values.count(None)
-    return f"{low:.4g} to {high:.4g} by mode" + (f", {mute} muted" if mute else "")
+    cloud = read_splats(path)
+    apart, rows = cKDTree(cloud.centers.numpy()).query(features.points.numpy())
+    if apart.any():
+        wanted, got = f"the {len(features.points)} Gaussians of the features", f"{len(cloud)} others"
+        advice = "name the file that the features were computed on"
+        raise SceneError.expected(wanted, len(cloud), got=got, file=path, name="--cloud", advice=advice)
+    return cloud.take(torch.from_numpy(rows)).colors

@@ -1,58 +1,108 @@
 """`avmsf locate`: contacts of recorded impacts, as text, heat maps and point clouds."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from statistics import mean, median
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
-from jaxtyping import Float64
-from torch import Tensor
+import tyro
 
 from avmsf._utils.text import format_number
-from avmsf.capture import CaptureSettings
-from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.settings import METRES
-from avmsf.cli.contacts import Contacts, read_contacts, refuse_far, rows_of
-from avmsf.cli.heartbeat import doing
-from avmsf.cli.options.locate import RECORDING, Options
-from avmsf.cli.printing import console, next_command, print_json, say
-from avmsf.editing.modal_edit import EDITS
+from avmsf.capture.settings import METRES, CaptureSettings
+from avmsf.cli.options.checks import OutputError
+from avmsf.cli.options.common import Flag, Printing, Unit
+from avmsf.cli.options.paths import ContactTable, Existing, FieldFile, OutputFolder, SettingsFile
+from avmsf.cli.printing import next_command, print_json, show
+from avmsf.cli.progress import doing, say
 from avmsf.errors import AvmsfError, LocationError
-from avmsf.field.sound_field import SoundField
-from avmsf.field.store import load
-from avmsf.localization.contact_map import ContactMap, not_located, symmetries_of
-from avmsf.localization.likelihood import Force
-from avmsf.localization.locate import locate, locate_impacts
-from avmsf.localization.locator import Locator
-from avmsf.symmetry.symmetries import Symmetries
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from avmsf.cli.contacts import Contacts
+    from avmsf.field.sound_field import SoundField
+    from avmsf.localization.contact_map import ContactMap
+
+    _Answer = tuple[dict[str, Any], ContactMap | None]
+    """The values for an impact, and its map; None for one that could not be located."""
 
 UNLOCATED = 2
 """The exit code where a recording could not be located."""
+RECORDING = Existing("a recording", ("a recording",))
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Find where on the object the impact of a recording was, with a heat map and the uncertainty.
+
+    Each recording holds one impact, of any force and polarity; with --several, any number of them.
+    """
+
+    field: tyro.conf.Positional[FieldFile]
+    """Field file, as `avmsf fit` writes it."""
+    recordings: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RECORDING.wav ...")]]
+    """Recordings of impacts on the same object: wav, flac or another format that libsndfile reads."""
+    settings: SettingsFile = None
+    """Read the recordings by this capture.toml; by default like the recordings of the fit."""
+    several: Flag = False
+    """The recordings hold several impacts each; locate every one of them."""
+    force: float | None = None
+    """Peak force of every impact, newtons (or relative to an average one), which tells contacts by loudness."""
+    probability: float = 0.9
+    """Probability that the contact lies within the region that is reported."""
+    true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """True contact of every impact, to print and mark its distance."""
+    true_contact_table: ContactTable = None
+    """True contacts of several recordings: columns file,x,y,z, such as impacts.csv."""
+    unit: Unit = "m"
+    """Unit of the true contacts; the field is in meters."""
+    output: OutputFolder = None
+    """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if not self.recordings:
+            raise OutputError.expected("one or more after the field, such as HIT.wav", 0, name="recordings")
+        # One that is missing does not keep the others from being located.
+        failures = []
+        for path in self.recordings:
+            try:
+                RECORDING.check(path)
+            except AvmsfError as error:
+                failures.append(error)
+        if len(failures) == len(self.recordings):
+            raise failures[0]
+        if self.true_contact is not None and self.true_contact_table is not None:
+            wanted = "true contacts by it, X Y Z, or by --true-contact-table TABLE.csv"
+            raise OutputError.expected(wanted, list(self.true_contact), got="both", name="--true-contact")
+        if not 0.0 < self.probability < 1.0:
+            raise OutputError.expected(
+                "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"
+            )
 
 
 def run(options: Options) -> int:
     """Locate, print and draw; return 2 where a recording could not be located."""
-    settings = None if options.settings is None else CaptureSettings.read(options.settings)
-    force = None if options.force is None else Force(options.force)
-    known = _Known(load(options.field))
-    truths = _true_contacts(options, known.field)
+    from avmsf.editing.modal_edit import EDITS
+    from avmsf.field.store import load
+
+    field = load(options.field)
+    truths = _true_contacts(options, field)
     say("preparing the gains over the surface and their posterior, once a run (seconds to minutes)")
-    screen = console(errors=options.json)
-    quality = known.field.quality
-    verdict = known.field.origin.report.get("guess") if quality is None else quality.verdict
+    verdict = field.origin.report.get("guess") if field.quality is None else field.quality.verdict
     if verdict is not None:
-        screen.print(verdict, soft_wrap=True)
+        show(verdict, json=options.json)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
+    locate = _locator(options, field)
     for path in options.recordings:
-        if found:
-            doing(f"locating the impact of {path}")
+        doing(f"locating the impact of {path}")
         try:
             RECORDING.check(path)
-            answers = _answers(known, read_recording(path), path, settings, force, options)
+            answers = locate(path)
         except AvmsfError as error:
             if len(options.recordings) == 1:
                 raise
@@ -63,68 +113,57 @@ def run(options: Options) -> int:
         for values, contact in answers:
             if truth is not None and contact is not None:
                 values |= _error(contact, truth, options.probability)
-            screen.print(_words(values), soft_wrap=True)
+            show(_words(values), json=options.json)
             if contact is not None and options.output is not None:
                 values |= _draw(contact, options.output, _name(path, taken), values, truth)
             found.append(values)
     summary = _summary(found)
     if summary is not None:
-        screen.print(_summary_line(summary, options.probability), soft_wrap=True)
-    if known.field.gain_field.contacts is not None and not known.field.origin.report.get(EDITS):
-        next_command("avmsf suggest", options.field)
+        show(_summary_line(summary, options.probability), json=options.json)
     if options.json:
         results = {"impacts": found, "summary": summary, "failures": failures}
         print_json({"field": str(options.field), "quality": verdict, **results})
+    if field.gain_field.contacts is not None and not field.origin.report.get(EDITS):
+        next_command("avmsf suggest", options.field)
     return UNLOCATED if failures or any(each["position"] is None for each in found) else 0
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """A field, and what is computed of it only where it is needed."""
+def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_Answer]]":
+    """Return what locates the impacts of a recording; what it needs of the field is computed with the first one."""
+    from avmsf.capture.audio import read_recording
+    from avmsf.localization.contact_map import not_located, symmetries_of
+    from avmsf.localization.likelihood import Force
+    from avmsf.localization.locate import locate, locate_impacts
+    from avmsf.localization.locator import Locator
 
-    field: SoundField
+    settings = None if options.settings is None else CaptureSettings.read(options.settings)
+    force, level = None if options.force is None else Force(options.force), options.probability
+    locator, symmetries = cache(lambda: Locator.of(field)), cache(lambda: symmetries_of(field))
 
-    @cached_property
-    def locator(self) -> Locator:
-        return Locator.of(self.field)
+    def describe(path: Path, seconds: float | None, contact: "ContactMap") -> "_Answer":
+        several = contact.refusal is None and len(contact.peaks(level)) > 1
+        values = contact.describe(symmetries() if several else None, level)
+        return {"recording": str(path), "seconds": seconds, **values}, None if contact.refusal else contact
 
-    @cached_property
-    def symmetries(self) -> Symmetries | None:
-        """The symmetries of the field's points; None where these are too few to tell."""
-        return symmetries_of(self.field)
+    def answers(path: Path) -> "list[_Answer]":
+        recording = read_recording(path)
+        given: dict[str, Any] = {"settings": settings, "force": force, "locator": locator()}
+        try:
+            if options.several:
+                return [describe(path, *each) for each in locate_impacts(field, recording, **given)]
+            return [describe(path, None, locate(field, recording, progress=False, **given))]
+        except LocationError as error:
+            return [({"recording": str(path), "seconds": None, **not_located(str(error))}, None)]
 
-
-def _answers(
-    known: _Known,
-    recording: Recording,
-    path: Path,
-    settings: CaptureSettings | None,
-    force: Force | None,
-    options: Options,
-) -> list[tuple[dict[str, Any], ContactMap | None]]:
-    """Return the values for each impact of a recording, and its map; None for one that could not be located."""
-    try:
-        impacts = _impacts(known, recording, settings, force, several=options.several)
-    except LocationError as error:
-        return [({"recording": str(path), "seconds": None, **not_located(str(error))}, None)]
-    return [
-        (_describe(str(path), seconds, contact, known, options.probability), None if contact.refusal else contact)
-        for seconds, contact in impacts
-    ]
+    return answers
 
 
-def _impacts(
-    known: _Known, recording: Recording, settings: CaptureSettings | None, force: Force | None, *, several: bool
-) -> list[tuple[float | None, ContactMap]]:
-    """Return the onsets of a recording's impacts, seconds, where there may be several, and their contacts."""
-    if several:
-        return [*locate_impacts(known.field, recording, settings=settings, force=force, locator=known.locator)]
-    found = locate(known.field, recording, settings=settings, force=force, locator=known.locator, progress=False)
-    return [(None, found)]
-
-
-def _true_contacts(options: Options, field: SoundField) -> Contacts | None:
+def _true_contacts(options: Options, field: "SoundField") -> "Contacts | None":
     """Return the true contacts, if any. Raises OutputError for one far from the object, as in another unit."""
+    import torch
+
+    from avmsf.cli.contacts import Contacts, read_contacts, refuse_far
+
     meters = METRES[options.unit]
     if options.true_contact_table is not None:
         contacts = read_contacts(options.true_contact_table, meters=meters, recordings=True)
@@ -137,8 +176,10 @@ def _true_contacts(options: Options, field: SoundField) -> Contacts | None:
     return contacts
 
 
-def _true_contact(contacts: Contacts, recording: Path) -> Float64[Tensor, " 3"] | None:
+def _true_contact(contacts: "Contacts", recording: Path) -> "Tensor | None":
     """Return a recording's true contact; where a table does not have one row for it, note that."""
+    from avmsf.cli.contacts import rows_of
+
     rows = [0] if contacts.table is None else rows_of(contacts, recording)
     if len(rows) != 1:
         got = len(rows) or "none"
@@ -147,7 +188,7 @@ def _true_contact(contacts: Contacts, recording: Path) -> Float64[Tensor, " 3"] 
     return contacts.places[rows[0]]
 
 
-def _error(contact: ContactMap, truth: Float64[Tensor, " 3"], level: float) -> dict[str, Any]:
+def _error(contact: "ContactMap", truth: "Tensor", level: float) -> dict[str, Any]:
     """Return how far the most probable contact is from the true one, and both estimates relative to the diagonal.
 
     `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`; `in_region` says whether the
@@ -182,12 +223,6 @@ def _summary_line(summary: dict[str, Any], level: float) -> str:
         f"({100 * summary['rmed']:.1f} % by cosine distance), {round(count * summary['in_region'])} of {count} true "
         f"contacts within the {100 * level:g} % region"
     )
-
-
-def _describe(name: str, seconds: float | None, contact: ContactMap, known: _Known, level: float) -> dict[str, Any]:
-    """Return the results for an impact, as plain values."""
-    symmetries = known.symmetries if contact.refusal is None and len(contact.peaks(level)) > 1 else None
-    return {"recording": name, "seconds": seconds, **contact.describe(symmetries, level)}
 
 
 def _words(values: dict[str, Any]) -> str:
@@ -225,9 +260,10 @@ def _name(path: Path, taken: set[str]) -> str:
 
 
 def _draw(
-    contact: ContactMap, folder: Path, name: str, values: dict[str, Any], truth: Float64[Tensor, " 3"] | None
+    contact: "ContactMap", folder: Path, name: str, values: dict[str, Any], truth: "Tensor | None"
 ) -> dict[str, str]:
-    # Drawing imports matplotlib, which text does without.
+    import torch
+
     from avmsf.plotting.contacts import draw_contact, write_contact_cloud
     from avmsf.plotting.pictures import save_picture
 

@@ -1,17 +1,18 @@
 """`avmsf modes`: the modes that a capture's recordings have in common."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated
+
+import tyro
 
 from avmsf._utils.text import counted
-from avmsf.capture import read_capture
-from avmsf.cli.alignment import AlignmentReport
-from avmsf.cli.mode_table import amplitudes, levels, listed, mode_rows, mode_table, quality_rows
-from avmsf.cli.options.checks import read_settings
-from avmsf.cli.options.modes import Options
-from avmsf.cli.printing import console, next_command, print_json, say
-from avmsf.modal.extraction.extract import extract_modes
-from avmsf.modal.extraction.quality import measure_quality
-from avmsf.pipeline.record import capture_settings_of, finder_of
+from avmsf.cli.options.checks import expect_capture, read_settings
+from avmsf.cli.options.common import Printing
+from avmsf.cli.options.paths import CaptureFolder, PlotsFolder, SettingsFile
+from avmsf.cli.printing import next_command, print_json, show
+from avmsf.cli.progress import doing, say
+from avmsf.modal.config import ExtractionMethod
+from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 
 _EXPLANATION = (
     "±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in all. orders: "
@@ -19,27 +20,73 @@ _EXPLANATION = (
 )
 
 
+@dataclass(frozen=True)
+class Options(Printing):
+    """List the modes of an object: frequencies, dampings and levels, from all recordings of a capture."""
+
+    capture: tyro.conf.Positional[CaptureFolder]
+    """Folder with impacts.csv and the recordings that it names."""
+    extraction: ExtractionMethod | None = None
+    """How modes are extracted, by default high-resolution: ESPRIT in subbands, which separates modes a few hertz apart.
+    short-time: the paper's method, bin by bin of a short-time spectrum."""
+    modes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Maximum number of modes, by default 128."""
+    time_zero: TimeZero | None = None
+    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
+    preset: Preset = "default"
+    """Defaults of all settings; paper: the published method, from the peak on."""
+    settings: SettingsFile = None
+    """Use this capture.toml instead of the folder's own."""
+    plots: PlotsFolder = None
+    """Draw the modes to modes.png in this folder."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        _ = self.pipeline
+        expect_capture(self.capture, self.settings)
+
+    @property
+    def pipeline(self) -> PipelineConfig:
+        """The settings of the preset, with those that are given."""
+        names = ("extraction", "modes", "time_zero")
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return replace(PRESETS[self.preset], **given)
+
+
 def run(options: Options) -> int:
     """Print the modes."""
-    known = read_settings(options.capture, options.settings)
-    capture = read_capture(options.capture, capture_settings_of(options.pipeline, known))
+    from avmsf.capture import read_capture
+    from avmsf.cli.alignment import AlignmentReport
+    from avmsf.cli.report import levels, mode_rows, mode_table
+    from avmsf.modal.extraction.extract import extract_modes
+    from avmsf.modal.extraction.finders import finder_named
+    from avmsf.modal.extraction.quality import measure_quality
+
+    config = options.pipeline
+    settings = read_settings(options.capture, options.settings).starting(config.time_zero)
+    capture = read_capture(options.capture, settings)
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
-    say(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
-    extraction = extract_modes(impacts, finder_of(options.pipeline))
-    level = levels(amplitudes(extraction))
-    rows = mode_rows(extraction.bank, level)
+    doing(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
+    extraction = extract_modes(impacts, finder_named(config.extraction, config.modes))
+    level = levels(extraction.gains.abs())
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
-    every = list(zip(rows, quality_rows(quality), quality.is_mode.tolist(), strict=True))
-    modes, supporting = ([(row, how) for row, how, is_mode in every if is_mode is part] for part in (True, False))
-    of = f" of {capture.name}, {counted(len(impacts), 'recording')}"
-    title, most, rest = listed(of, [row for row, _ in modes], len(supporting))
-    screen = console(errors=options.json)
-    screen.print(mode_table(title, most, {row.number: how for row, how in modes}))
-    screen.print(f"{rest}{'. ' if rest else ''}{_EXPLANATION}", soft_wrap=True)
+    columns = {
+        "frequency_spread_hertz": quality.frequency_spread,
+        "damping_spread_per_second": quality.damping_spread,
+        "stable_orders": quality.stable_orders,
+        "phase_coherence": quality.coherence,
+        "energy_share": quality.energy_share,
+        "explained_left_out": quality.explained_left_out,
+    }
+    rows = mode_rows(extraction.bank, level)
+    rows = [row | {name: float(column[place]) for name, column in columns.items()} for place, row in enumerate(rows)]
+    every = list(zip(rows, quality.is_mode.tolist(), strict=True))
+    modes, supporting = ([row for row, is_mode in every if is_mode is part] for part in (True, False))
     aligned = AlignmentReport.of(extraction, impacts)
-    for sentence in [] if aligned is None else aligned.sentences():
-        screen.print(sentence, soft_wrap=True)
+    lines = [mode_table(f" of {capture.name}, {count}", modes, len(supporting)), _EXPLANATION]
+    show("\n".join([*lines, *([] if aligned is None else aligned.sentences())]), json=options.json)
     if options.plots is not None:
         from avmsf.plotting.pictures import draw_modes, save_picture
 
@@ -56,8 +103,8 @@ def run(options: Options) -> int:
                 "seconds": impacts.duration,
                 "method": options.pipeline.extraction,
                 "alignment": None if aligned is None else asdict(aligned),
-                "modes": [asdict(row) | asdict(how) for row, how in modes],
-                "supporting_poles": [asdict(row) | asdict(how) for row, how in supporting],
+                "modes": modes,
+                "supporting_poles": supporting,
             }
         )
     next_command("avmsf fit", options.capture, "-o field.safetensors")

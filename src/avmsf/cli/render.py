@@ -2,32 +2,113 @@
 
 import math
 import warnings
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from jaxtyping import Float
-from torch import Tensor
+import tyro
 
-from avmsf.capture.audio import MAX_SAMPLES
-from avmsf.cli.contacts import Contacts, given_contacts, note_off, refuse_far
-from avmsf.cli.heartbeat import doing
 from avmsf.cli.options.checks import OutputError, expect_writable
-from avmsf.cli.options.render import Options
-from avmsf.cli.printing import next_command, print_result, say
-from avmsf.cli.writing import Level, write_sound
+from avmsf.cli.options.common import Flag, Printing, Unit
+from avmsf.cli.options.paths import ContactTable, FieldFile, NewFile, PositionList
+from avmsf.cli.printing import next_command, print_result
+from avmsf.cli.progress import doing, say
 from avmsf.errors import PositionWarning
-from avmsf.field.sound_field import SoundField
-from avmsf.field.store import load
-from avmsf.modal.modes import ForcePulse
+from avmsf.modal.config import PulseShape
+from avmsf.simulate.recipe import MAX_CONTACT_SECONDS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from avmsf.cli.contacts import Contacts
+    from avmsf.field.sound_field import SoundField
+    from avmsf.modal.modes import ForcePulse
 
 _MUCH_SOFTER = 20.0
 """Decibels below the recorded impact from which a softer hammer's sound is noted."""
 _LOW_LEVEL_DBFS = -20.0
 """Peak in decibels of full scale below which sounds are noted as quiet."""
+Coding = Literal["float32", "int16"]
+
+
+@dataclass(frozen=True)
+class Options(Printing):
+    """Write the sounds of impacts anywhere on the object as wav files.
+
+    Contacts come from --position, once per contact, or from a table with the columns x,y,z and optionally file and
+    nx,ny,nz, such as a capture's impacts.csv. An impact without a direction is perpendicular to the surface.
+    """
+
+    field: tyro.conf.Positional[FieldFile]
+    """Field file, as `avmsf fit` writes it."""
+    output: Annotated[
+        Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER|FILE.wav"), NewFile((".wav",), or_folder=True)
+    ]
+    """Folder for the sounds; for a single contact also a file that ends in .wav."""
+    position: PositionList = ()
+    """A contact in the object's frame."""
+    direction: PositionList = ()
+    """Direction of the impact at each --position, in the same order."""
+    contact_table: ContactTable = None
+    """Table of contacts. In it, a direction that is empty or 0,0,0 is not known."""
+    unit: Unit = "m"
+    """Unit of the coordinates; the field is in meters."""
+    force: float = 1.0
+    """Peak force, in newtons if the field knows forces, otherwise relative to an average recorded impact."""
+    contact_time: float = 0.0
+    """Contact time of a softer hammer of the same impulse, seconds: 0.002 for felt. 0: as recorded."""
+    pulse: PulseShape = "half-sine"
+    """Force over the contact time: of a linear contact, or of two round bodies (Hertz)."""
+    no_noise: Flag = False
+    """Write the modes without the residual noise."""
+    seconds: float | None = None
+    """Length of the sounds; by default that of the training sounds."""
+    normalize: Literal["none", "peak"] = "none"
+    """none: the scale of the recordings. peak: all sounds times one factor, the loudest at full scale."""
+    level_db: float = 0.0
+    """Additional gain in dB."""
+    coding: Coding = "float32"
+    """Format of the samples; int16 rejects sounds that would clip."""
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if bool(self.position) == (self.contact_table is not None):
+            wanted = "contacts by it, X Y Z, once or more, or by --contact-table TABLE.csv"
+            raise OutputError.expected(wanted, len(self.position), name="--position")
+        if self.direction and len(self.direction) != len(self.position):
+            wanted = f"one for each of {len(self.position)} --position"
+            raise OutputError.expected(wanted, len(self.direction), name="--direction")
+        for row, place in enumerate(self.position):
+            if not all(map(math.isfinite, place)):
+                raise OutputError.expected("finite coordinates", list(place), row=row, name="--position")
+        for row, way in enumerate(self.direction):
+            if not (any(way) and all(map(math.isfinite, way))):
+                advice = "leave out --direction for impacts perpendicular to the surface"
+                raise OutputError.expected(
+                    "a direction other than 0 0 0", list(way), row=row, name="--direction", advice=advice
+                )
+        if not math.isfinite(self.level_db):
+            raise OutputError.expected("a finite number", self.level_db, name="--level-db")
+        if not 0 < self.force < math.inf:
+            advice = "--direction says which way it acts"
+            raise OutputError.expected("a finite force above 0", self.force, name="--force", advice=advice)
+        if not 0 <= self.contact_time <= MAX_CONTACT_SECONDS:
+            raise OutputError.expected(
+                f"seconds from 0 to {MAX_CONTACT_SECONDS:g}", self.contact_time, name="--contact-time"
+            )
+        if self.seconds is not None and not 0 < self.seconds < math.inf:
+            raise OutputError.expected("more than 0", self.seconds, name="--seconds")
 
 
 def run(options: Options) -> int:
     """Render and write."""
+    from avmsf.cli.contacts import given_contacts, note_off, refuse_far
+    from avmsf.cli.writing import Level, write_sound
+    from avmsf.field.store import load
+    from avmsf.modal.modes import ForcePulse
+
     contacts = given_contacts(options.position, options.contact_table, unit=options.unit, directions=options.direction)
     paths = _paths(options.output, contacts)
     field = load(options.field)
@@ -38,7 +119,7 @@ def run(options: Options) -> int:
     if round(field.sample_rate) != field.sample_rate:
         say(f"note: the wav files have {round(field.sample_rate)} Hz for {field.sample_rate:g} Hz")
     doing("rendering")
-    pulse = _pulse(options)
+    pulse = ForcePulse(options.contact_time, options.pulse) if options.contact_time else None
     rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds, noise=not options.no_noise)
     sounds = rendered(contacts.places, contacts.directions, pulse=pulse)
     softer = 0.0
@@ -46,8 +127,8 @@ def run(options: Options) -> int:
         loudest = int(sounds.abs().amax(1).argmax())
         place = contacts.places[loudest : loudest + 1]
         way = None if contacts.directions is None else contacts.directions[loudest : loudest + 1]
-        hard = rendered(place, way)
-        softer = _softer(hard[0], sounds[loudest])
+        peaks = [float(each.abs().max()) for each in (rendered(place, way), sounds[loudest])]
+        softer = 20 * math.log10(peaks[0] / peaks[1]) if min(peaks) > 0 else 0.0
     sounds = sounds * Level(options.normalize, options.level_db).factor(sounds, coding=options.coding)
     peak = float(sounds.abs().max())
     peak_dbfs = 20 * math.log10(peak) if peak > 0 else -math.inf
@@ -67,12 +148,6 @@ def run(options: Options) -> int:
     return 0
 
 
-def _softer(hard: Float[Tensor, " samples"], soft: Float[Tensor, " samples"]) -> float:
-    """Return by how many decibels a softer hammer lowers the recorded impact's peak; 0 where that is not known."""
-    loud, low = (float(each.abs().max()) for each in (hard, soft))
-    return 20 * math.log10(loud / low) if loud > 0 and low > 0 else 0.0
-
-
 def _say_level(peak_dbfs: float, softer: float, options: Options) -> None:
     """Print that the loudest sound clips, or that it is quiet, and why where it is the softer hammer."""
     if options.coding == "float32" and peak_dbfs > 0:
@@ -90,16 +165,19 @@ def _say_level(peak_dbfs: float, softer: float, options: Options) -> None:
 
 
 def render_sounds(
-    field: SoundField,
-    places: Float[Tensor, "contacts 3"],
-    directions: Float[Tensor, "contacts 3"] | None = None,
+    field: "SoundField",
+    places: "Tensor",
+    directions: "Tensor | None" = None,
     *,
     force: float,
     seconds: float | None,
-    pulse: ForcePulse | None = None,
+    pulse: "ForcePulse | None" = None,
     noise: bool = True,
-) -> Float[Tensor, "contacts samples"]:
-    """Render impacts of `force` for `seconds`; raises `OutputError` for a time of less than a sample."""
+) -> "Tensor":
+    """Render impacts of `force` for `seconds` at contacts [contacts, 3], as sounds [contacts, samples].
+
+    Raises `OutputError` for a time of less than a sample.
+    """
     samples = None if seconds is None else _samples(seconds, field)
     with warnings.catch_warnings():
         # The notes have said it, with the names of the sounds.
@@ -107,7 +185,9 @@ def render_sounds(
         return field.render(places, directions=directions, forces=force, samples=samples, pulse=pulse, noise=noise)
 
 
-def _samples(seconds: float, field: SoundField) -> int:
+def _samples(seconds: float, field: "SoundField") -> int:
+    from avmsf.capture.audio import MAX_SAMPLES
+
     samples = round(seconds * field.sample_rate) if math.isfinite(seconds) else 0
     if not 1 <= samples <= MAX_SAMPLES:
         raise OutputError.expected(
@@ -116,11 +196,7 @@ def _samples(seconds: float, field: SoundField) -> int:
     return samples
 
 
-def _pulse(options: Options) -> ForcePulse | None:
-    return ForcePulse(options.contact_time, options.pulse) if options.contact_time else None
-
-
-def _paths(output: Path, contacts: Contacts) -> list[Path]:
+def _paths(output: Path, contacts: "Contacts") -> list[Path]:
     if output.suffix.lower() == ".wav" and not output.is_dir():
         if len(contacts.names) > 1:
             wanted, count = f"a folder for {len(contacts.names)} contacts", len(contacts.names)

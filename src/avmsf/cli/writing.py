@@ -15,7 +15,7 @@ from torch import Tensor
 from avmsf._utils.files import write_whole
 from avmsf.capture.audio import wav_bytes
 from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.render import Coding
+from avmsf.cli.render import Coding
 
 _LARGEST_INT16 = 2**15 - 1
 FULL_SCALE: dict[Coding, float] = {"float32": 1.0, "int16": _LARGEST_INT16 / 2**15}

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,7 +29,7 @@ from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface
-from avmsf.pipeline.bodies import candidate_bodies, roughened
+from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.scene import FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder
@@ -137,8 +138,19 @@ class ObjectInputs:
         stages = SceneStages(
             seen.folder, StageFolder(folder), config, settings=seen.settings, name=name, device=self.device
         )
-        with stages.stages.lock("avmsf evaluate", wait=NO_LIMIT):
+        with stages.folder.lock("avmsf evaluate", wait=NO_LIMIT):
             yield stages
+
+
+def roughened(surface: Surface, part: float, *, seed: int) -> Surface:
+    """Return a surface whose vertices are displaced at random, by `part` of its size (standard deviation, each axis).
+
+    The size is the diagonal of the box around it: what a bad scan does to a shape.
+    """
+    generator = np.random.default_rng(seed)
+    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
+    moved = surface.vertices.double().numpy() + part * size * generator.standard_normal(surface.vertices.shape)
+    return Surface(torch.from_numpy(moved).to(surface.vertices.dtype), surface.faces)
 
 
 def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, seed: int) -> Float[Tensor, " samples"]:

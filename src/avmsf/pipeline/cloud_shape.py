@@ -1,7 +1,6 @@
 """The shape of what Gaussians show, and pictures of them."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import torch
 
@@ -15,11 +14,11 @@ from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import orbit_cameras
 from avmsf.reconstruction import ObjectShape, object_surface
 
-_FEWEST = 100
+_MIN_COUNT = 100
 """Gaussians; what encloses an object is not known from fewer."""
 _MIN_OPACITY = 0.05
 """Opacity below which a Gaussian does not show where the object is."""
-_FEWEST_MASKS = 3
+_MIN_MASKS = 3
 """Masks from which outlines are taken; with fewer, pictures of the Gaussians have them."""
 _SIZE = 256
 """Width and height of such pictures, pixels."""
@@ -29,8 +28,7 @@ def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: i
     """Return the shape of the object that Gaussians show; masks of views say where its outlines are.
 
     Where fewer than 3 views have masks, pictures of the Gaussians from all sides stand for them. Raises SceneError for
-    fewer than 100 Gaussians that can be seen, numbers that are not finite, Gaussians in one place, and as
-    `object_surface` does.
+    fewer than 100 Gaussians that can be seen, for Gaussians in one place, and as `object_surface` does.
     """
     cloud = _visible(cloud)
     rasterizer = choose_rasterizer(cloud.centers.device)
@@ -41,7 +39,7 @@ def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: i
 
 def masks_suffice(views: Sequence[View]) -> bool:
     """Return whether 3 or more views have masks that show something."""
-    return sum(bool(view.foreground.any()) for view in views) >= _FEWEST_MASKS
+    return sum(bool(view.foreground.any()) for view in views) >= _MIN_MASKS
 
 
 def views_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer, *, size: int) -> tuple[View, ...]:
@@ -58,34 +56,12 @@ def views_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer, *, size: int) -
 
 def _visible(cloud: GaussianCloud) -> GaussianCloud:
     """Return the Gaussians that are not faint. Raises SceneError where they cannot be an object."""
-    for each in fields(cloud):
-        values = getattr(cloud, each.name).detach()
-        wrong = torch.nonzero(~torch.isfinite(values.reshape(len(values), -1)).all(1)).flatten()
-        if len(wrong):
-            row = int(wrong[0])
-            found = values[row].tolist()
-            raise SceneError(
-                f"{each.name}, row {row}: expected finite numbers, got {found} ({len(wrong)} Gaussians); remove them "
-                "with GaussianCloud.take",
-                row=row,
-                name=each.name,
-                value=found,
-            )
     visible = cloud.detach().take(cloud.opacities.detach() >= _MIN_OPACITY)
-    if len(visible) < _FEWEST:
-        raise SceneError(
-            f"opacities: expected {_FEWEST} Gaussians or more of at least {_MIN_OPACITY}, got {len(visible)} of "
-            f"{len(cloud)}; fit the Gaussians again, with more steps or better masks",
-            name="opacities",
-            value=len(visible),
-        )
-    extent = (visible.centers.amax(0) - visible.centers.amin(0)).tolist()
-    if not max(extent) > 0:
+    advice = "fit the Gaussians again, with more steps or better masks"
+    if len(visible) < _MIN_COUNT:
+        wanted = f"{_MIN_COUNT} Gaussians or more of at least {_MIN_OPACITY}"
+        raise SceneError.expected(wanted, len(visible), name="opacities", advice=advice)
+    if not float((visible.centers.amax(0) - visible.centers.amin(0)).max()) > 0:
         center = visible.centers[0].tolist()
-        raise SceneError(
-            f"centers: expected Gaussians all over an object, got {len(visible)} at one position, {center}; fit the "
-            "Gaussians again",
-            name="centers",
-            value=center,
-        )
+        raise SceneError.expected("Gaussians all over an object", center, name="centers", advice=advice)
     return visible

@@ -22,8 +22,8 @@ DESCRIPTORS = "descriptors"
 AUTO = "auto"
 CACHE = ".avmsf"
 """Folder inside a capture folder that keeps the outputs of the stages."""
-CACHED_FIELD = "field.safetensors"
-"""Name of the field in it."""
+CACHED_FIELD, SURFACE = "field.safetensors", "surface.ply"
+"""Names of the field and of the object's surface, in meters, in it."""
 
 
 @dataclass(frozen=True)

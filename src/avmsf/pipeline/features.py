@@ -1,7 +1,6 @@
-"""From Gaussians and views to the features that a gain field reads: described, lifted, pooled over symmetries."""
+"""From views to the features that a gain field reads: described, lifted onto the object, pooled over symmetries."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,27 +15,11 @@ from avmsf.features.lift import Lifted, by_presence, by_visibility, lift, lift_p
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.points import sample_surface
-from avmsf.gaussians.rasterizer.protocol import Rasterizer
 from avmsf.gaussians.visibility import depth_of_surface
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import View
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.symmetry.find import find_symmetries
-from avmsf.symmetry.symmetries import Symmetries
-
-_WEIGHTINGS = {"plain": by_presence, "visibility": by_visibility}
-
-
-@dataclass(frozen=True, eq=False)
-class MadeFeatures:
-    """Features, and what came to light on the way."""
-
-    features: FeatureField
-    symmetries: Symmetries | None
-    """None where none were looked for."""
-    report: dict[str, Any]
-    """Plain values: encoder, points, how many of them no view sees and how many were left out, agreement of the views,
-    symmetries, spread over orbits."""
 
 
 def choose_encoder(config: LiftConfig, *, log: Callable[[str], None], device: str | None = None) -> Encoder:
@@ -56,63 +39,41 @@ def choose_encoder(config: LiftConfig, *, log: Callable[[str], None], device: st
         return ImageDescriptors()
 
 
-def settled(config: LiftConfig, *, log: Callable[[str], None], device: str | None = None) -> LiftConfig:
-    """Return the settings with the encoder that `auto` means here; `log` reports any other than DINOv2."""
-    if config.encoder != AUTO:
-        return config
-    found = choose_encoder(config, log=log, device=device)
-    return replace(config, encoder=DESCRIPTORS if isinstance(found, ImageDescriptors) else DINO)
-
-
-def lift_to_cloud(
-    cloud: GaussianCloud,
-    views: Sequence[View],
-    encoder: Encoder,
-    config: LiftConfig,
-    *,
-    rasterizer: Rasterizer,
-    progress: Callable[[int, int, str], None] | None = None,
-) -> Lifted:
-    """Lift features onto the Gaussians that views see, as the settings say."""
-    weighting = _WEIGHTINGS[config.weighting]
-    lifted = lift(
-        cloud,
-        views,
-        encoder,
-        rasterizer=rasterizer,
-        weighting=weighting,
-        inpainted=config.encoder_background == "inpainted",
-        progress=progress,
-    )
-    return supported(lifted)
-
-
-def lift_to_surface(
-    surface: Surface,
+def lift_features(
+    shape: Surface | GaussianCloud,
     views: Sequence[View],
     encoder: Encoder,
     config: LiftConfig,
     *,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Lifted:
-    """Lift features onto points drawn evenly from a mesh, whose triangles hide what lies behind them."""
+    """Lift features onto the Gaussians that views see, or onto points drawn evenly from a mesh, as the settings say.
+
+    The triangles of a mesh hide what lies behind them. Raises SceneError where no view sees a point.
+    """
+    weighting = by_visibility if config.weighting == "visibility" else by_presence
+    inpainted = config.encoder_background == "inpainted"
+    if isinstance(shape, GaussianCloud):
+        return supported(lift(shape, views, encoder, weighting=weighting, inpainted=inpainted, progress=progress))
     generator = torch.Generator().manual_seed(config.seed)
-    points = sample_surface(surface.vertices, surface.faces, config.points, generator=generator)
-    weighting = _WEIGHTINGS[config.weighting]
-    depth_map = depth_of_surface(surface)
+    points = sample_surface(shape.vertices, shape.faces, config.points, generator=generator)
     return lift_points(
         points,
         views,
         encoder,
-        depth_map=depth_map,
+        depth_map=depth_of_surface(shape),
         weighting=weighting,
-        inpainted=config.encoder_background == "inpainted",
+        inpainted=inpainted,
         progress=progress,
     )
 
 
-def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
-    """Reduce lifted features, pool them over the symmetries that the points have, and set positions beside them."""
+def finish_features(lifted: Lifted, config: LiftConfig) -> tuple[FeatureField, dict[str, Any]]:
+    """Reduce lifted features, pool them over the symmetries that the points have, and set positions beside them.
+
+    Returns the features and a report of plain values: encoder, points, how many of them no view sees and how many were
+    left out, agreement of the views, symmetries, spread over orbits before and after.
+    """
     features = lifted.features
     if config.components:
         features = reduce(features, config.components)
@@ -125,7 +86,6 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
         "dropped": lifted.dropped,
         "agreement": lifted.agreement,
     }
-    symmetries = None
     if config.symmetry:
         generator = torch.Generator().manual_seed(config.seed)
         symmetries = find_symmetries(features.points, seed=generator)
@@ -137,6 +97,4 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> MadeFeatures:
             spreads = (orbit_spread(each, symmetries, angles=config.angles) for each in (features, pooled))
             report["orbit_spread"] = list(spreads)
             features = pooled
-    if config.positions:
-        features = with_positions(features)
-    return MadeFeatures(features, symmetries, report)
+    return with_positions(features) if config.positions else features, report

@@ -2,16 +2,12 @@
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import Progress as Bar
-
 from avmsf._utils.caching import once
-from avmsf._utils.progress import is_live, repeated
 from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.checks import find_surface
@@ -31,30 +27,23 @@ from avmsf.field.trainer import Progress
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once
+from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import CACHE, PipelineConfig
+from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE, PipelineConfig
 from avmsf.pipeline.guess import expect_no_recordings, guess_field
-from avmsf.pipeline.record import capture_settings_of, finder_of, modes_words, supporting_poles, with_record
-from avmsf.pipeline.scene import ProgressListener, SceneStages
-from avmsf.pipeline.shape import FIELD, MODES, FitShape, is_mesh, object_shape, scene_of, shape_of
-from avmsf.pipeline.stages import StageFolder
+from avmsf.pipeline.progress import ProgressDisplay, ProgressListener
+from avmsf.pipeline.record import modes_words, supporting_poles, with_record
+from avmsf.pipeline.scene import SceneStages
+from avmsf.pipeline.shape import FitShape, is_mesh, object_shape, pipeline_of, shape_of
+from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
 from avmsf.pipeline.visuals import expect_shape
 
+MODES, FIELD = "modes.safetensors", CACHED_FIELD
+"""What the last stages call their outputs."""
 BODIES = "bodies"
 """Folder of elastic modes in the cache, kept by content."""
 _FEW = 8
 """Recordings below which little is known of the gains between contacts."""
-
-
-@dataclass(frozen=True)
-class StageTime:
-    """What one stage took."""
-
-    stage: str
-    seconds: float
-    """Of the run that made it, which may have been an earlier one."""
-    fresh: bool
-    """Whether it ran now."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +52,8 @@ class StagedFit:
 
     field: Path
     """The field's file in the cache."""
-    stages: tuple[StageTime, ...]
+    stages: Mapping[str, Kept]
+    """The output of each stage, by its name, in order."""
     report: Mapping[str, Any]
     """What the features' file says of itself; empty where no features were made."""
     modes: Extraction
@@ -106,7 +96,8 @@ def fit(
     """
     config = _configured(PipelineConfig() if config is None else config, gain_model, seed, device)
     source = Path(capture) if isinstance(capture, str) else capture
-    with _shown(progress) as listener:
+    with ProgressDisplay() as display:
+        listener = display.listener if progress else ProgressListener()
         if material is not None:
             if isinstance(source, Capture):
                 raise FitError.expected("a mesh or a folder with material=", "Capture", name="capture")
@@ -121,12 +112,12 @@ def fit(
             if source.is_file():
                 wanted = "a capture folder, or material=NAME with a mesh"
                 raise FitError.expected(wanted, got="a file without", file=source, name="material")
-            source = read_capture(source, capture_settings_of(config, settings_of(source)))
+            source = read_capture(source, settings_of(source).starting(config.time_zero))
         if not isinstance(source, Capture):
             raise FitError.expected("a Capture or a folder", type(source).__name__, name="capture")
         if features is None and source.folder is not None:
             expect_shape(source)
-        views = scene_of(source, config, features, StageFolder(Path()), listener) is not None
+        views = isinstance(pipeline_of(source, config, features, StageFolder(Path()), listener=listener), SceneStages)
         with _stage_folder(cache, source.folder if views else None) as stages:
             return load(fit_in_stages(source, config, stages, features=features, listener=listener).field)
 
@@ -154,26 +145,24 @@ def fit_in_stages(
     _expect_start(capture, config)
     with stages.lock("avmsf fit"):
         if len(train) < _FEW:
-            listener.log(f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}")
+            listener.note(
+                f"expected {_FEW} recordings or more to predict gains between contacts well, got {len(train)}"
+            )
+        pipeline = pipeline_of(capture, config, features, stages, listener=listener)
         # Before the modes: what is wrong with the object's shape shows in less time than they take.
-        shape = shape_of(capture, config, features, features_report or {}, stages, listener)
-        return _fit_shape(capture, train, shape, config, stages, listener)
+        shape = shape_of(capture, config, features, features_report or {}, pipeline)
+        return _fit_shape(capture, train, shape, config, pipeline)
 
 
 def _fit_shape(
-    capture: Capture,
-    train: Impacts,
-    shape: FitShape,
-    config: PipelineConfig,
-    stages: StageFolder,
-    listener: ProgressListener,
+    capture: Capture, train: Impacts, shape: FitShape, config: PipelineConfig, pipeline: Pipeline
 ) -> StagedFit:
-    method = finder_of(config)
+    method, listener = finder_named(config.extraction, config.modes), pipeline.listener
     recorded = {"impacts": train.digest(), "method": repr(method)}
-    cache = stages.folder / BODIES
 
     def bodies() -> CandidateBodies:
         listener.log("bodies: finite-element models of the object")
+        cache = pipeline.folder.path(BODIES)
         return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, log=listener.log)
 
     estimator = once(
@@ -182,7 +171,7 @@ def _fit_shape(
             bodies,
             symmetries=shape.symmetries,
             features=shape.features,
-            log=listener.log if shape.known else None,
+            log=listener.note if shape.known else None,
         )
     )
 
@@ -192,10 +181,8 @@ def _fit_shape(
         listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
         extract_once(train, method, path, needed=True)
 
-    found = stages.keep(MODES, recorded, find_modes)
-    modes = extract_once(train, method, found.path)
-
-    def make(path: Path) -> None:
+    def fit_gains(path: Path, found: Path) -> None:
+        modes = extract_once(train, method, found)
         supporting = supporting_poles(modes, train)
         listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
         fitted = fit_field(
@@ -206,20 +193,24 @@ def _fit_shape(
             gains=estimator(),
             capture=capture.name,
             settings=capture.settings,
-            checkpoint=stages.checkpoint(FIELD),
+            checkpoint=pipeline.folder.checkpoint(FIELD),
             progress=lambda progress: _show_step(progress, listener),
             device=config.device,
             supporting=supporting,
         )
         save(with_record(fitted, config, shape.report), path)
 
-    recipe = {**recorded, "features": shape.digest, "fit": asdict(config.fit), "modes": found.digest}
-    recipe |= {"gain_model": config.gain_model, "name": capture.name}
-    recipe |= {"body": asdict(config.body), "settings": asdict(capture.settings), "surface": shape.surface_digest}
-    kept = stages.keep(FIELD, recipe, make, usable=lambda path: _is_final(path, config, bodies))
-    made = {**shape.made, "modes": found, "fit": kept}
-    times = tuple(StageTime(name, each.seconds, each.fresh) for name, each in made.items())
-    return StagedFit(kept.path, times, shape.report, modes, made["surface"].path if "surface" in made else None)
+    def recipe() -> dict[str, Any]:
+        values: dict[str, Any] = {"gain_model": config.gain_model, "name": capture.name, "features": shape.digest}
+        values |= {"body": asdict(config.body), "fit": asdict(config.fit), "settings": asdict(capture.settings)}
+        return {**recorded, **values, "surface": shape.surface_digest}
+
+    found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
+    usable = lambda path: _is_final(path, config, bodies)  # noqa: E731
+    field = pipeline.add(Stage(FIELD, fit_gains, (MODES,), recipe, usable))
+    surface = pipeline.made.get(SURFACE)
+    modes = extract_once(train, method, found.path)
+    return StagedFit(field.path, pipeline.made, shape.report, modes, None if surface is None else surface.path)
 
 
 def _is_final(path: Path, config: PipelineConfig, bodies: Callable[[], object]) -> bool:
@@ -265,16 +256,15 @@ def guess_in_stages(
         else:
             name, mesh = name or source.resolve().stem, read_surface(source, meters=settings.surface_meters)
         if scene is not None and scene.source is not None and scene.source.kind in ("photographs", "video"):
-            raise SceneError(
-                f"{scene.folder}: expected a mesh, or photographs with cameras in meters (transforms.json, COLMAP), "
-                f"got {scene.source.kind} without the object's size",
-                file=scene.folder,
-                value=scene.source.kind,
+            raise SceneError.expected(
+                "a mesh, or photographs with cameras in meters (transforms.json, COLMAP)",
+                scene.source.kind,
+                got=f"{scene.source.kind} without the object's size",
+                file=source if isinstance(source, Path) else None,
             )
-        stages.count((*(() if scene is None else scene.outputs[:-1]), FIELD), listener.counting)
         shape, digest = object_shape(mesh, scene)
 
-        def make(path: Path) -> None:
+        def guess(path: Path) -> None:
             guessed = guess_field(
                 shape(),
                 material,
@@ -290,7 +280,7 @@ def guess_in_stages(
 
         recipe = {"guess": asdict(material), "surface": digest, "modes": config.modes, "body": asdict(config.body)}
         recipe |= {"fit": asdict(config.fit), "settings": asdict(settings), "name": name}
-        return stages.keep(FIELD, recipe, make).path
+        return Pipeline(stages, listener=listener).add(Stage(FIELD, guess, recipe=lambda: recipe)).path
 
 
 def _configured(
@@ -311,31 +301,6 @@ def _stage_folder(cache: str | Path | None, folder: Path | None) -> Iterator[Sta
         return
     with tempfile.TemporaryDirectory(prefix="avmsf-", ignore_cleanup_errors=True) as place:
         yield StageFolder(Path(place))
-
-
-@contextmanager
-def _shown(progress: bool) -> Iterator[ProgressListener]:
-    """Yield a listener that shows progress on the standard error, or shows nothing."""
-    if not progress:
-        yield ProgressListener()
-        return
-    console, doing = Console(stderr=True), ["fitting"]
-    live = is_live(console)
-    with (
-        Bar(console=console, transient=True, disable=not live) as bar,
-        nullcontext() if live else repeated(lambda: doing[0]),
-    ):
-        task = bar.add_task("fitting", total=None)
-
-        def log(message: str) -> None:
-            doing[0] = message
-            console.print(message, markup=False, highlight=False, soft_wrap=True)
-
-        def step(stage: str, done: int, total: int, message: str) -> None:
-            doing[0] = f"{stage}: step {done} of {total}, {message}"
-            bar.update(task, description=stage, completed=done, total=total)
-
-        yield ProgressListener(log, step)
 
 
 def _show_step(progress: Progress, listener: ProgressListener) -> None:

@@ -11,10 +11,10 @@ from torch import Tensor
 from avmsf.capture.checks import NARROWEST, WIDEST
 from avmsf.capture.settings import TABLE, CaptureSettings
 from avmsf.capture.table import read_cells
-from avmsf.errors import FitError, SimulationError
+from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_meshes import HollowShape
-from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
+from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import Material, material_named
@@ -25,7 +25,7 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.mesh.surface import Surface
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.pipeline.bodies import wall_error
+from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.recipe import Hammer
@@ -104,22 +104,17 @@ def expect_no_recordings(folder: Path) -> None:
     """Raise FitError for a folder whose table of contacts has rows: a fit to them says more than a guess."""
     table = folder / TABLE
     if table.is_file() and len(read_cells(table)[0]) > 1:
-        raise FitError(
-            f"{table}: expected no recordings with --material, got some; leave --material out, or name the mesh",
-            file=table,
-            name="--material",
+        advice = "leave --material out, or name the mesh"
+        raise FitError.expected(
+            "no recordings with --material", got="some", file=table, name="--material", advice=advice
         )
 
 
 def _expect_meters(surface: Surface) -> None:
     extent = float((surface.vertices.amax(0) - surface.vertices.amin(0)).max())
     if not NARROWEST <= extent <= WIDEST:
-        raise FitError(
-            f"surface: expected a size of {NARROWEST:g} to {WIDEST:g} m, got {extent:.3g} m; state its unit as "
-            "surface_unit in capture.toml",
-            name="surface_unit",
-            value=extent,
-        )
+        wanted, advice = f"a size of {NARROWEST:g} to {WIDEST:g} m", "state the mesh's unit in capture.toml"
+        raise FitError.expected(wanted, extent, got=f"{extent:.3g} m", name="surface_unit", advice=advice)
 
 
 def _body(
@@ -131,31 +126,15 @@ def _body(
     cache: Path | None,
     log: Callable[[str], None] | None,
 ) -> CandidateBody:
+    """Return the free body of the stated wall, by default the solid one."""
     between = None if isinstance(surface, Surface) else surface.thickness_range
     if between is not None and config.wall is None:
         low, high = (1000 * each for each in between)
-        raise FitError(
-            f"wall: expected the wall thickness, which sets the frequencies; give it by --set body.wall=METERS (0: "
-            f"solid; by the views {low:.2g} to {high:.2g} mm)",
-            name="wall",
-            value=between,
-        )
-    try:
-        return SurfaceBodies(
-            surface, thicknesses=[config.wall or None], count=count, dofs=config.dofs, material=material, cache=cache,
-            log=log,
-        ).bodies[0]  # fmt: skip
-    except SimulationError as error:
-        if config.wall and error.name == "surface":
-            raise wall_error(surface, config.wall, error) from error
-        if config.wall:
-            raise
-        raise SimulationError(
-            f"{error}; give the wall thickness by --set body.wall=METERS",
-            file=error.file,
-            name="wall",
-            value=error.value,
-        ) from error
+        advice = f"give it by --set body.wall=METERS (0: solid; by the views {low:.2g} to {high:.2g} mm)"
+        wanted = "the wall thickness, which sets the frequencies"
+        raise FitError.expected(wanted, between, got="none", name="wall", advice=advice)
+    free = replace(config, wall=config.wall or 0.0, shapes=count, supports="free")
+    return candidate_bodies(surface, free, material=material, cache=cache, log=log).bodies[0]
 
 
 def _pulse(elastic: ElasticModes, poles: Complex128[Tensor, " modes"]) -> Float64[Tensor, " modes"]:

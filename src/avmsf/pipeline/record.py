@@ -1,4 +1,4 @@
-"""What a pipeline's configuration means for captures, modes and the fields that it makes."""
+"""What a field's file says of the configuration that made it, and how many of its poles are modes."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -8,10 +8,8 @@ import torch
 
 from avmsf._utils.text import counted
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.settings import CaptureSettings
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.finders import ModeFinder, finder_named
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.config import PipelineConfig
 
@@ -25,16 +23,6 @@ _RENAMED = {
     "lift": {"background": "encoder_background", "size": "feature_size"},
 }
 """Settings in files of earlier versions, and their names now, by the record that holds them."""
-
-
-def finder_of(config: PipelineConfig) -> ModeFinder:
-    """Return what finds the modes."""
-    return finder_named(config.extraction, config.modes)
-
-
-def capture_settings_of(config: PipelineConfig, settings: CaptureSettings) -> CaptureSettings:
-    """Return a capture's settings with the configuration's start of sounds."""
-    return settings.starting(config.time_zero)
 
 
 def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str, Any]) -> SoundField:

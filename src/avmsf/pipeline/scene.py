@@ -1,9 +1,8 @@
-"""From what a folder shows of the object to features on its surface: views, Gaussians, features, each kept."""
+"""From what a folder shows of the object to features on its surface: views, Gaussians, features, each a stage."""
 
-import hashlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import SceneError
 from avmsf.features.encoder import Encoder
-from avmsf.features.lift import Lifted
 from avmsf.features.store import save_features
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.fit import SplatProgress, splat
@@ -24,52 +22,28 @@ from avmsf.gaussians.initialize import StartPoints
 from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.gaussians.prune import keep_object
 from avmsf.gaussians.rasterizer.devices import choose_rasterizer
-from avmsf.mesh.surface import read_surface
+from avmsf.mesh.surface import Surface, read_surface
 from avmsf.photographs import read_sparse_points, read_views, write_views
 from avmsf.photographs.cameras import View
 from avmsf.pipeline.cloud_shape import masks_suffice, shape_of_cloud, views_of_cloud
 from avmsf.pipeline.config import SceneConfig
-from avmsf.pipeline.features import choose_encoder, finish_features, lift_to_cloud, lift_to_surface
-from avmsf.pipeline.sources import Source, find_source, find_splats, keep_views
-from avmsf.pipeline.stages import Kept, StageFolder, digest_of
+from avmsf.pipeline.features import choose_encoder, finish_features, lift_features
+from avmsf.pipeline.progress import ProgressListener
+from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder, digest_of
+from avmsf.pipeline.views import MOTION, VIEWS, Source, find_source, find_splats, view_stages
 from avmsf.reconstruction import ObjectShape
 
-VIEWS, CLOUD, FEATURES = "views", "cloud.ply", "features.safetensors"
+CLOUD, FEATURES = "cloud.ply", "features.safetensors"
 """What the stages call their outputs."""
 
 
-def _ignore(*values: object) -> None:
-    pass
-
-
-@dataclass(frozen=True)
-class ProgressListener:
-    """Callbacks that receive the progress of the stages."""
-
-    log: Callable[[str], None] = _ignore
-    """Receives a sentence as each stage begins."""
-    step: Callable[[str, int, int, str], None] = _ignore
-    """Receives a stage's name, its steps done and in all, and a message on the last one."""
-    counting: Callable[[str], None] = _ignore
-    """Receives the number and name of each stage, see `StageFolder.count`."""
-
-    def splatting(self, progress: SplatProgress) -> None:
-        """Pass on how far Gaussians are fitted."""
-        message = f"loss {progress.loss:.3g}, {progress.psnr:.1f} dB, {len(progress.cloud)} Gaussians"
-        self.step("splat", progress.step, progress.steps, message)
-
-    def lifting(self, done: int, total: int, view: str) -> None:
-        """Pass on how many views are described."""
-        self.step("features", done, total, view)
-
-
-class SceneStages:
+class SceneStages(Pipeline):
     """The stages that lead from a folder's photographs, video, mesh or Gaussians to features on the object.
 
     Gaussians that lie in the folder are the object's; where there are no photographs beside them, pictures of them from
     all sides are described. A mesh needs no Gaussians: its own surface is the object unless the settings say otherwise,
-    and pictures of it are described. Every stage runs when its output is first asked for and raises what it raises;
-    SceneError where the folder shows nothing of the object.
+    and pictures of it are described. Each raises what it raises; SceneError where the folder shows nothing of the
+    object.
     """
 
     def __init__(
@@ -87,13 +61,14 @@ class SceneStages:
 
         Gaussians and DINOv2 are computed on `device`, by default on a GPU where there is one.
         """
-        self.device = device
-        self.folder, self.stages, self.config, self.settings, self.name = folder, stages, config, settings, name
-        self.listener = ProgressListener() if listener is None else listener
+        self.source_folder, self.config, self.settings, self.name, self.device = folder, config, settings, name, device
         found = find_source(folder, settings, prefer=config.views.source)
-        preferred = config.views.source == "mesh" and found is not None and found.kind == "mesh"
-        self.splats = None if preferred else find_splats(folder)
-        self.source: Source | None = None if self.splats and found and found.kind == "mesh" else found
+        meshed = found is not None and found.kind == "mesh"
+        self.splats = None if meshed and config.views.source == "mesh" else find_splats(folder)
+        self.source: Source | None = None if self.splats and meshed else found
+        super().__init__(stages, listener=listener or ProgressListener())
+        if self:
+            self.stages |= {stage.name: stage for stage in self._stages()}
 
     def __bool__(self) -> bool:
         """Whether the folder shows anything of the object."""
@@ -102,71 +77,119 @@ class SceneStages:
     def expect_any(self) -> None:
         """Raise SceneError, before anything is written, where the folder shows nothing of the object."""
         if not self:
-            self._source()
+            raise no_views(self.source_folder)
 
     @property
-    def outputs(self) -> tuple[str, ...]:
-        """The outputs on the way to features, in order, the features last."""
-        if self.source is None:
-            return CLOUD, VIEWS, self.name
-        motion = ("motion",) if self.source.kind in ("photographs", "video") else ()
-        return (*motion, VIEWS, *(() if self._on_mesh else (CLOUD,)), self.name)
-
-    @property
-    def _on_mesh(self) -> bool:
-        """Whether features lie on the mesh, so that no Gaussians are needed."""
-        return self.splats is None and self._source().kind == "mesh" and self.config.lift.onto == "mesh"
-
-    @cached_property
     def views(self) -> Kept:
         """The folder of views."""
-        if self.splats is not None and self.source is None:
-            return self._keep_views_of_cloud()
-        return keep_views(self._source(), self.stages, self.config.views, settings=self.settings, log=self.listener.log)
+        return self[VIEWS]
 
-    @cached_property
+    @property
     def cloud(self) -> Kept:
         """The file of Gaussians: the folder's own, or fitted to its views, those of a mesh included."""
-        if self.splats is not None:
-            return self._keep_given(self.splats)
-        views = read_views(self.views.path)
-        start = self._start(views)
+        return self[CLOUD]
 
-        def make(path: Path) -> None:
-            self.listener.log(f"splat: {counted(self.config.splat.steps, 'step')} on {len(views)} views")
-            cloud = splat(
-                views,
-                self.config.splat,
-                start=start,
-                progress=self.listener.splatting,
-                checkpoint=self.stages.checkpoint(CLOUD),
-                device=self.device,
-            )
-            write_splats(cloud, path)
-
-        begun = None if start is None else hashlib.sha256(start.points.numpy().tobytes()).hexdigest()
-        recipe = {"views": self.views.digest, "splat": asdict(self.config.splat), "start": begun}
-        return self.stages.keep(CLOUD, recipe, make)
-
-    @cached_property
+    @property
     def features(self) -> Kept:
         """The file of features, on the Gaussians or on points of the mesh."""
-        encoder = choose_encoder(self.config.lift, log=self.listener.log, device=self.device)
-        on_mesh = self._on_mesh
-        recipe = {
-            "views": self.views.digest,
-            "cloud": None if on_mesh else self.cloud.digest,
-            "encoder": encoder.name,
-            "lift": asdict(self.config.lift),
-        }
+        return self[self.name]
 
-        def make(path: Path) -> None:
-            views = read_views(self.views.path)
-            lifted = self._lift_to_mesh(views, encoder) if on_mesh else self._lift_to_cloud(views, encoder)
-            made = finish_features(lifted, self.config.lift)
-            save_features(made.features, path, report={**made.report, "scene": asdict(self.config)})
+    def _stages(self) -> list[Stage]:
+        """Return the list: names, what they depend on, functions."""
+        config, source, splats, meters = self.config, self.source, self.splats, self.settings.views_meters
+        lifting = Stage(self.name, self._make_features, (VIEWS, CLOUD), self._features_recipe)
+        if splats is not None and source is None:
+            size = config.views.rendered
+            return [
+                Stage(CLOUD, self._take_gaussians, recipe=lambda: {"given": digest_of(splats), "meters": meters}),
+                Stage(VIEWS, self._picture_gaussians, (CLOUD,), lambda: {"rendered": size}),
+                lifting,
+            ]
+        assert source is not None
+        views = view_stages(source, config.views, settings=self.settings, log=self.listener.log)
+        if splats is not None:
+            recipe = lambda: {"given": digest_of(splats), "meters": meters}  # noqa: E731
+            return [*views, Stage(CLOUD, self._take_gaussians, (VIEWS,), recipe), lifting]
+        if source.kind == "mesh" and config.lift.onto == "mesh":
+            lifting = replace(lifting, inputs=(VIEWS,))
+        # Structure from motion's points may be the start.
+        start = {"files": source.digest} if source.kind == "cameras" else {}
+        inputs = tuple(stage.name for stage in views)
+        fitting = Stage(CLOUD, self._fit_gaussians, inputs, lambda: {"splat": asdict(config.splat), **start})
+        return [*views, fitting, lifting]
 
-        return self.stages.keep(self.name, recipe, make)
+    def _fit_gaussians(self, path: Path, *inputs: Path) -> None:
+        views = read_views(inputs[-1])
+        start = self._start(views)
+        self.listener.log(f"splat: {counted(self.config.splat.steps, 'step')} on {len(views)} views")
+        checkpoint = self.folder.checkpoint(CLOUD)
+        cloud = splat(
+            views, self.config.splat, start=start, progress=self._splatting, checkpoint=checkpoint, device=self.device
+        )
+        write_splats(cloud, path)
+
+    def _start(self, views: Sequence[View]) -> StartPoints | None:
+        """Return structure from motion's points where masks are missing; None lets the masks' hull be the start."""
+        bare = [view.name for view in views if view.mask is None]
+        if not bare:
+            return None
+        assert self.source is not None
+        where = self.source.path if self.source.kind == "cameras" else self.folder.path(MOTION)
+        found = read_sparse_points(where, meters=self.settings.views_meters)
+        if found is None:
+            raise SceneError.expected(
+                "masks, or points of structure from motion, to initialize Gaussians",
+                bare,
+                got=f"{counted(len(bare), 'view')} without a mask ({bare[0]}, ...)",
+                file=where,
+                name="masks",
+                advice="give masks, or let them be computed",
+            )
+        return StartPoints(found[0].float(), found[1].float() / 255)
+
+    def _take_gaussians(self, path: Path, views: Path | None = None) -> None:
+        """Write the Gaussians of a file that came with the folder: in meters, and those on the object alone."""
+        assert self.splats is not None
+        self.listener.log(f"splat: the Gaussians of {self.splats.name}, unchanged")
+        read = scaled(read_splats(self.splats), self.settings.views_meters)
+        cloud = without_far(read)
+        if len(cloud) < len(read):
+            self.listener.note(f"splat: {len(read) - len(cloud)} Gaussians far from the object are left out")
+        if views is not None:
+            cloud = keep_object(cloud, read_views(views), rasterizer=choose_rasterizer(cloud.centers.device))
+        write_splats(cloud, path)
+
+    def _picture_gaussians(self, path: Path, given: Path) -> None:
+        cloud = read_splats(given)
+        rasterizer = choose_rasterizer(cloud.centers.device)
+        write_views(views_of_cloud(cloud, rasterizer, size=self.config.views.rendered), path, replace=True)
+
+    @cached_property
+    def _encoder(self) -> Encoder:
+        return choose_encoder(self.config.lift, log=self.listener.note, device=self.device)
+
+    def _features_recipe(self) -> dict[str, object]:
+        return {"encoder": self._encoder.name, "lift": asdict(self.config.lift)}
+
+    def _make_features(self, path: Path, views_path: Path, cloud: Path | None = None) -> None:
+        views, config, encoder = read_views(views_path), self.config.lift, self._encoder
+        if cloud is None:
+            assert self.source is not None
+            shape: Surface | GaussianCloud = read_surface(self.source.path, meters=self.settings.surface_meters)
+            points = f"{config.points} points of the mesh"
+        else:
+            shape = read_splats(cloud)
+            points = f"{len(shape)} Gaussians"
+        self.listener.log(f"features: {encoder.name} of {len(views)} views onto {points}")
+        lifted = lift_features(
+            shape, views, encoder, config, progress=lambda *step: self.listener.step("features", *step)
+        )
+        features, report = finish_features(lifted, config)
+        save_features(features, path, report={**report, "scene": asdict(self.config)})
+
+    def _splatting(self, progress: SplatProgress) -> None:
+        message = f"loss {progress.loss:.3g}, {progress.psnr:.1f} dB, {len(progress.cloud)} Gaussians"
+        self.listener.step("splat", progress.step, progress.steps, message)
 
     def shape(self) -> ObjectShape:
         """Return the object's shape, of its views' masks and its Gaussians' depth.
@@ -174,85 +197,12 @@ class SceneStages:
         Where fewer than 3 views have masks, pictures of the Gaussians stand for them.
         """
         views, cloud = read_views(self.views.path), read_splats(self.cloud.path)
-        source = (
-            f"{len(views)} views"
-            if masks_suffice(views)
-            else "images of the Gaussians, as fewer than 3 views have masks,"
-        )
+        enough = masks_suffice(views)
+        source = f"{len(views)} views" if enough else "images of the Gaussians, as fewer than 3 views have masks,"
         self.listener.log(f"shape: of {source} and {len(cloud)} Gaussians")
         shape = shape_of_cloud(cloud, views)
         self.listener.log(f"shape: {shape.describe()}")
         return shape
-
-    def made(self) -> dict[str, Kept]:
-        """Return the stages that were needed so far, in order."""
-        return {name: self.__dict__[name] for name in ("views", "cloud", "features") if name in self.__dict__}
-
-    def _source(self) -> Source:
-        if self.source is None:
-            raise no_views(self.folder)
-        return self.source
-
-    def _start(self, views: Sequence[View]) -> StartPoints | None:
-        """Return structure from motion's points where masks are missing; None lets the masks' hull be the start."""
-        source, bare = self._source(), [view.name for view in views if view.mask is None]
-        if not bare:
-            return None
-        where = source.path if source.kind == "cameras" else self.stages.path("motion")
-        found = read_sparse_points(where, meters=self.settings.views_meters)
-        if found is None:
-            raise SceneError(
-                f"{where}: expected masks, or points of structure from motion, to initialize Gaussians, got "
-                f"{counted(len(bare), 'view')} without a mask ({bare[0]}, ...); give masks, or let them be computed",
-                file=where,
-                name="masks",
-                value=bare,
-            )
-        return StartPoints(found[0].float(), found[1].float() / 255)
-
-    def _lift_to_cloud(self, views: Sequence[View], encoder: Encoder) -> Lifted:
-        cloud = read_splats(self.cloud.path)
-        self.listener.log(f"features: {encoder.name} of {len(views)} views onto {len(cloud)} Gaussians")
-        rasterizer = choose_rasterizer(cloud.centers.device)
-        return lift_to_cloud(
-            cloud, views, encoder, self.config.lift, rasterizer=rasterizer, progress=self.listener.lifting
-        )
-
-    def _lift_to_mesh(self, views: Sequence[View], encoder: Encoder) -> Lifted:
-        surface = read_surface(self._source().path, meters=self.settings.surface_meters)
-        points = self.config.lift.points
-        self.listener.log(f"features: {encoder.name} of {len(views)} views onto {points} points of the mesh")
-        return lift_to_surface(surface, views, encoder, self.config.lift, progress=self.listener.lifting)
-
-    def _keep_given(self, splats: Path) -> Kept:
-        """Keep the Gaussians of a file that came with the folder: in meters, and those on the object alone."""
-        views = None if self.source is None else self.views
-
-        def make(path: Path) -> None:
-            self.listener.log(f"splat: the Gaussians of {splats.name}, unchanged")
-            read = scaled(read_splats(splats), self.settings.views_meters)
-            cloud = without_far(read)
-            if len(cloud) < len(read):
-                self.listener.log(f"splat: {len(read) - len(cloud)} Gaussians far from the object are left out")
-            if views is not None:
-                cloud = keep_object(cloud, read_views(views.path), rasterizer=choose_rasterizer(cloud.centers.device))
-            write_splats(cloud, path)
-
-        recipe = {
-            "given": digest_of(splats),
-            "views": None if views is None else views.digest,
-            "meters": self.settings.views_meters,
-        }
-        return self.stages.keep(CLOUD, recipe, make)
-
-    def _keep_views_of_cloud(self) -> Kept:
-        def make(path: Path) -> None:
-            cloud = read_splats(self.cloud.path)
-            rasterizer = choose_rasterizer(cloud.centers.device)
-            write_views(views_of_cloud(cloud, rasterizer, size=self.config.views.rendered), path, replace=True)
-
-        recipe = {"cloud": self.cloud.digest, "rendered": self.config.views.rendered}
-        return self.stages.keep(VIEWS, recipe, make)
 
 
 def without_far(cloud: GaussianCloud) -> GaussianCloud:

@@ -24,18 +24,15 @@ from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import read_surface, surface_points, write_surface
 from avmsf.photographs import read_views
 from avmsf.photographs.nerf_json import stated_moves
-from avmsf.pipeline.config import CACHED_FIELD, DESCRIPTORS, PRESETS, PipelineConfig
+from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
 from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
-from avmsf.pipeline.scene import FEATURES, ProgressListener, SceneStages
-from avmsf.pipeline.stages import Kept, StageFolder
+from avmsf.pipeline.progress import ProgressListener
+from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
+from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
 from avmsf.reconstruction import ObjectShape
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
 
-SURFACE = "surface.ply"
-"""What the stage of the object's surface calls its output, in meters."""
-MODES, FIELD = "modes.safetensors", CACHED_FIELD
-"""What the last stages call their outputs."""
 POINTS = "points.safetensors"
 """What the stage of the features is called where the gain model reads none: their points are the object's."""
 OFF_MESH = 0.02
@@ -57,8 +54,6 @@ class FitShape:
     """Makes the object's mesh, or the shape that its views show. Raises SceneError without either."""
     surface_digest: str
     """Of what the surface is made of."""
-    made: Mapping[str, Kept]
-    """The stages that made it."""
     report: Mapping[str, Any]
     """How the features were made."""
     known: bool = True
@@ -75,37 +70,33 @@ class FitShape:
         return digest.hexdigest()
 
 
-def scene_of(
+def pipeline_of(
     capture: Capture,
     config: PipelineConfig,
     features: FeatureField | None,
-    stages: StageFolder,
+    folder: StageFolder,
+    *,
     listener: ProgressListener,
-) -> SceneStages | None:
+) -> Pipeline:
     """Return the stages of the views that a fit needs: for a shape without a mesh, and for features.
 
-    None where the folder shows nothing but points.
+    None of these, but a pipeline for the later stages, where the folder shows nothing but points.
     """
     reads = features is None and config.gain_model in (NETWORK, Visual.kind)
     # The network needs no surface.
     needed = reads or (config.gain_model != NETWORK and not is_mesh(capture.surface))
-    if not needed or capture.folder is None:
-        return None
-    settings, name = config.scene, FEATURES
-    if not reads:
-        # Of the features only the points and their symmetries are read, which are the same for any encoder.
-        settings, name = replace(settings, lift=replace(settings.lift, encoder=DESCRIPTORS)), POINTS
-    scene = SceneStages(
-        capture.folder,
-        stages,
-        settings,
-        settings=capture.settings,
-        listener=listener,
-        name=name,
-        device=config.device,
-    )
-    points = capture.surface is not None and not is_mesh(capture.surface)
-    return None if not scene or (points and scene.source is not None and scene.source.kind == "mesh") else scene
+    if needed and capture.folder is not None:
+        scene, name = config.scene, FEATURES
+        if not reads:
+            # Of the features only the points and their symmetries are read, which are the same for any encoder.
+            scene, name = replace(scene, lift=replace(scene.lift, encoder=DESCRIPTORS)), POINTS
+        made = SceneStages(
+            capture.folder, folder, scene, settings=capture.settings, listener=listener, name=name, device=config.device
+        )
+        points = capture.surface is not None and not is_mesh(capture.surface)
+        if made and not (points and made.source is not None and made.source.kind == "mesh"):
+            return made
+    return Pipeline(folder, listener=listener)
 
 
 def shape_of(
@@ -113,27 +104,24 @@ def shape_of(
     config: PipelineConfig,
     features: FeatureField | None,
     report: Mapping[str, Any],
-    stages: StageFolder,
-    listener: ProgressListener,
+    pipeline: Pipeline,
 ) -> FitShape:
-    """Return what shows a capture's object, made in `stages`; `features` with their report in place of the views'.
+    """Return what shows a capture's object, made by `pipeline_of`; `features` with their report replace the views'.
 
     Raises SceneError for views, and CaptureError for contacts, that do not fit each other.
     """
-    scene = scene_of(capture, config, features, stages, listener)
-    outputs = () if scene is None else scene.outputs
-    shaped = config.gain_model != NETWORK and (scene is not None or is_mesh(capture.surface))
-    stages.count((*outputs, *((SURFACE,) if shaped else ()), MODES, FIELD), listener.counting)
-    if scene is not None:
+    if isinstance(pipeline, SceneStages):
         given = None if features is None else (features, report)
-        return _shape_of_views(capture, config, scene, given, listener)
+        return _shape_of_views(capture, config, pipeline, given)
+    log = pipeline.listener.note
     if config.scene != PRESETS["default"].scene and is_mesh(capture.surface):
-        listener.log("the object's shape is its mesh: settings of views, Gaussians and features are not used")
-    points = _points_of(capture, config, features, listener.log)
+        log("the object's shape is its mesh: settings of views, Gaussians and features are not used")
+    points = _points_of(capture, config, features, log)
     surface, digest = object_shape(capture.surface, None)
-    made = _surface_stage(stages, surface, digest, listener) if shaped else {}
+    if config.gain_model != NETWORK and is_mesh(capture.surface):
+        keep_surface(pipeline, surface, digest)
     known = capture.surface is not None or features is not None
-    return FitShape(points, points, lambda: _symmetries(capture, config), surface, digest, made, report, known)
+    return FitShape(points, points, lambda: _symmetries(capture, config), surface, digest, report, known)
 
 
 def _points_of(
@@ -161,15 +149,11 @@ def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:
 
 
 def _shape_of_views(
-    capture: Capture,
-    config: PipelineConfig,
-    scene: SceneStages,
-    given: tuple[FeatureField, Mapping[str, Any]] | None,
-    listener: ProgressListener,
+    capture: Capture, config: PipelineConfig, scene: SceneStages, given: tuple[FeatureField, Mapping[str, Any]] | None
 ) -> FitShape:
     """Return the shape that views show; `given` are features with their report, in place of those of the views."""
     impacts, settings = capture.impacts, capture.settings
-    stated = stated_moves(scene.folder, meters=settings.views_meters)
+    stated = stated_moves(scene.source_folder, meters=settings.views_meters)
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         views = read_views(scene.views.path)
@@ -182,16 +166,19 @@ def _shape_of_views(
         expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians", stated=stated)
     features, report = given or (load_features(scene.features.path), read_report(scene.features.path))
     surface, digest = object_shape(capture.surface, scene)
-    made = scene.made()
-    if config.gain_model != NETWORK:
-        made |= _surface_stage(scene.stages, surface, digest, listener)
-    seen = capture.surface
-    if seen is None and "surface" in made:
-        # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
-        seen = read_surface(made["surface"].path)
     # The paper's network reads the Gaussians' own centers.
     centers = config.gain_model == NETWORK and config.scene.lift.onto == "gaussians"
-    if seen is not None and "cloud" in made and not centers:
+    fitted = CLOUD in scene.made and not centers
+    seen = capture.surface
+    if config.gain_model != NETWORK:
+        try:
+            kept = keep_surface(scene, surface, digest)
+        except SceneError as error:
+            scene.listener.note(f"no surface is written: {error}")
+        else:
+            # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
+            seen = read_surface(kept.path) if seen is None else seen
+    if seen is not None and fitted:
         features = moved_onto(features, seen)
     # Structure from motion knows nothing of the frame that the contacts are in.
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
@@ -202,18 +189,7 @@ def _shape_of_views(
         found = report.get("symmetries")
         return None if found is None else Symmetries.from_dict(found)
 
-    return FitShape(FeatureField.from_points(features.points), features, symmetries, surface, digest, made, report)
-
-
-def _surface_stage(
-    stages: StageFolder, surface: Callable[[], Surface | ObjectShape], digest: str, listener: ProgressListener
-) -> dict[str, Kept]:
-    """Return the stage of the object's surface; none where its shape is unknown."""
-    try:
-        return {"surface": keep_surface(stages, surface, digest)}
-    except SceneError as error:
-        listener.log(f"no surface is written: {error}")
-        return {}
+    return FitShape(FeatureField.from_points(features.points), features, symmetries, surface, digest, report)
 
 
 def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:
@@ -246,16 +222,14 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
     if scene is None:
 
         def unknown() -> ObjectShape:
-            raise SceneError(
-                "surface: expected a mesh or views of the object in the folder, got none; add surface.obj",
-                name="surface",
-            )
+            wanted = "a mesh or views of the object in the folder"
+            raise SceneError.expected(wanted, name="surface", advice="add surface.obj")
 
         return unknown, ""
     return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
 
 
-def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:
+def keep_surface(pipeline: Pipeline, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:
     """Return the file of the object's surface, made where what is kept is of something else. Raises as `make`."""
 
     def write(path: Path) -> None:
@@ -263,7 +237,7 @@ def keep_surface(stages: StageFolder, make: Callable[[], Surface | ObjectShape],
         surface = shape if isinstance(shape, Surface) else shape.as_seen()
         write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
 
-    return stages.keep(SURFACE, {"of": digest}, write)
+    return pipeline.add(Stage(SURFACE, write, recipe=lambda: {"of": digest}))
 
 
 def is_mesh(surface: Surface | None) -> bool:

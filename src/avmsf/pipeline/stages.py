@@ -1,11 +1,16 @@
-"""What each stage of a fit made, kept in a folder next to the record of what it was made from."""
+"""Stages: functions whose outputs a folder keeps, each next to the record of what it was made from.
+
+A `Stage` is a name, the stages that it depends on, and a function. A `Pipeline` is a list of them, each of which is
+made, after those that it depends on, when it is first asked for, unless a `StageFolder` keeps it already.
+"""
 
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +20,7 @@ from avmsf._utils.files import way_out, write_whole
 from avmsf._utils.processes import WAIT, write_lock
 from avmsf._utils.text import read_json
 from avmsf.errors import CaptureError
+from avmsf.pipeline.progress import ProgressListener
 
 _BLOCK = 1 << 20
 
@@ -33,6 +39,22 @@ class Kept:
     """Whether it ran now."""
 
 
+@dataclass(frozen=True)
+class Stage:
+    """One step from a capture to a field."""
+
+    name: str
+    """Of its output in the folder."""
+    make: Callable[..., object]
+    """Receives the output's path, and those of the stages that it depends on; leaves it whole or not at all."""
+    inputs: tuple[str, ...] = ()
+    """The stages that it depends on."""
+    recipe: Callable[[], Mapping[str, Any]] = dict
+    """Returns the plain values that decide the output besides these, digests of files among them."""
+    usable: Callable[[Path], bool] | None = None
+    """Whether an output of the same recipe may be used; by default it may."""
+
+
 class StageFolder:
     """A folder of stages' outputs, `NAME` beside `NAME.stage.json`, its recipe.
 
@@ -43,15 +65,6 @@ class StageFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._counted: Sequence[str] = ()
-        self._log: Callable[[str], None] = lambda message: None
-
-    def count(self, names: Sequence[str], log: Callable[[str], None]) -> None:
-        """From now on log the number of each of these outputs when its turn comes, such as "2 of 5: modes (cached)".
-
-        They come in this order; some may be left out.
-        """
-        self._counted, self._log = names, log
 
     def lock(self, command: str, *, wait: float = WAIT) -> AbstractContextManager[None]:
         """Return a context in which no other process or thread makes or replaces a stage here.
@@ -70,22 +83,15 @@ class StageFolder:
         """Return where a stage may leave its state until it is done."""
         return self.folder / f"{name}.checkpoint"
 
-    def keep(
-        self,
-        name: str,
-        recipe: Mapping[str, Any],
-        make: Callable[[Path], object],
-        *,
-        usable: Callable[[Path], bool] | None = None,
-    ) -> Kept:
-        """Return the output called `name`, made by `make(path)` where what is kept is not of this recipe.
+    def keep(self, stage: Stage, inputs: Mapping[str, Kept] | None = None) -> Kept:
+        """Return a stage's output, made of `inputs` where what is kept is not of its recipe and of these.
 
-        `recipe` holds plain values that decide the output, digests of inputs among them. `make` leaves the output whole
-        or not at all. An output of this recipe that `usable(path)` finds wanting is made again too. Raises as `make`,
-        and `CaptureError` where the folder cannot be written.
+        Raises as the stage, and `CaptureError` where the folder cannot be written.
         """
+        name, inputs = stage.name, inputs or {}
         path, record = self.path(name), self.folder / f"{name}.stage.json"
-        key = {"version": avmsf.__version__, "source": source_digest(make.__module__), **recipe}
+        key = {"version": avmsf.__version__, "source": source_digest(stage.make.__module__), **stage.recipe()}
+        key |= {"inputs": {each: kept.digest for each, kept in inputs.items()}}
         wanted = json.loads(json.dumps(key, sort_keys=True))
         known = _read(record)
         same = known.get("recipe") == wanted
@@ -93,16 +99,12 @@ class StageFolder:
             current = same and path.exists() and digest_of(path) == known.get("digest")
             if not same:
                 self.checkpoint(name).unlink(missing_ok=True)
-        fresh = not current or (usable is not None and not usable(path))
-        if name in self._counted:
-            cached = "" if fresh else " (cached)"
-            self._log(f"{self._counted.index(name) + 1} of {len(self._counted)}: {Path(name).stem}{cached}")
-        if not fresh:
+        if current and (stage.usable is None or stage.usable(path)):
             return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
         with self._explaining(name):
             _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
-        make(path)
+        stage.make(path, *(kept.path for kept in inputs.values()))
         with self._explaining(name):
             digest, seconds = digest_of(path), time.monotonic() - begun
             _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)})
@@ -125,6 +127,29 @@ class StageFolder:
             ) from cause
 
 
+class Pipeline:
+    """Stages in a folder, by name: `pipeline[name]` is the output, made when it is first asked for."""
+
+    def __init__(self, folder: StageFolder, stages: Iterable[Stage] = (), *, listener: ProgressListener) -> None:
+        self.folder, self.listener = folder, listener
+        self.stages = {stage.name: stage for stage in stages}
+        self.made: dict[str, Kept] = {}
+        """The outputs that were asked for so far, in order."""
+
+    def __getitem__(self, name: str) -> Kept:
+        if name not in self.made:
+            stage = self.stages[name]
+            kept = self.folder.keep(stage, {each: self[each] for each in stage.inputs})
+            self.made[name] = kept
+            self.listener.ready(Path(name).stem, kept.seconds if kept.fresh else None)
+        return self.made[name]
+
+    def add(self, stage: Stage) -> Kept:
+        """Add a stage and return its output."""
+        self.stages[stage.name] = stage
+        return self[stage.name]
+
+
 def digest_of(path: Path) -> str:
     """Return a digest of a file's content, or of the names and contents of all files in a folder."""
     if path.is_dir():
@@ -138,7 +163,7 @@ def digest_files(paths: Iterable[Path], *, root: Path) -> str:
     for path in sorted(paths):
         digest.update(f"{path.relative_to(root).as_posix()}\0{path.stat().st_size}\0".encode())
         with open(path, "rb") as file:
-            while block := file.read(_BLOCK):
+            for block in iter(partial(file.read, _BLOCK), b""):
                 digest.update(block)
     return digest.hexdigest()
 

@@ -23,7 +23,7 @@ from avmsf.photographs.nerf_json import stated_moves
 from avmsf.photographs.segmentation import find_foreground
 from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import scaled, without_far
-from avmsf.pipeline.sources import find_source, find_splats
+from avmsf.pipeline.views import find_source, find_splats
 
 
 @dataclass(frozen=True)

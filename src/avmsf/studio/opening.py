@@ -11,10 +11,9 @@ from avmsf.capture.filenames import SPLATS, find_surface_file
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.errors import StudioError
 from avmsf.gaussians.ply import holds_gaussians
-from avmsf.pipeline.config import CACHE
+from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
-from avmsf.pipeline.shape import FIELD, SURFACE
-from avmsf.pipeline.sources import find_source, find_splats
+from avmsf.pipeline.views import find_source, find_splats
 
 MESHES = (".obj", ".ply", ".glb", ".stl")
 """Suffixes of the meshes that a capture may have as its surface."""
@@ -96,7 +95,7 @@ def shows_more(opened: Opened) -> bool:
 
 def _open_folder(folder: Path, object: Path | None) -> Opened:
     folder = folder.resolve()
-    field = folder / CACHE / FIELD
+    field = folder / CACHE / CACHED_FIELD
     opened = Opened(folder.name, folder, field if field.is_file() else None, folder, object)
     if not ((folder / TABLE).is_file() or find_object(opened) is not None or shows_more(opened)):
         surfaces = ", ".join(f"surface{suffix}" for suffix in MESHES)

@@ -30,8 +30,8 @@ from avmsf.errors import NO_MEMORY, AvmsfError, CaptureWarning, lacks_memory
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
 from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.record import capture_settings_of
-from avmsf.pipeline.scene import ProgressListener, SceneStages
+from avmsf.pipeline.progress import ProgressListener
+from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.capture import COMMAND
 
@@ -45,7 +45,7 @@ class EventWriter:
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
-        self.listener = ProgressListener(self.log, self._stage_step)
+        self.listener = ProgressListener(self.log, self._stage_step, note=self.log)
         """What the stages of a fit report to."""
 
     def write(self, event: Values) -> None:
@@ -81,7 +81,7 @@ def make_field(task: Values, events: EventWriter) -> Values:
     """
     folder = Path(task["folder"])
     config = replace(PRESETS[task["preset"]], modes=int(task["modes"]))
-    settings = capture_settings_of(config, settings_of(folder))
+    settings = settings_of(folder).starting(config.time_zero)
     events.log("capture: reading the recordings")
     capture, stages = read_capture(folder, settings), StageFolder(folder / CACHE)
     with stages.lock(COMMAND):

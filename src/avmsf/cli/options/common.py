@@ -53,7 +53,7 @@ class Printing(Common):
     """Options of the verbs that print results."""
 
     json: Flag = False
-    """Print the results as one JSON object to standard output, and everything else to standard error."""
+    """Print the results as one JSON object to standard output, all else to standard error."""
 
 
 def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | None = None) -> T:
@@ -77,8 +77,7 @@ class Configured(Printing, ABC):
     config: SettingsTable = None
     """Take settings from this file; --set and other options come after it."""
     print_config: Flag = False
-    """Print all settings as they are with these options, with what they mean, as a file for --config, and do nothing
-    else."""
+    """Print all settings with these options as a file for --config, and do nothing else."""
     usual: ClassVar[object]
     """The settings where nothing changes them."""
 

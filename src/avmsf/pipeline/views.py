@@ -1,10 +1,10 @@
-"""What a folder holds of an object's look, and how that becomes views: whatever it is, one folder of them comes out."""
+"""What shows the object in a folder, and the stages that make views with cameras and masks of it, whatever it is."""
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -21,10 +21,12 @@ from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.photographs.sfm import MIN_IMAGES, estimate_cameras
 from avmsf.photographs.video import pick_frames
 from avmsf.pipeline.config import ViewsConfig
-from avmsf.pipeline.stages import Kept, StageFolder, digest_files
+from avmsf.pipeline.stages import Stage, digest_files
 
 Kind = Literal["cameras", "photographs", "video", "mesh"]
 Log = Callable[[str], None]
+MOTION, VIEWS = "motion", "views"
+"""What the stages call their outputs."""
 
 
 @dataclass(frozen=True)
@@ -86,31 +88,50 @@ def find_splats(folder: Path) -> Path | None:
     return next((folder / name for name in SPLATS if (folder / name).is_file()), None)
 
 
-def keep_views(
-    source: Source, stages: StageFolder, config: ViewsConfig, *, settings: CaptureSettings, log: Log
-) -> Kept:
-    """Make the folder `views` of a source's views, with masks, or return it where it is as it should be.
+def view_stages(source: Source, config: ViewsConfig, *, settings: CaptureSettings, log: Log) -> list[Stage]:
+    """Return the stages that make the folder `views` of a source's views, with masks.
 
-    Photographs without cameras get them by structure from motion first, kept in `motion`. Raises as the readers do.
+    Photographs without cameras get them by structure from motion first, in the folder `motion`, which holds `images`
+    and the COLMAP model `sparse/0`. Raise as the readers do.
     """
-    if source.kind in ("photographs", "video"):
-        moved = _keep_motion(source, stages, config, log=log)
-        recipe = {"motion": moved.digest}
-    else:
-        moved = None
-        recipe = {"files": source.digest}
 
-    def make(path: Path) -> None:
+    def find_cameras(path: Path) -> None:
+        shutil.rmtree(path, ignore_errors=True)
+        if source.kind == "video":
+            log(f"views: picking {config.frames} frames of {source.path.name}")
+            pick_frames(source.path, path / "images", count=config.frames)
+        else:
+            _copy_photographs(source, path)
+        log("views: finding the cameras by structure from motion")
+        estimate_cameras(path / "images", path, timeout=60 * config.minutes, seed=config.seed)
+
+    def make_views(path: Path, motion: Path | None = None) -> None:
         if source.kind == "mesh":
             views = _rendered(source.path, config, settings=settings, log=log)
         else:
-            folder = source.path if moved is None else moved.path
-            views = _photographed(folder, config, meters=settings.views_meters, log=log)
+            views = _photographed(motion or source.path, config, meters=settings.views_meters, log=log)
         write_views(_spread(views, config.count), path, replace=True)
 
-    lengths = {"views_meters": settings.views_meters, "surface_meters": settings.surface_meters}
-    chosen = {name: value for name, value in asdict(config).items() if name in _matters(source.kind)}
-    return stages.keep("views", {"kind": source.kind, **recipe, **lengths, **chosen}, make)
+    def recipe() -> dict[str, Any]:
+        names = ("rendered", "count") if source.kind == "mesh" else ("longest", "masks", "count")
+        lengths = {"views_meters": settings.views_meters, "surface_meters": settings.surface_meters}
+        return {"kind": source.kind, **lengths, **{name: getattr(config, name) for name in names}}
+
+    if source.kind not in ("photographs", "video"):
+        return [Stage(VIEWS, make_views, recipe=lambda: {"files": source.digest, **recipe()})]
+    frames = {"frames": config.frames} if source.kind == "video" else {}
+    motion = Stage(MOTION, find_cameras, recipe=lambda: {"files": source.digest, "seed": config.seed, **frames})
+    return [motion, Stage(VIEWS, make_views, (MOTION,), recipe)]
+
+
+def _copy_photographs(source: Source, folder: Path) -> None:
+    """Copy photographs and their masks to `images` and `masks` in a folder."""
+    masks = source.folder / "masks"
+    for file in source.files:
+        masked = file.is_relative_to(masks)
+        place = folder / ("masks" if masked else "images") / file.relative_to(masks if masked else source.path)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, place)
 
 
 def _spread(views: Sequence[View], count: int) -> Sequence[View]:
@@ -119,11 +140,6 @@ def _spread(views: Sequence[View], count: int) -> Sequence[View]:
         return views
     positions = torch.stack([view.camera.position for view in views])
     return [views[row] for row in sorted(farthest_points(positions, count).tolist())]
-
-
-def _matters(kind: Kind) -> Sequence[str]:
-    """Return the settings that decide views of one kind."""
-    return ("rendered", "count") if kind == "mesh" else ("longest", "masks", "count")
 
 
 def _photographed(folder: Path, config: ViewsConfig, *, meters: float, log: Log) -> tuple[View, ...]:
@@ -140,27 +156,3 @@ def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, log
     cameras = orbit_cameras(mesh.surface, size=config.rendered)
     log(f"views: rendering {len(cameras)} of {path.name}")
     return render_views(mesh, cameras)
-
-
-def _keep_motion(source: Source, stages: StageFolder, config: ViewsConfig, *, log: Log) -> Kept:
-    """Return a folder of `images` and the COLMAP model `sparse/0` that was found for them."""
-    recipe: dict[str, str | int] = {"files": source.digest, "seed": config.seed}
-    if source.kind == "video":
-        recipe["frames"] = config.frames
-
-    def make(path: Path) -> None:
-        shutil.rmtree(path, ignore_errors=True)
-        if source.kind == "video":
-            log(f"views: picking {config.frames} frames of {source.path.name}")
-            pick_frames(source.path, path / "images", count=config.frames)
-        else:
-            masks = source.folder / "masks"
-            for file in source.files:
-                masked = file.is_relative_to(masks)
-                place = path / ("masks" if masked else "images") / file.relative_to(masks if masked else source.path)
-                place.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, place)
-        log("views: finding the cameras by structure from motion")
-        estimate_cameras(path / "images", path, timeout=60 * config.minutes, seed=config.seed)
-
-    return stages.keep("motion", recipe, make)

@@ -1,0 +1,285 @@
+"""What a field is and how good it is, as lines for people and as plain values: for `avmsf fit`, `info` and `modes`."""
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf._utils.text import counted, format_number
+from avmsf.capture import Impacts
+from avmsf.capture.impacts import places_of
+from avmsf.cli.printing import decimals, table
+from avmsf.cli.progress import display
+from avmsf.evaluation.scores import Scores, evaluate, score
+from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
+from avmsf.evaluation.task import Renderer
+from avmsf.field.config import NETWORK
+from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.gains.scaled import BodyGains
+from avmsf.field.sound_field import SoundField
+from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.modes import ModalBank
+from avmsf.pipeline.record import RECORD, modes_words, recorded
+from avmsf.symmetry.symmetries import Symmetries
+
+MAX_LISTED_MODES = 20
+"""Modes in a table, those of most energy."""
+HEADINGS = {"relative_stft": "relative STFT error", "l1": "L1", "l1_log": "L1-log", "envelope": "ENV"}
+"""Metrics in the order of the table, as its columns call them."""
+
+
+def describe(field: SoundField) -> dict[str, Any]:
+    """Return what the field is, as plain values."""
+    points = field.gain_field.points
+    noise = float(field.residual.magnitude.square().mean().sqrt())
+    return {
+        "capture": field.origin.capture,
+        "sample_rate": field.sample_rate,
+        "seconds": field.samples / field.sample_rate,
+        "mode_count": int(field.is_mode.sum()),
+        "supporting_pole_count": int((~field.is_mode).sum()),
+        "points": len(points),
+        "extent_meters": (points.amax(0) - points.amin(0)).tolist(),
+        "bounds_meters": [points.amin(0).tolist(), points.amax(0).tolist()],
+        "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
+        "residual_rms": noise,
+        "per_newton": field.origin.per_newton,
+        "trained_on": list(field.origin.trained_on),
+        "pipeline": {**recorded(field), "fit": asdict(field.origin.config)},
+        "body": None if field.body is None else field.body.record(),
+        "report": {name: value for name, value in field.origin.report.items() if name != RECORD},
+    }
+
+
+def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list[str]:
+    """Return lines on a field in the file `path`: what it is and how good it is; all with `settings`."""
+    values = describe(field)
+    report, trained = values["report"], counted(len(values["trained_on"]), "recording")
+    extent = ", ".join(
+        f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in zip("xyz", *values["bounds_meters"], strict=True)
+    )
+    reason = f" ({report['damping_reason']})" if "damping_reason" in report else ""
+    modes = modes_words(len(field.bank), values["supporting_pole_count"])
+    scale = "per newton" if values["per_newton"] else "on the scale of the recordings"
+    rows = [
+        ("modes", f"{modes}, {report.get('damping', 'shared')} damping{reason}"),
+        ("gains", _gains_words(values["gain_field"])),
+        ("fitted to", trained),
+    ]
+    if settings:
+        rows += [
+            ("sounds", f"{values['seconds']:.3g} s at {values['sample_rate']:g} Hz, {scale}"),
+            ("noise", f"{values['residual_rms']:.2g} (root mean square of the residual)"),
+            ("object", f"{values['points']} points, {extent} m"),
+        ]
+    if settings and "guess" not in report:
+        rows += _settings_rows(values["pipeline"])
+    if field.body is not None:
+        rows.append(("body", f"{field.body} (the most probable one{_gained(report)})"))
+    rows += [("warning", field.body.warning)] if field.body is not None and field.body.warning else []
+    rows += [("quality", words) for words in quality_words(field, path)]
+    rows += [("outlier", words) for words in outlier_words(field)]
+    rows += [("edited", _edit_words(edit)) for edit in report.get("edits", [])]
+    if report.get("validated"):
+        held = report.get("validation_spectral", {})
+        errors = ", ".join(f"{name} {float(error):.3g}" for name, error in held.items())
+        rows.append(("chosen on", f"{len(report['validation_contacts'])} validation contacts, spectral error {errors}"))
+    name = values["capture"] or "an unnamed capture"
+    return [f"field of {name}", *(f"  {title:10} {words}" for title, words in rows)]
+
+
+def _gained(report: Mapping[str, Any]) -> str:
+    if "credibility" not in report:
+        return ""
+    gained = report["credibility"]["with_body"] - report["credibility"]["without_body"]
+    return f"; it raises the log likelihood of the gains at left-out contacts by {gained:.1f} per mode"
+
+
+def _gains_words(gains: dict[str, Any]) -> str:
+    if gains.get("inner", gains["kind"]) == AttentionGains.kind:
+        return f"attention network on features: {gains['encoder']}"
+    if gains.get("inner", gains["kind"]) == BodyGains.kind:
+        return "computed without recordings: mode shapes of a body, each times its level"
+    families = ", ".join(dict.fromkeys(gains["families"]))
+    return f"Gaussian process over {families} kernels, by {counted(gains['contacts'], 'contact')}"
+
+
+def _settings_rows(pipeline: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return lines on the stages that made the field, if its file names them."""
+    fit, scene = pipeline["fit"], pipeline.get("scene")
+    rows = []
+    if "extraction" in pipeline:
+        rows.append(("extraction", f"{pipeline['extraction']}, {pipeline['modes']} modes at most"))
+        rows.append(("gain model", pipeline["gain_model"]))
+    if scene is not None:
+        lift, count = scene["lift"], scene["views"]["count"]
+        of = f"{lift['weighting']} mean over {count or 'all'} views, {lift['components'] or 'all'} components"
+        rows.append(("features", f"{pipeline['encoder']}, {of}, onto {lift['onto']}"))
+    learned = f"{fit['clusters']} clusters, {fit['warmup_steps']} steps of warm-up, "
+    network = learned if pipeline.get("gain_model") == NETWORK else ""
+    rows.append(("fit", f"{network}{counted(fit['steps'], 'step')} end to end, seed {fit['seed']}"))
+    return rows
+
+
+def _edit_words(edit: dict[str, Any]) -> str:
+    """Return the description of an edit, without settings that change nothing."""
+    parts = [str(edit.get("edit"))]
+    if "from" in edit:
+        parts.append(f"from {edit['from']['name']} to {edit['to']['name']}")
+    parts += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
+    usual = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
+    parts += [f"{name} {_by_mode(edit[name])}" for name, same in usual.items() if edit.get(name, same) != same]
+    parts += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
+    beyond = {"silent_hertz": "beyond half the sample rate", "overdamped_hertz": "overdamped"}
+    parts += [f"modes {what}: {len(edit[name])}" for name, what in beyond.items() if edit.get(name)]
+    if scores := edit.get("clap", {}).get("scores"):
+        parts.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
+    return ", ".join(parts)
+
+
+def _by_mode(values: float | list[float | None] | None) -> str:
+    """Return one value, or the range of those of single modes; None is what is muted."""
+    if not isinstance(values, list):
+        return "-inf" if values is None else f"{values:.4g}"
+    known = [each for each in values if each is not None] or [0.0]
+    mute = values.count(None)
+    return f"{min(known):.4g} to {max(known):.4g} by mode" + (f", {mute} muted" if mute else "")
+
+
+def quality_words(field: SoundField, path: Path) -> list[str]:
+    """Return the quality of a field in the file `path`, and the command for more contacts; empty if unknown."""
+    if isinstance(guess := field.origin.report.get("guess"), str):
+        return [f"{guess} Record a few impacts and fit again: avmsf fit"]
+    if field.quality is None:
+        return []
+    more = f" More contacts: avmsf suggest {shlex.quote(str(path))}" if field.quality.advice else ""
+    return [f"{field.quality}{more}"]
+
+
+def outlier_words(field: SoundField) -> list[str]:
+    """Return a line for each recording that contradicts the others: what was done, why it may be; --verbose figures."""
+    report = field.origin.report
+    lines = []
+    for name, words in report.get("outliers", {}).items():
+        done = "left out of the fit" if name in report.get("excluded", ()) else "used in the fit all the same"
+        found = report.get("outlier_figures", {}).get(name)
+        lines.append(f"{done}: {words}" + (f" ({_figures(found)})" if display.verbose and found else ""))
+    return lines
+
+
+def _figures(found: Mapping[str, Any]) -> str:
+    where = ", ".join(f"{each + 0.0:.4g}" for each in found["place"])
+    return (
+        f"log likelihood ratio per mode {found['ratio']:.2g}, and {found['place_ratio']:.2g} at ({where}) m, "
+        f"{found['distance']:.2g} m away; plausible above 0"
+    )
+
+
+def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction) -> dict[str, Scores]:
+    """Score the field, baselines of the same training impacts, and the held-out recordings' own gains without noise.
+
+    All by recordings aligned like those that the modes were found in.
+    """
+    train, test, count = modes.aligned(train), modes.aligned(test), min(3, len(train))
+    renderers: dict[str, Renderer] = {
+        "field": field,
+        "nearest recording": NearestRecording(train),
+        f"mean waveform of {count} nearest": MeanWaveform(train, count),
+    }
+    if train.directions is not None:
+        renderers[f"mean waveform of {count} nearest, by direction"] = MeanWaveform(train, count, by_direction=True)
+    renderers |= {f"mean gains of {count} nearest": MeanGains(train, modes, count), "white noise": WhiteNoise(train)}
+    scores = {name: evaluate(renderer, test) for name, renderer in renderers.items()}
+    return scores | {"the held-out recordings' own gains, no noise": score(floor(test, modes.bank), test)}
+
+
+def parts_words(train: Impacts, test: Impacts) -> str:
+    """Return how many positions are held out and how many are trained on, with the recordings where these are more."""
+    owners = places_of(torch.cat([train.contacts, test.contacts]).double()).tolist()
+    recorded, left = len(set(owners[: len(train)])), len(set(owners[len(train) :]))
+    repeats = (
+        "" if (recorded, left) == (len(train), len(test)) else f" ({len(test)} and {counted(len(train), 'recording')})"
+    )
+    return f"{counted(left, 'position')} not trained on, {recorded} trained on{repeats}"
+
+
+def score_table(title: str, scores: Mapping[str, Scores]) -> str:
+    """Return the means for printing, with the standard error of the first metric."""
+    rows = []
+    for method, each in scores.items():
+        mean, error = each.mean(), each.standard_error()
+        first, *others = HEADINGS
+        with_error = f"{format_number(mean[first])} ± {format_number(error[first], 1)}"
+        rows.append([method, with_error, *(format_number(mean[metric]) for metric in others)])
+    return table(title, ["", *HEADINGS.values()], rows)
+
+
+def score_values(scores: Mapping[str, Scores]) -> dict[str, dict[str, float]]:
+    """Return the means as plain values for JSON."""
+    return {method: each.mean() for method, each in scores.items()}
+
+
+def features_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return lines on the features, their consistency over the views, and their symmetries."""
+    lines = [
+        f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of them in no view; "
+        f"consistency of the views {100 * report['agreement']:.0f} % of the features' variance"
+    ]
+    if report.get("dropped"):
+        lines.append(
+            f"removed: {counted(report['dropped'], 'Gaussian')} inside the object or behind its surface in the views"
+        )
+    if "symmetries" in report:
+        lines.append(Symmetries.from_dict(report["symmetries"]).summary())
+    if "orbit_spread" in report:
+        before, after = report["orbit_spread"]
+        lines.append(
+            f"deviation over symmetric points, relative to all: {before:.3f} before pooling, {after:.3f} after"
+        )
+    return lines
+
+
+def levels(amplitudes: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes"]:
+    """Return each mode's root mean square amplitude against the strongest pole's, dB."""
+    size = amplitudes.square().mean(0).sqrt()
+    smallest = torch.finfo(size.dtype).tiny
+    return 20 * torch.log10((size / size.max().clamp_min(smallest)).clamp_min(1e-10))
+
+
+def mode_rows(bank: ModalBank, level_db: Float[Tensor, " modes"]) -> list[dict[str, Any]]:
+    """Return the modes in the bank's order, numbered from 1 by frequency; levels are against the strongest pole's."""
+    names = ("number", "frequency_hertz", "damping_per_second", "t60_seconds", "level_db")
+    columns = (bank.frequency.tolist(), bank.damping.tolist(), level_db.tolist())
+    return [
+        dict(zip(names, (number, frequency, damping, math.log(1000) / damping, level), strict=True))
+        for number, (frequency, damping, level) in enumerate(zip(*columns, strict=True), start=1)
+    ]
+
+
+def mode_table(of: str, rows: Sequence[dict[str, Any]], supporting: int) -> str:
+    """Return the modes of most energy for printing, with their quality where the rows have it, and the other poles."""
+    # Energy over time: proportional to the square of the amplitude and to the decay time.
+    most = sorted(rows, key=lambda row: row["level_db"] + 10 * math.log10(row["t60_seconds"]), reverse=True)
+    most = most[:MAX_LISTED_MODES]
+    which = "by energy" if len(most) == len(rows) else f"the {MAX_LISTED_MODES} of most energy"
+    columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
+    judged = any("energy_share" in row for row in rows)
+    columns += ["energy", "phase", "orders", "left out"] if judged else []
+    cells = []
+    for row in most:
+        cell = [str(row["number"]), decimals(row["frequency_hertz"], 2), format_number(row["damping_per_second"])]
+        cell += [format_number(row["t60_seconds"]), decimals(row["level_db"], 1)]
+        if judged:
+            cell[1] += f" ± {format_number(row['frequency_spread_hertz'], 2)}"
+            cell[2] += f" ± {format_number(row['damping_spread_per_second'], 2)}"
+            cell += [f"{100 * row['energy_share']:.2f} %", decimals(row["phase_coherence"], 2)]
+            cell += [f"{100 * row['stable_orders']:.0f} %", f"{100 * row['explained_left_out']:.0f} %"]
+        cells.append(cell)
+    poles = f"\n{counted(supporting, 'supporting pole')} in the model, but not modes (--json lists all)"
+    return table(f"{counted(len(rows), 'mode')}{of}, {which}", columns, cells) + (poles if supporting else "")

@@ -1,0 +1,109 @@
+"""The progress of the stages: what they report, and how it is shown on the standard error."""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from avmsf._utils.progress import is_live
+from avmsf._utils.text import printable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+
+def _ignore(*values: object) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class ProgressListener:
+    """Callbacks that receive the progress of the stages."""
+
+    log: Callable[[str], None] = _ignore
+    """Receives a sentence as each part of a stage begins."""
+    step: Callable[[str, int, int, str], None] = _ignore
+    """Receives a stage's name, its steps done and in all, and a message on the last one."""
+    ready: Callable[[str, float | None], None] = _ignore
+    """Receives the name of a stage whose output is there, and the seconds that it took; None where it was cached."""
+    note: Callable[[str], None] = _ignore
+    """Receives a sentence that a user should know: what is missing, and what is done without it."""
+
+
+class ProgressDisplay:
+    """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready."""
+
+    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+        """Show nothing but notes with `quiet`, and with `verbose` print each part of a stage as it begins."""
+        self.quiet, self.verbose = quiet, verbose
+        self._bar: Progress | None = None
+        self._shown: tuple[str, TaskID] | None = None
+        self._objects, self._begun = 0, time.monotonic()
+
+    def __enter__(self) -> "ProgressDisplay":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    @property
+    def listener(self) -> ProgressListener:
+        """What the stages report to."""
+        return ProgressListener(self.doing, self.step, self.ready, lambda text: self.say(f"note: {text}"))
+
+    def say(self, text: str) -> None:
+        """Print a line, unless `quiet`; a note or a warning always."""
+        self.close()
+        if not self.quiet or text.startswith(("note: ", "avmsf ")):
+            print(printable(text), file=sys.stderr, flush=True)
+
+    def doing(self, text: str) -> None:
+        """Show what begins."""
+        if self.verbose:
+            self.say(text)
+        self._show(text, text, 0, None)
+
+    def step(self, stage: str, done: int, total: int, message: str) -> None:
+        """Show how many steps of a stage are done, and a message on the last one."""
+        self._show(stage, f"{stage}: {message}" if message else stage, done, total)
+
+    def ready(self, name: str, seconds: float | None) -> None:
+        """Print that a stage is ready, with its time on the right."""
+        self.say(f"{name:24}{'cached' if seconds is None else f'{seconds:.1f} s':>12}")
+
+    def objects(self, message: str, done: int, total: int) -> None:
+        """Show how many objects are done, and what begins or ends; print a line for each object that is done."""
+        if done > self._objects:
+            self.say(f"{message} ({done} of {total}, {time.monotonic() - self._begun:.0f} s)")
+        self._objects = done
+        self._show("objects", message, done, total)
+
+    def close(self) -> None:
+        """Remove the line that moves, until something is shown again."""
+        if self._bar is not None:
+            self._bar.stop()
+
+    def _show(self, stage: str, text: str, done: int, total: int | None) -> None:
+        if self.quiet or not sys.stderr.isatty():
+            return
+        if self._bar is None:
+            self._bar = _new_bar()
+        self._bar.start()
+        if self._shown is None or self._shown[0] != stage:
+            if self._shown is not None:
+                self._bar.remove_task(self._shown[1])
+            self._shown = stage, self._bar.add_task("", total=total)
+        self._bar.update(self._shown[1], description=printable(text).replace("[", "\\["), completed=done)
+
+
+def _new_bar() -> "Progress":
+    # Only here: what is shown in a file or a pipe does without rich.
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(file=sys.stderr)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    # What goes to a file or a pipe is not for the terminal.
+    redirect = sys.stdout.isatty()
+    return Progress(*columns, console=console, transient=True, disable=not is_live(console), redirect_stdout=redirect)
