@@ -31,7 +31,7 @@ from avmsf.modal.residual_noise import Residual, estimate_residual
 
 _MIN_PLACES = 4
 """Places below which leaving one out says nothing of the field of all."""
-_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_SPREAD_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Spread shares that are tried."""
 
 
@@ -136,14 +136,14 @@ def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundFi
     residuals = {"noise": field.noise(samples)}
     if field.origin.config.residual:
         residuals["recordings"] = (recordings[rows] * signs[..., None]).mean(1)
-    modes = [field.modal_sounds(gains.left_out_estimate(share), samples) for share in _SHARES]
+    modes = [field.modal_sounds(gains.left_out_estimate(share), samples) for share in _SPREAD_SHARES]
     error = PlaceErrors(train, places, field.origin.config)
     errors = {kind: torch.stack([error(each + added) for each in modes]) for kind, added in residuals.items()}
     best = min(errors, key=lambda kind: float(errors[kind].mean(1).min()))
     if best == "recordings":
         field = replace(field, residual=Residual(field.residual.magnitude, recordings))
     chosen = smallest_within_error(errors[best])
-    field = replace(field, gain_field=replace(gains, spread_share=_SHARES[chosen]))
+    field = replace(field, gain_field=replace(gains, spread_share=_SPREAD_SHARES[chosen]))
     reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}
     contact, distance = (_next(field, gains) if advise else ()) or (None, None)
     nearest, averaged = error(neighbors[:, 0]), error(neighbors.mean(1))

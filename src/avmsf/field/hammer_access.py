@@ -20,11 +20,11 @@ HAMMER_DIAMETER = 0.01
 _RADIUS = 0.5 * HAMMER_DIAMETER
 MAX_TILT_DEGREES = 45.0
 """Angle between the hammer and the normal beyond which more of the force goes along the surface than into it."""
-MAX_DISTANCE = 0.02
+MAX_DISTANCE_RATIO = 0.02
 """Distance of a place from the surface over the object's size up to which the blow meant is that on the surface."""
 _TILTS, _TURNS, _SIDES = 4, 12, 8
 """Tilts and turns of the axes that are tried, and lines along the rod that are checked beside its axis."""
-_GAP = 1e-4
+_GAP_RATIO = 1e-4
 """Gap between tip and surface, over the object's size, so that rounding lets no rod touch the triangle it strikes."""
 _MAX_POINTS = 12_000
 """Points that can block a rod, of an object without triangles."""
@@ -51,10 +51,10 @@ class MeshAccess:
 
         The axis is a unit vector away from the surface: of those that lie clear the one nearest to the normal.
         """
-        found, gap = self._closest(places), _GAP * self._size
+        found, gap = self._closest(places), _GAP_RATIO * self._size
         feet = (self._triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)
         normals = self._normals[found.rows]
-        tips, near = feet + (_RADIUS + gap) * normals, found.distances <= MAX_DISTANCE * self._size
+        tips, near = feet + (_RADIUS + gap) * normals, found.distances <= MAX_DISTANCE_RATIO * self._size
         open_to = near & (self._free(feet + gap * normals, normals) > _RADIUS)
         reached, used = np.zeros(len(places), dtype=bool), normals.copy()
         for axes in _axes(normals):

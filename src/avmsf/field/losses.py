@@ -21,7 +21,7 @@ from avmsf._utils.compiled import compiled
 
 _CHUNK, _CARD_CHUNK = 1 << 19, 1 << 27
 """Samples of windowed frames held at once: near a processor's cache, or all frames in half a gigabyte of a card's."""
-_SILENT = 1e-12
+_MIN_POWER_RATIO = 1e-12
 """Power below which a magnitude counts as zero, over that of the target's largest sample times the window's energy: its
 slope is taken as finite there. Recordings divided by their forces have samples of 1e-5, so the floor has to scale."""
 
@@ -70,7 +70,7 @@ def spectral_target(
     resolutions = []
     for size, hop in zip(fft_sizes, hops, strict=True):
         window = torch.hann_window(size, dtype=cut.dtype, device=cut.device)
-        floor = max(_SILENT * peak**2 * float(window.square().sum()), torch.finfo(cut.dtype).tiny)
+        floor = max(_MIN_POWER_RATIO * peak**2 * float(window.square().sum()), torch.finfo(cut.dtype).tiny)
         frames = _padded(cut, size).unfold(1, size, hop)
         magnitudes = torch.empty(*frames.shape[:2], size // 2 + 1, dtype=cut.dtype, device=cut.device)
         for chunk in _chunks(frames):

@@ -20,13 +20,13 @@ from avmsf.field.posterior import energy_of, fitted_mixture
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 
-PLACES = 400
+MAX_POINTS = 400
 """Points of the surface that the expected error is summed over, and that are candidates unless others are given."""
 MAX_CANDIDATES = 500
 """Candidates that are weighed; of more, as many that lie far apart. The memory grows with their square."""
-_OFF = 0.05
+_MAX_OFF_RATIO = 0.05
 """Distance of a candidate from the surface over the object's size, from which on it is not on the object."""
-_SAME = 1e-6
+_SAME_POSITION_RATIO = 1e-6
 """Distance between two places over the object's size, below which they are one."""
 
 
@@ -89,13 +89,13 @@ def suggest(
     _expect_directions(directions, given)
     with working("computing the expected error over the surface", shown=progress):
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
-        points = surface[farthest_points(surface, min(PLACES, len(surface)))].double()
+        points = surface[farthest_points(surface, min(MAX_POINTS, len(surface)))].double()
         if given is None:
             pool, directions = _reachable(gains, points)
         else:
             _expect_on_surface(given, gains.points.double())
             pool = given
-        same = _SAME * float((points.amax(0) - points.amin(0)).norm())
+        same = _SAME_POSITION_RATIO * float((points.amax(0) - points.amin(0)).norm())
         allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
         if int(allowed.sum()) < count:
             wanted, advice = f"{count} or more without a recording", "ask for fewer, or give more candidates"
@@ -214,7 +214,7 @@ def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Flo
         raise FitError.expected("1 position or more", 0, got="none", name="candidates", advice="leave it out")
     distance = torch.from_numpy(cKDTree(surface.numpy()).query(candidates.numpy())[0])
     worst = int(distance.argmax())
-    if float(distance[worst]) > _OFF * float((surface.amax(0) - surface.amin(0)).norm()):
+    if float(distance[worst]) > _MAX_OFF_RATIO * float((surface.amax(0) - surface.amin(0)).norm()):
         found = [round(each, 4) for each in candidates[worst].tolist()]
         raise FitError.expected(
             "a position on the object's surface", found, got=f"{found} m, {float(distance[worst]):.2g} m from it",

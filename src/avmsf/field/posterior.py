@@ -22,11 +22,11 @@ from avmsf.modal.residual_noise import interpolated
 
 LEVEL = 0.9
 """Default probability of credible intervals."""
-_MAPPED = 1000
+_MAX_MAPPED_POINTS = 1000
 """Points that the mean over the surface is taken over, at most."""
 _DRAWS = 200
 """Sounds that a band is drawn from."""
-_BANDS = 400
+_MAX_BANDS = 400
 """Bands of a spectrum, evenly spaced up to half the sample rate."""
 
 
@@ -109,7 +109,7 @@ def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> F
     as `fitted_mixture`.
     """
     surface = field.gain_field.points
-    step = max(1, len(surface) // _MAPPED)
+    step = max(1, len(surface) // _MAX_MAPPED_POINTS)
     energy = energy_of(field, field.gain_field.predict(surface[::step]).parts).mean()
     variance = energy_of(field, posterior(field, points)[1])
     return (variance / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
@@ -135,7 +135,7 @@ def spectrum_band(
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
     power = torch.fft.rfft(field.modal_sounds(Gains(torch.view_as_complex(drawn)), field.samples)).abs().square()
     power += field.samples * interpolated(field.residual.magnitude, power.shape[1]).double().square()
-    edges = torch.linspace(0, power.shape[1], min(_BANDS, power.shape[1]) + 1).round().long()
+    edges = torch.linspace(0, power.shape[1], min(_MAX_BANDS, power.shape[1]) + 1).round().long()
     bands = torch.stack([power[:, first:last].mean(1) for first, last in pairwise(edges.tolist())], dim=1)
     tail = (1.0 - level) / 2.0
     ordered = torch.quantile(bands, torch.tensor([tail, 0.5, 1.0 - tail], dtype=torch.float64), dim=0)
