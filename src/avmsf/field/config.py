@@ -1,7 +1,7 @@
 """How a field is fitted: one flat record, which is the command line's options too."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from avmsf._utils.text import changes_repr
@@ -111,19 +111,19 @@ class FitConfig:
     def __post_init__(self) -> None:
         if not isinstance(self.seed, int):
             raise FitError.expected("a whole number", self.seed, name="seed")
-        values = {name: value for name, value in asdict(self).items() if not isinstance(value, bool)}
-        numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
-        for name, value in numbers.items():
-            least = 1 if name in _COUNTS else 0
-            if not least <= value < math.inf or (name in _POSITIVE and value == 0):
-                wanted = "more than 0" if name in _POSITIVE else f"{least} or more"
-                raise FitError(f"{name}: expected {wanted}, got {value}", name=name, value=value)
+        for each in fields(self):
+            value, least = getattr(self, each.name), 1 if each.name in _COUNTS else 0
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            if not least <= value < math.inf or (each.name in _POSITIVE and value == 0):
+                wanted = "more than 0" if each.name in _POSITIVE else f"{least} or more"
+                raise FitError.expected(wanted, value, name=each.name)
         if self.seed >= 2**63:
-            raise FitError(f"seed: expected less than 2^63, got {self.seed}", name="seed", value=self.seed)
+            raise FitError.expected("less than 2^63", self.seed, name="seed")
         if not 0 <= self.validation <= 0.5:
             raise FitError.expected("0 to 0.5 of the positions", self.validation, name="validation")
         if self.warmup_steps + self.steps == 0:
-            raise FitError("steps: expected warmup_steps or steps of 1 or more, got 0 for both", name="steps", value=0)
+            raise FitError.expected("warmup_steps or steps of 1 or more", 0, got="0 for both", name="steps")
         # A rate as low as a structure's takes a quarter of each size, which has to be even.
         odd = [size for size in self.fft_sizes if size < 16 or size % 8]
         if odd or not self.fft_sizes:

@@ -104,33 +104,31 @@ def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> E
     """Return the error for sounds without modes: `name` is the property at fault, `value` how large it is."""
     samples = sounds.shape[1]
     duration = samples / sample_rate
-    expected = f"{SHORTEST} samples or more"
-
-    def failed(got: str, advice: str, name: str, value: float | int) -> ExtractionError:
-        return ExtractionError(f"expected {expected}, got {got}; {advice}", name=name, value=value)
-
     if samples < SHORTEST:
-        got = f"{samples} ({duration:.3g} s) in each of {len(sounds)} recordings"
-        return failed(got, "use more seconds after the onset", "samples", samples)
-    lowest = lowest_frequency(samples, sample_rate)
+        got, advice = f"{samples} ({duration:.3g} s)", "use more seconds after the onset"
+        return ExtractionError.expected(f"{SHORTEST} samples or more", samples, got=got, name="samples", advice=advice)
     moving = sounds.to(torch.float64) - sounds.mean(1, keepdim=True)
     tenth = samples // 10
     head, tail = (float(part.square().mean()) for part in (moving[:, :tenth], moving[:, -tenth:]))
-    expected = "sound"
     if head + tail == 0:
-        return failed(f"silence in all {len(sounds)} recordings", "check the channel", "sounds", 0.0)
-    fall = 10 * math.log10(max(head, 1e-30) / max(tail, 1e-30))
+        got = f"silence in all {len(sounds)} recordings"
+        return ExtractionError.expected("sound", 0.0, got=got, name="sounds", advice="check the channel")
+    lowest = lowest_frequency(samples, sample_rate)
     band = f"{lowest:.0f} to {sample_rate / 2:.0f} Hz"
-    expected = f"modes from {band} in {len(sounds)} recordings of {duration:.3g} s"
-    power = torch.fft.rfft(moving).abs().square().sum(0)
-    below = float(power[: math.ceil(lowest * duration)].sum() / power.sum())
+    wanted = f"modes from {band} in {len(sounds)} recordings of {duration:.3g} s"
+    fall = 10 * math.log10(max(head, 1e-30) / max(tail, 1e-30))
     if fall < 6:
         advice = "check the onset and the noise (avmsf check), or record louder impacts"
-        return failed(f"noise or hum that decays by {fall:.0f} dB", advice, "decay", fall)
+        got = f"noise or hum that decays by {fall:.0f} dB"
+        return ExtractionError.expected(wanted, fall, got=got, name="decay", advice=advice)
+    power = torch.fft.rfft(moving).abs().square().sum(0)
+    below = float(power[: math.ceil(lowest * duration)].sum() / power.sum())
     if below > 0.5:
         advice = "use more seconds after the onset, which lowers this limit"
-        return failed(f"{100 * below:.0f} % of the energy below {lowest:.0f} Hz", advice, "energy", below)
-    return failed("none above the noise", "record at a higher rate, closer, or a less damped object", "modes", 0)
+        got = f"{100 * below:.0f} % of the energy below {lowest:.0f} Hz"
+        return ExtractionError.expected(wanted, below, got=got, name="energy", advice=advice)
+    advice = "record at a higher rate, closer, or a less damped object"
+    return ExtractionError.expected(wanted, 0, got="none above the noise", name="modes", advice=advice)
 
 
 def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool = False) -> Extraction:
