@@ -78,13 +78,13 @@ def _explain(folder: Path) -> tuple[str, str | tuple[str, ...]]:
 
 def _no_folder(path: Path) -> DatasetError:
     if path.is_file():
-        advice = "; unpack it and name the folder" if path.suffix.lower() in ARCHIVES else ""
-        return DatasetError(f"{path}: expected a folder, got a file{advice}", file=path, value="file")
+        advice = "unpack it and name the folder" if path.suffix.lower() in ARCHIVES else ""
+        return DatasetError.expected("a folder", "file", got="a file", file=path, advice=advice)
     near: list[str] = []
     if path.parent.is_dir():
         near = get_close_matches(path.name, [each.name for each in path.parent.iterdir() if each.is_dir()], n=1)
-    meant = f"; did you mean {path.parent / near[0]}?" if near else ""
-    return DatasetError(f"{path}: expected a folder, got none{meant}", file=path, value=tuple(near))
+    meant = f"did you mean {path.parent / near[0]}?" if near else ""
+    return DatasetError.expected("a folder", tuple(near), got="none", file=path, advice=meant)
 
 
 def _any(folder: Path, pattern: str) -> bool:

@@ -89,11 +89,8 @@ def refuse_unknown(identifier: str, known: Collection[str], dataset: str) -> NoR
     if not near and number is not None:
         near = sorted(known, key=lambda name: abs((number_of(name) or 0) - number))[:4]
     meant = f"did you mean {' or '.join(near)}?" if near else f"such as {', '.join(in_order(known)[:8])};"
-    raise DatasetError(
-        f"{dataset}: expected one of its {len(known)} objects, got {identifier!r}; {meant} `avmsf check` lists all",
-        name="object",
-        value=identifier,
-    )
+    wanted, advice = f"one of the {len(known)} of {dataset}", f"{meant} `avmsf check` lists all"
+    raise DatasetError.expected(wanted, identifier, name="object", advice=advice)
 
 
 def _words(name: str) -> list[str]:

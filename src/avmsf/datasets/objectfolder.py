@@ -291,7 +291,7 @@ def _records(path: Path) -> list[tuple[int, Any]]:
             return list(enumerate(parse_json(text)))
         return [(row, parse_json(line)) for row, line in enumerate(text.splitlines(), start=1) if line.strip()]
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: expected a JSON list of contacts, got {error}", file=path) from error
+        raise DatasetError.expected("a JSON list of contacts", got=str(error), file=path) from error
 
 
 def _parse_record(record: Any, path: Path, row: int) -> tuple[tuple[str, str], Point]:

@@ -66,26 +66,26 @@ def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
 
 
 def check_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetError | None:
-    """Return the error of a sound file, from its header alone, whose message calls it `shown`; or None.
+    """Return the error of a sound file, which it calls `shown`, from its header alone; or None.
 
     Expected is one channel of at least so many frames at the rate, Hz.
     """
     advice = "unpack or download it again"
     if not path.is_file():
-        return DatasetError(f"{shown}: expected a sound file, got none; {advice}", file=path)
+        return DatasetError.expected("a sound file", file=shown, advice=advice)
     try:
         header = soundfile.info(str(path))
     except (soundfile.LibsndfileError, OSError) as error:
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
-        return DatasetError(f"{shown}: expected a sound file, got {reason!r}; {advice}", file=path)
+        return DatasetError.expected("a sound file", got=repr(reason), file=shown, advice=advice)
     for name, found, expected in (
         ("sample rate", header.samplerate, int(rate)),
         ("number of channels", header.channels, 1),
         ("length in frames", header.frames, max(frames, header.frames)),
     ):
         if found != expected:
-            message = f"{shown}: expected a {name} of {expected}, got {found}; take the published file"
-            return DatasetError(message, file=path, name=name, value=found)
+            advice = "take the published file"
+            return DatasetError.expected(f"a {name} of {expected}", found, file=shown, name=name, advice=advice)
     return None
 
 
@@ -103,9 +103,6 @@ def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> lis
     placement = check_placement(impacts.contacts, surface_points(surface))
     found = placement.describe(impacts.names)
     if placement.fault == "unit":
-        raise DatasetError(
-            f"{origin}: expected contacts and surface in one unit; {found}",
-            name=origin,
-            value=placement.mismatch.factor if placement.mismatch else None,
-        )
+        factor = placement.mismatch.factor if placement.mismatch else None
+        raise DatasetError.expected("contacts and surface in one unit", factor, got=found, name=origin)
     return [found] if found else []

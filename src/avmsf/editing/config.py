@@ -88,7 +88,5 @@ def _check(settings: object, **rules: tuple[bool, str]) -> None:
 def check_prompt(prompt: str) -> str:
     """Return a prompt without surrounding blanks. Raises `EditError` for an empty one."""
     if not prompt.strip():
-        raise EditError(
-            'expected a prompt, such as "an impact on a wooden bowl", got an empty one', name="prompt", value=prompt
-        )
+        raise EditError.expected('a text, such as "an impact on a wooden bowl"', prompt, name="prompt")
     return prompt.strip()

@@ -194,11 +194,8 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
     rate, samples = train.sample_rate, train.sounds.shape[1]
     lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY * rate / 2
     if lowest >= highest:
-        raise FitError(
-            f"train: expected longer recordings, got {samples} samples; use more seconds after the onset",
-            name="train",
-            value=samples,
-        )
+        got, advice = f"{samples} samples", "use more seconds after the onset"
+        raise FitError.expected("longer recordings", samples, got=got, name="train", advice=advice)
     chance = torch.rand(2, modes, dtype=torch.float64, generator=generator)
     frequency = torch.sort(lowest * (highest / lowest) ** chance[0]).values
     slowest = rate / samples

@@ -52,12 +52,8 @@ def method_named(name: str) -> Method:
         given = name.partition(":")[2]
         path = Path(given).expanduser()
         if not given or not (path.is_dir() if entry.is_folder else path.is_file()):
-            raise EvaluationError(
-                f"{name}: expected {entry.path} after `{kind_of(name)}:`, found none",
-                file=path if given else None,
-                name="method",
-                value=name,
-            )
+            wanted = f"{entry.path} after `{kind_of(name)}:`"
+            raise EvaluationError.expected(wanted, name, file=path if given else None, name="method")
         # However it is written: results of one path are those of one method.
         name, settings = f"{kind_of(name)}:{path}", {"path": path}
     made: Method

@@ -132,7 +132,7 @@ class ObjectInputs:
         """Yield the stages from what shows an object, locked. Raises SceneError where nothing does."""
         seen = self.dataset.visual_source(identifier)
         if seen is None:
-            raise SceneError(f"{identifier}: expected a mesh or photographs in the dataset, got none", name=identifier)
+            raise SceneError.expected("a mesh or photographs in the dataset", name=identifier)
         config = replace(config, views=replace(config.views, count=views or 0))
         folder = self.cache / identifier / ("all views" if views is None else f"{views} views")
         stages = SceneStages(

@@ -83,7 +83,7 @@ def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
         count += len(points)
     joined = np.concatenate(vertices)
     if not len(joined):
-        raise CaptureError(f"{path}: expected points, got none; export the surface again", file=path, value=0)
+        raise CaptureError.expected("points", 0, got="none", file=path, advice="export the surface again")
     return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
 
 

@@ -50,9 +50,8 @@ def write_simulation(
                 write_frames(render_views(mesh, cameras, progress=progress), begun)
             write_truth(simulation.truth, begun / TRUTH)
     except CaptureError as error:
-        raise SimulationError(
-            f"{folder}: expected a writable folder, got {error}; choose another folder", file=folder, value=str(error)
-        ) from error
+        advice = "choose another folder"
+        raise SimulationError.expected("a writable folder", str(error), file=folder, advice=advice) from error
 
 
 def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:

@@ -44,7 +44,8 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     _, reach = RayCaster(corners)(corners.mean(axis=1), -doubled / areas[:, None], lead=_RAY_LEAD)
     hit = np.isfinite(reach)
     if not hit.any():
-        raise SimulationError("expected a closed surface, got an open one; make the tetrahedra again", name="solid")
+        advice = "make the tetrahedra again"
+        raise SimulationError.expected("a closed surface", got="an open one", name="solid", advice=advice)
     # At a rim the walls' thickness, not the rim's distance from what lies below it.
     walls = np.full(len(places), np.inf)
     np.minimum.at(walls, triangles, np.where(hit, reach, np.median(reach[hit]))[:, None])

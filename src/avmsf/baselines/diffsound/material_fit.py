@@ -122,11 +122,8 @@ class DampingCurve:
         )
         slow = (damping > 0.0) & (damping < _FASTEST_DECAY) & (frequency > BAND[0]) & (frequency < _CURVE_END)
         if not slow.any():
-            raise EvaluationError(
-                f"expected a mode with a damping below {_FASTEST_DECAY:g} 1/s for DiffSound, got none of {len(bank)}",
-                name="damping",
-                value=len(bank),
-            )
+            wanted, got = f"a mode below {_FASTEST_DECAY:g} 1/s for DiffSound", f"none of {len(bank)}"
+            raise EvaluationError.expected(wanted, len(bank), got=got, name="damping")
         bins = ((frequency[slow] - BAND[0]) // _CURVE_STEP).astype(int)
         kept = np.unique(bins)
         least = [float(damping[slow][bins == each].min()) for each in kept]
@@ -149,12 +146,8 @@ def clip_spectra(impacts: Impacts) -> ClipSpectra:
     peaks = kept.abs().amax(dim=1)
     loud = peaks > 0.0
     if not bool(loud.any()):
-        raise EvaluationError(
-            f"expected a recording with a sound, got {len(impacts)} silent ones ({', '.join(impacts.names[:3])}); "
-            "record the impacts again",
-            name="sounds",
-            value=0.0,
-        )
+        got, advice = f"{len(impacts)} silent ones ({', '.join(impacts.names[:3])})", "record the impacts again"
+        raise EvaluationError.expected("a recording with a sound", 0.0, got=got, name="sounds", advice=advice)
     return ClipSpectra((kept[loud] / peaks[loud, None])[:CLIPS].float(), RATE)
 
 
@@ -168,7 +161,7 @@ def predicted_sound(
     audible = damped_frequency(frequency, damping)
     inside = (audible > BAND[0]) & (audible < BAND[1])
     if not bool(inside.any()):
-        raise EvaluationError(f"expected modes from {BAND[0]:g} to {BAND[1]:g} Hz, got none", name="frequency", value=0)
+        raise EvaluationError.expected(f"modes from {BAND[0]:g} to {BAND[1]:g} Hz", 0, got="none", name="frequency")
     ones = torch.ones(1, int(inside.sum()))
     sound = synthesize(ones, audible[inside], damping[inside], samples=SAMPLES, sample_rate=RATE)[0]
     return sound / sound.detach().abs().max(), audible[inside]
@@ -196,12 +189,8 @@ def fit_material(
     best = min(tried, key=problem.loss)
     if not math.isfinite(problem.loss(best)):
         lowest = float(family.bodies[0].modes(starts[0]).frequency[0])
-        raise EvaluationError(
-            f"expected an object with modes from {BAND[0]:g} to {BAND[1]:g} Hz, got a lowest mode at {lowest:.3g} Hz; "
-            "give the mesh's unit",
-            name="frequency",
-            value=lowest,
-        )
+        wanted, got = f"modes from {BAND[0]:g} to {BAND[1]:g} Hz", f"a lowest mode at {lowest:.3g} Hz"
+        raise EvaluationError.expected(wanted, lowest, got=got, name="frequency", advice="give the mesh's unit")
     best = problem.transported(best, config.transport_steps)
     best = problem.descended(best, config.difference_steps)
     if config.search:

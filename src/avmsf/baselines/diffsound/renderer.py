@@ -101,9 +101,8 @@ class DiffSound:
         """
         audible = sound.detach().cpu()[: self.samples].double()
         if not bool(torch.isfinite(audible).all()) or not bool(audible.any()):
-            raise LocationError(
-                "sound: expected finite samples that are not all 0, got others; record the impact again", name="sound"
-            )
+            wanted, advice = "finite samples that are not all 0", "record the impact again"
+            raise LocationError.expected(wanted, got="others", name="sound", advice=advice)
         found = fit_gains(audible[None], self.bank, sample_rate=self.sample_rate)[0]
         return cosine_distance(gains.to(torch.complex64), found, self.bank.frequency)
 
@@ -142,11 +141,8 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
     audible = damped_frequency(elastic.frequency, damping)
     inside = torch.nonzero((audible > 1.0) & (audible < 0.5 * train.sample_rate)).flatten()
     if not len(inside):
-        raise EvaluationError(
-            f"expected modes below {0.5 * train.sample_rate:g} Hz, got none; give the mesh's unit",
-            name="frequency",
-            value=0,
-        )
+        wanted = f"modes below {0.5 * train.sample_rate:g} Hz"
+        raise EvaluationError.expected(wanted, 0, got="none", name="frequency", advice="give the mesh's unit")
     elastic = replace(elastic, frequency=elastic.frequency[inside], shapes=elastic.shapes[:, inside].contiguous())
     bank = ModalBank(audible[inside], damping[inside])
     weight = _weights(_displacements(elastic, bank, train.contacts, train.directions), bank, train, weighted=weighted)
@@ -190,11 +186,8 @@ def _weights(
         products += row * (own @ recorded)
     energy = float(gram.sum())
     if not energy > 0.0 or not float(products.sum()) > 0.0:
-        raise EvaluationError(
-            f"expected sounds and displacements above 0 at a contact, got none of {len(train)}; record them again",
-            name="train",
-            value=0.0,
-        )
+        wanted, got = "sounds and displacements above 0 at a contact", f"none of {len(train)}"
+        raise EvaluationError.expected(wanted, 0.0, got=got, name="train", advice="record them again")
     if not weighted:
         return torch.full((len(bank),), float(products.sum()) / energy, dtype=torch.float64)
     # Modes that do not move at any contact have no weight to fit; scaled columns keep the others' size in view.

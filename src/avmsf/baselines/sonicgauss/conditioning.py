@@ -48,20 +48,14 @@ def normalized(cloud: GaussianCloud, rest: Float[Tensor, "points 9"]) -> Normali
     """
     kept = cloud.logit_opacities >= LEAST_LOGIT
     if not bool(kept.any()):
-        raise EvaluationError(
-            f"expected Gaussians with an opacity above .5, got {len(cloud)} of lower opacity; fit them with more steps",
-            name="opacity",
-            value=len(cloud),
-        )
+        got, advice = f"{len(cloud)} of lower opacity", "fit them with more steps"
+        raise EvaluationError.expected("Gaussians above .5", len(cloud), got=got, name="opacity", advice=advice)
     chosen, rest = cloud.detach().take(kept), rest.detach()[kept]
     low, high = chosen.centers.amin(0), chosen.centers.amax(0)
     extent = float((high - low).max())
     if not extent > 0.0:
-        raise EvaluationError(
-            f"expected Gaussians over the whole object, got {len(chosen)} at one position; fit them again",
-            name="centers",
-            value=len(chosen),
-        )
+        wanted, got = "Gaussians over the whole object", f"{len(chosen)} at one position"
+        raise EvaluationError.expected(wanted, len(chosen), got=got, name="centers", advice="fit them again")
     shift = 0.5 - 0.5 * (low + high) / extent
     centers = chosen.centers / extent + shift
     parts = [

@@ -208,9 +208,8 @@ def _load(part: nn.Module, path: Path) -> None:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys() if not name.startswith(_UNUSED)}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise EvaluationError(
-            f"{path}: expected published weights of SonicGauss, got {error}; {_DOWNLOAD}", file=path
-        ) from error
+        wanted = "published weights of SonicGauss"
+        raise EvaluationError.expected(wanted, got=str(error), file=path, advice=_DOWNLOAD) from error
     load_tensors(part, tensors, path, _DOWNLOAD)
 
 
@@ -218,11 +217,8 @@ def _diffusers() -> tuple[Any, Any]:
     try:
         from diffusers import AutoencoderOobleck, FluxTransformer2DModel
     except (ImportError, RuntimeError) as error:
-        raise EvaluationError(
-            f"sonicgauss: expected the package diffusers, got {error}; pip install 'avmsf[text]', or take "
-            "sonicgauss-small",
-            name="diffusers",
-        ) from error
+        wanted, advice = "the package for sonicgauss", "pip install 'avmsf[text]', or take sonicgauss-small"
+        raise EvaluationError.expected(wanted, got=str(error), name="diffusers", advice=advice) from error
     return AutoencoderOobleck, FluxTransformer2DModel
 
 

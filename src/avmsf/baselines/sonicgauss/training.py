@@ -129,12 +129,8 @@ def tune(
 def expect_sound(loudest: float, impacts: Impacts) -> None:
     """Raise EvaluationError where the largest magnitude of the recordings is not above 0."""
     if not loudest > 0.0:
-        raise EvaluationError(
-            f"expected a recording with a sound, got {len(impacts)} silent ones ({', '.join(impacts.names[:3])}); "
-            "record the impacts again",
-            name="sounds",
-            value=0.0,
-        )
+        got, advice = f"{len(impacts)} silent ones ({', '.join(impacts.names[:3])})", "record the impacts again"
+        raise EvaluationError.expected("a recording with a sound", 0.0, got=got, name="sounds", advice=advice)
 
 
 def train(

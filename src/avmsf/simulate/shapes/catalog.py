@@ -70,7 +70,7 @@ def make_shape(kind: str, *, seed: int | None = 0, size: float | None = None, wa
         raise SimulationError.expected(f"one of {', '.join(sorted(KINDS))}", kind, name="kind")
     seed = 0 if seed is None else seed
     if seed < 0:
-        raise SimulationError(f"seed: expected 0 or more, got {seed}", name="seed", value=seed)
+        raise SimulationError.expected("0 or more", seed, name="seed")
     for name, value in (("size", size), ("wall", wall)):
         if value is not None and not 0.0 < value <= _MAX_EXTENT_M:
             raise SimulationError.expected(f"more than 0 and at most {_MAX_EXTENT_M:g} m", value, name=name)
