@@ -109,7 +109,8 @@ def weighed(values: torch.Tensor, floor: torch.Tensor, given: Hypotheses) -> Ker
 
 def spread_of(given: KernelMixture, cross: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
     """Return the standard deviation at places of these covariances with the contacts, and variances."""
-    return given.spread(own, torch.einsum("hpc,hcs->ps", cross, given.solve()), given.explained(cross))
+    mean = torch.einsum("hpc,hcs->ps", cross, given.solve())
+    return (own.mT @ given.scale + given.explained(cross) - mean.square()).sqrt()
 
 
 def test_evidence_is_the_textbook_one():

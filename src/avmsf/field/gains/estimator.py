@@ -176,21 +176,19 @@ class MixtureEstimator(GainEstimator):
 
     def _usable_bodies(self, data: GainData) -> tuple[list[CandidateBody], dict[str, str]]:
         """Return the bodies that the contacts lie on, and why there are none."""
-        missing = {body_name(each): reason for each, reason in self.bodies.refused.items()} if self.bodies else {}
         if Elastic.kind not in self.kinds:
             return [], {}
-        if self.bodies is None:
-            if self.name == Elastic.kind:
+        try:
+            if self.bodies is None:
                 advice = self.missing or "give its mesh"
                 raise FitError.expected("the object's shape", name=Elastic.kind, advice=advice)
-            return [], {Elastic.kind: self.missing} if self.missing else {}
-        try:
             expect_placed(data.train.contacts, self.bodies.bodies[0].elastic.points, names=data.train.names)
         except FitError as error:
             if self.name == Elastic.kind:
                 raise
-            return [], {Elastic.kind: str(error)}
-        return list(self.bodies.bodies), missing
+            missing = self.missing if self.bodies is None else str(error)
+            return [], {Elastic.kind: missing} if missing else {}
+        return list(self.bodies.bodies), {body_name(each): reason for each, reason in self.bodies.refused.items()}
 
     def _may_be_held(self, judgment: Judgment) -> bool:
         """Return whether supports are tried: where they are asked for, or the free body predicts little."""

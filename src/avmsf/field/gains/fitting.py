@@ -207,15 +207,14 @@ def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: Measu
 
 
 def _shape(
-    weighed: WeighedFamily, elastic: Elastic, active: Bool[Tensor, " series"] | None = None
+    weighed: WeighedFamily, elastic: Elastic, active: Bool[Tensor, " series"] | float = 1.0
 ) -> Float64[Tensor, "shapes modes"]:
     """Return the log evidence of each shape, that of both parts."""
-    found = elastic.shape_evidence(weighed.evidence)
-    return (found if active is None else found * active).reshape(len(elastic.modes), 2, -1).sum(1)
+    return (elastic.shape_evidence(weighed.evidence) * active).reshape(len(elastic.modes), 2, -1).sum(1)
 
 
 def _no_shape(
-    families: Sequence[WeighedFamily], active: Bool[Tensor, " series"] | None = None
+    families: Sequence[WeighedFamily], active: Bool[Tensor, " series"] | float = 1.0
 ) -> Float64[Tensor, " modes"]:
     """Return the log evidence that a mode is no shape of a body, that of both parts."""
     others = [each for each in families if not isinstance(each.family, Elastic)]
@@ -224,5 +223,4 @@ def _no_shape(
         each.evidence.flatten(0, 1) + math.log(each.family.prior / total / each.evidence[:, :, 0].numel())
         for each in others
     ]
-    found = torch.logsumexp(torch.cat(logs), dim=0)
-    return (found if active is None else found * active).reshape(2, -1).sum(0)
+    return (torch.logsumexp(torch.cat(logs), dim=0) * active).reshape(2, -1).sum(0)

@@ -146,6 +146,13 @@ class KernelMixture:
         """The values along the eigenvectors, z = U' y."""
         return self.eigen[1].mT @ self.values
 
+    @cached_property
+    def scale(self) -> Float64[Tensor, "kernels series"]:
+        """The sum over noise shares of weight times s^2, the variance of a kernel of one."""
+        found = torch.zeros(len(self.kernels), self.values.shape[1], dtype=torch.float64)
+        pairs = self._pairs
+        return found.index_put_((pairs.kernel, pairs.series), pairs.weight * pairs.scale, accumulate=True)
+
     def solve(self) -> Float64[Tensor, "kernels contacts series"]:
         """Return the sum over noise shares of weight times C^-1 y: a mean at a place is k' times it, over kernels."""
         pairs = self._pairs
@@ -247,22 +254,6 @@ class KernelMixture:
             along = self.eigen[1][rows].mT @ loadings(rows - kernels.start)
             forms.append((middle @ along).flatten(0, 1).T @ along.flatten(0, 1))
         return torch.stack(forms)
-
-    def spread(
-        self,
-        own: Float64[Tensor, "kernels places"],
-        mean: Float64[Tensor, "places series"],
-        explained: Float64[Tensor, "places series"],
-    ) -> Float64[Tensor, "places series"]:
-        """Return the standard deviation at places, within hypotheses and between them, without noise.
-
-        `own` is each kernel's variance at each place, `mean` the values' mean there, and `explained` that of all
-        kernels.
-        """
-        pairs = self._pairs
-        scale = torch.zeros(len(self.kernels), self.values.shape[1], dtype=torch.float64)
-        scale.index_put_((pairs.kernel, pairs.series), pairs.weight * pairs.scale, accumulate=True)
-        return (own.mT @ scale + explained - mean.square()).clamp_min(0.0).sqrt()
 
     def mean_magnitude(
         self,

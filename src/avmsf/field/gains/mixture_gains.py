@@ -347,19 +347,20 @@ class MixtureGains(GainModel):
         return self.mixture.mean_magnitude(cross, own, self.spread_share)
 
     def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        own, first, explained = [], 0, torch.zeros(len(sites), self.mixture.values.shape[1], dtype=torch.float64)
-        for family, forms in zip(self.families, self._forms, strict=True):
-            own.append(family.own(sites))
+        mean, first = self._mean(sites), 0
+        second, scales = torch.zeros_like(mean), torch.split(self.mixture.scale, list(map(len, self.families)))
+        for family, forms, scale in zip(self.families, self._forms, scales, strict=True):
+            second += family.own(sites).mT @ scale
             if forms is None or not isinstance(family, Elastic):
-                explained += self.mixture.explained(family.between(sites, self.training), first)
+                second += self.mixture.explained(family.between(sites, self.training), first)
             else:
                 factors = family.factors(sites, self.training)
                 # Products of two factors, each pair once: half of what the matrices times the factors would take.
                 first_of, second_of = torch.triu_indices(factors.shape[1], factors.shape[1])
                 parts = torch.split(factors, _PRODUCTS)
-                explained += torch.cat([(part[:, first_of] * part[:, second_of]) @ forms for part in parts])
+                second += torch.cat([(part[:, first_of] * part[:, second_of]) @ forms for part in parts])
             first += len(family)
-        return self.mixture.spread(torch.cat(own), self._mean(sites), explained)
+        return (second - mean.square()).clamp_min(0.0).sqrt()
 
     @cached_property
     def _forms(self) -> list[Float64[Tensor, "_pairs series"] | None]:
