@@ -102,7 +102,7 @@ def test_taking_rows_and_finding_them():
     assert few.nearest(few.points).tolist() == list(range(9))
     rows = table.nearest(few.points)
     torch.testing.assert_close(few.render(torch.arange(9)), table.render(rows))
-    torch.testing.assert_close(few.damping_at(torch.arange(9)), table.damping_at(rows))
+    torch.testing.assert_close(few.damping, table.damping[rows])
 
 
 def ball(count: int) -> torch.Tensor:

@@ -168,7 +168,7 @@ def test_modes_are_the_same_at_any_sample_rate(page: "Page", table: SampledField
     expected = synthesize(
         table.gains[4:5, kept],
         table.frequency[kept],
-        table.damping_at(torch.tensor([4]))[:, kept],
+        table.take(torch.tensor([4])).damping[..., kept],
         samples=samples,
         sample_rate=rate,
     )[0]

@@ -152,10 +152,6 @@ class SampledField:
             gains=self.gains[rows],
         )
 
-    def damping_at(self, rows: Int[Tensor, " chosen"]) -> Float64[Tensor, "chosen modes"]:
-        """Return the dampings at some points, 1/s."""
-        return self.damping.expand(len(rows), -1) if self.shared_damping else self.damping[rows]
-
     def render(
         self,
         rows: Int[Tensor, " contacts"],

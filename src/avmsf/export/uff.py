@@ -86,8 +86,7 @@ def response(
 
     Of sine exp(-d t) sin(w t) + cosine exp(-d t) cos(w t) it is (sine w + cosine (s + d)) / ((s + d)^2 + w^2).
     """
-    place = torch.tensor([row])
-    damping = field.damping_at(place)[0].numpy()
+    damping = (field.damping if field.shared_damping else field.damping[row]).numpy()
     turning = 2 * math.pi * field.frequency.numpy()
     gains = field.gains[row].to(torch.complex128).numpy()
     total = np.zeros(len(frequencies), dtype=np.complex128)

@@ -13,7 +13,6 @@ from avmsf.export.samples import write_grid
 from avmsf.export.uff import write_universal
 from avmsf.export.web import write_webpage
 from avmsf.export.writing import POINTS, SUFFIXES, Format, Written
-from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 
 _FORMATS: dict[str, Format] = {suffix: name for name, suffixes in SUFFIXES.items() for suffix in suffixes}
@@ -51,7 +50,7 @@ def write(
     limit = POINTS[kind] if contacts is None else contacts
     if kind == "web":
         return write_webpage(field, output, limit=limit, **options)
-    sampled = SampledField.of(field, points_on_object(field.gain_field), limit=limit)
+    sampled = SampledField.of(field, limit=limit)
     if kind == "wavs":
         options = {"contacts": len(sampled), **options}
     return WRITERS[kind](sampled, output, **options)
