@@ -4,29 +4,20 @@ import warnings
 from pathlib import Path
 
 import pytest
-import torch
-import trimesh
 
 from avmsf._utils import caching
 from avmsf._utils.files import write_whole
 from avmsf.errors import AvmsfWarning, FitError
-from avmsf.mesh.surface import Surface
-from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import BodyConfig
 from factories.raising import raises, warns
 
 
-@pytest.mark.slow
-def test_bodies_are_used_where_they_cannot_be_kept_and_the_cause_is_told_once(tmp_path: Path) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
-    surface = Surface(torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces).long())
+def test_where_nothing_can_be_kept_the_work_goes_on_and_the_cause_is_told_once(tmp_path: Path) -> None:
     blocked = tmp_path / "bodies"
     blocked.write_text("in the way")
     with warns(AvmsfWarning, file=blocked, value="File exists"):
-        [body] = candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, dofs=1200), cache=blocked).bodies
-    assert len(body.elastic) == 6
+        caching.keep_if_possible(lambda: write_whole(blocked / "kept", "a"), blocked / "kept")
     # A second warning would be an error here.
-    candidate_bodies(surface, BodyConfig(wall=0.0, shapes=6, dofs=1600), cache=blocked)
+    caching.keep_if_possible(lambda: write_whole(blocked / "other", "a"), blocked / "other")
 
 
 def test_what_is_wrong_with_the_work_itself_is_no_matter_of_the_disk(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(
         with monkeypatch.context() as patched:
             # Another thread that makes a file meanwhile would see the change.
             patched.setattr(os, "umask", lambda mask: changed.append(mask) or 0o027)
-            write_whole(tmp_path / "file", "words")
+            write_whole(tmp_path / "file", lambda place: place.write_text("words"))
             write_folder(tmp_path / "folder", {"inside": b""}, {})
     finally:
         os.umask(before)
