@@ -34,7 +34,7 @@ scattered at random, one disc in e^12 = 160,000 of that size has none."""
 
 
 class MeshAccess:
-    """Judges places by the triangles of a closed surface, or of an open one that is seen from outside."""
+    """Tests places by the triangles of a closed surface, or of an open one that is seen from outside."""
 
     def __init__(self, vertices: Float64[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:
         self._size, triangles = float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices[faces]
@@ -84,7 +84,7 @@ class MeshAccess:
 
 
 class PointAccess:
-    """Judges places by points all over a surface, where there are no triangles.
+    """Tests places by points all over a surface, where there are no triangles.
 
     Between points the surface is unknown, so the rod is thick enough to slip through none of it. A place on one side of
     a thinner wall can be struck if the other side can: the two are one.

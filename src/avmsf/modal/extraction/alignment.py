@@ -281,8 +281,8 @@ class _Fit:
     """Delays and what they make of the modes' phases."""
 
     delays: Float64[Tensor, " contacts"]
-    weights: Float64[Tensor, "contacts modes"]
-    """Concentrations of the doubled phases."""
+    turned: Complex128[Tensor, "contacts modes"]
+    """Concentrations of the doubled phases times exp(2 i phase), as delayed."""
     spread: Float64[Tensor, " modes"]
     prior: DelayPrior
     log_posterior: float
@@ -313,14 +313,13 @@ def _estimate(
         fit = max(fits, key=lambda each: each.log_posterior)
     else:
         fit = _climb(measured, DelayPrior(-earlier, _MAX_JITTER_SAMPLES), vague=vague)
-    turned = fit.weights * measured.doubled(fit.delays)
-    _, odds, _ = measured.search(fit.spread, turned.sum(0) - turned, fit.prior)
+    _, odds, _ = measured.search(fit.spread, fit.turned.sum(0) - fit.turned, fit.prior)
     agreement = odds.sigmoid()
     # The share that agrees is learned from all: without common phases single recordings may agree by chance.
     for _ in range(_MAX_ROUNDS):
         share = (agreement.sum() + 1) / (len(odds) + 2)
         agreement = (odds + share.logit()).sigmoid()
-    doubled = (agreement[:, None] * turned).sum(0)
+    doubled = (agreement[:, None] * fit.turned).sum(0)
     delays = fit.prior.median(fit.delays, agreement)
     return delays, agreement, Phases(measured.bank, doubled, measured.power, fit.spread, fit.prior.scale, 0.0)
 
@@ -363,7 +362,7 @@ def _climb(
     total = turned.sum(0)
     bend = (measured.turn.square() * (turned * total.conj()).real / total.abs().clamp_min(1e-300)).sum(1)
     share = float(occam_factor(prior, delays, bend).sum())
-    return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spreads, total) + share)
+    return _Fit(delays, turned, spread, prior, measured.log_likelihood(weights, spreads, total) + share)
 
 
 def _unmoved(measured: MeasuredPhases) -> _Fit:
@@ -372,6 +371,5 @@ def _unmoved(measured: MeasuredPhases) -> _Fit:
     for _ in range(_ROUNDS_OF_FIXED_JITTER):
         spread = measured.spread(measured.concentration(spread), delays, vague=_USUAL_RECORDINGS)
     weights = measured.concentration(spread)
-    total = (weights * measured.doubled(delays)).sum(0)
-    prior = DelayPrior(delays[:1], _MIN_JITTER_SAMPLES)
-    return _Fit(delays, weights, spread, prior, measured.log_likelihood(weights, spread, total))
+    turned, prior = weights * measured.doubled(delays), DelayPrior(delays[:1], _MIN_JITTER_SAMPLES)
+    return _Fit(delays, turned, spread, prior, measured.log_likelihood(weights, spread, turned.sum(0)))
