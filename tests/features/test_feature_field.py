@@ -31,11 +31,11 @@ def test_a_region_is_described_by_the_mean_of_its_points_features(dtype):
     points = box()
     features = torch.randn(200, 5, generator=torch.Generator().manual_seed(2), dtype=dtype)
     field = FeatureField(points, features, "anyone")
-    regions, labels = field.clusters(7), cluster(points, 7)[1]
+    (centers, descriptors), labels = field.clusters(7), cluster(points, 7)[1]
     for group in range(7):
         # Sums of some thirty numbers of unit size in float32.
-        torch.testing.assert_close(regions.descriptors[group], features[labels == group].mean(0), rtol=0, atol=1e-6)
-        torch.testing.assert_close(regions.centers[group], points[labels == group].mean(0), rtol=0, atol=1e-6)
+        torch.testing.assert_close(descriptors[group], features[labels == group].mean(0), rtol=0, atol=1e-6)
+        torch.testing.assert_close(centers[group], points[labels == group].mean(0), rtol=0, atol=1e-6)
 
 
 def test_position_features_know_neither_the_objects_place_nor_its_size():

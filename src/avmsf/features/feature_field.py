@@ -18,16 +18,6 @@ GEOMETRY = "geometry"
 
 
 @dataclass(frozen=True, eq=False)
-class Regions:
-    """Groups of neighboring points, each with one descriptor (paper, eq. 7)."""
-
-    centers: Float[Tensor, "clusters 3"]
-    """Means of the groups' points, meters."""
-    descriptors: Float[Tensor, "clusters dim"]
-    """Means of the groups' features."""
-
-
-@dataclass(frozen=True, eq=False)
 class FeatureField:
     """Points of an object, each with a feature vector."""
 
@@ -87,12 +77,11 @@ class FeatureField:
         """Return the features of the points nearest to the contacts."""
         return self.features[self.nearest(contacts)]
 
-    def clusters(self, count: int) -> Regions:
-        """Return `count` regions by k-means on the positions, with the mean feature of each (paper, eq. 7)."""
+    def clusters(self, count: int) -> tuple[Float[Tensor, "clusters 3"], Float[Tensor, "clusters dim"]]:
+        """Return the mean positions and features of `count` regions, by k-means on the positions (paper, eq. 7)."""
         centers, labels = cluster(self.points, count)
         sums = self.features.new_zeros(count, self.features.shape[1]).index_add_(0, labels, self.features)
-        sizes = torch.bincount(labels, minlength=count)
-        return Regions(centers.float(), sums / sizes[:, None])
+        return centers.float(), sums / torch.bincount(labels, minlength=count)[:, None]
 
 
 def reduce(features: FeatureField, dim: int) -> FeatureField:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from avmsf._utils.text import RecordError, count_of, like, record_of
 from avmsf.capture.impacts import rows_by_place
-from avmsf.features.feature_field import FeatureField, Regions
+from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import Directions, GainModel, Gains, Points
@@ -45,17 +45,17 @@ class AttentionGains(TrainableGains, GainModel):
         gain_scale: Float[Tensor, " modes"],
         shape: AttentionShape,
         generator: torch.Generator,
-        regions: Regions | None = None,
+        regions: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         """Build an untrained network whose gains are about `gain_scale` in size, mode by mode, in float32.
 
-        `regions` are the features' clusters where they have been found before.
+        `regions` are the centers and descriptors of the features' clusters where they have been found before.
         """
         super().__init__()
-        regions = features.clusters(shape.clusters) if regions is None else regions
+        centers, descriptors = features.clusters(shape.clusters) if regions is None else regions
         self.shape, self.encoder = shape, features.encoder
         self.points, self.features = nn.Buffer(features.points.float()), nn.Buffer(features.features.float())
-        self.centers, self.descriptors = nn.Buffer(regions.centers.float()), nn.Buffer(regions.descriptors.float())
+        self.centers, self.descriptors = nn.Buffer(centers.float()), nn.Buffer(descriptors.float())
         self.gain_scale = nn.Buffer(gain_scale.float())
         dim, modes = features.features.shape[1], len(gain_scale)
         sizes = [shape.width + dim] + [shape.hidden] * shape.layers
@@ -152,7 +152,7 @@ class AttentionGains(TrainableGains, GainModel):
                 gain_scale=torch.empty(modes),
                 shape=shape,
                 generator=torch.Generator(device="cpu"),
-                regions=Regions(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim)),
+                regions=(torch.empty(shape.clusters, 3), torch.empty(shape.clusters, dim)),
             )
 
 
