@@ -1,17 +1,23 @@
-"""Bodies held at a face, an edge or a point."""
+"""Bodies that are held at patches of their surface."""
 
 import math
 
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 
-from avmsf.fem.elastic_modes import elastic_modes
+from avmsf.errors import SimulationError
+from avmsf.fem.elastic_modes import HeldModes, elastic_modes
 from avmsf.fem.elements import SecondOrder
-from avmsf.fem.material import NOMINAL
+from avmsf.fem.material import NOMINAL, Material
 from avmsf.fem.solid import Solid
-from avmsf.fem.supports import supports_of
+from avmsf.fem.supports import Patch, Support, patches_of
+from factories.raising import raises
 from oracles.block import block
+
+RIGID = 1e12
+LOWEST = Patch("its lowest part", (0.0, 0.0, -1.0))
 
 
 def standing(solid: Solid) -> Solid:
@@ -22,39 +28,103 @@ def standing(solid: Solid) -> Solid:
 def test_a_bar_held_at_its_lower_end_is_a_cantilever():
     length, height, width = 0.2, 0.005, 0.008
     solid = standing(block((length, height, width), (16, 1, 1)))
-    mesh = SecondOrder.of(solid)
-    [support] = supports_of(mesh)
-    assert support.name == "held at its lowest point"
-    modes = elastic_modes(solid, NOMINAL, count=4, fixed=support.nodes(mesh))
+    modes = elastic_modes(solid, NOMINAL, count=4, support=Support((LOWEST,), RIGID))
     speed = math.sqrt(NOMINAL.young / NOMINAL.density)
     # 1 + cosh x cos x = 0 at x = 1.8751, for bending in the plane of either side.
     expected = [1.8751**2 / (2 * math.pi) * speed * side / math.sqrt(12) / length**2 for side in (height, width)]
     assert modes.frequency[:2].tolist() == pytest.approx(expected, rel=0.02)
-    lower = modes.nodes[:, 2] < 1e-6
-    assert float(modes.shapes[lower].abs().max()) == 0.0
+
+
+def springed_beam(ratio: float) -> list[float]:
+    """Wave numbers times length of a beam between two springs, each `ratio` times as stiff as E I / length^3.
+
+    The textbook's boundary conditions at both ends: no moment, and a shear that is the spring's force.
+    """
+
+    def determinant(x: float) -> float:
+        rows = []
+        for place, sign in ((0.0, 1.0), (x, -1.0)):
+            c, s, ch, sh = math.cos(place), math.sin(place), math.cosh(place), math.sinh(place)
+            shape, moment, shear = np.array([c, s, ch, sh]), np.array([-c, -s, ch, sh]), np.array([s, -c, sh, ch])
+            rows += [moment, x**3 * shear + sign * ratio * shape]
+        return float(np.linalg.det(np.array(rows) / np.cosh(x)))
+
+    grid = np.linspace(0.3, 12.0, 2000)
+    values = [determinant(x) for x in grid]
+    return [brentq(determinant, *grid[k : k + 2]) for k in range(len(grid) - 1) if values[k] * values[k + 1] < 0]
+
+
+@pytest.mark.parametrize("ratio", [3.0, 100.0, 3000.0])
+def test_a_beam_on_two_springs_has_the_textbooks_frequencies(ratio: float):
+    length, width, height = 0.3, 0.012, 0.003
+    solid = block((length, width, height), (30, 2, 1))
+    stiffness = ratio * NOMINAL.young * width * height**3 / 12 / length**3
+    ends = tuple(Patch(name, (way, 0.0, 0.0)) for name, way in (("left", -1.0), ("right", 1.0)))
+    modes = elastic_modes(solid, NOMINAL, count=24, support=Support(ends, stiffness))
+    middle = torch.tensor([[0.5 * length, 0.5 * width, 0.0]], dtype=torch.float64)
+    line = middle + torch.linspace(-0.5, 0.5, 31, dtype=torch.float64)[:, None] * torch.tensor([length, 0.0, 0.0])
+    along = modes.at(line).abs().amax(0)
+    flexural = modes.frequency[along[:, 2] > 0.5 * modes.shapes.abs().amax((0, 2))]
+    bending = math.sqrt(NOMINAL.young * height**2 / 12 / NOMINAL.density) / (2 * math.pi * length**2)
+    expected = [x**2 * bending for x in springed_beam(ratio)[:4]]
+    assert flexural[:4].tolist() == pytest.approx(expected, rel=0.02)
+
+
+def test_a_body_on_a_soft_patch_bounces_as_a_rigid_one():
+    solid = block((0.04, 0.03, 0.02), (4, 3, 2))
+    stiffness = 100.0
+    modes = elastic_modes(solid, NOMINAL, count=6, support=Support((LOWEST,), stiffness))
+    bounce = math.sqrt(stiffness / (NOMINAL.density * 0.04 * 0.03 * 0.02)) / (2 * math.pi)
+    assert float((modes.frequency / bounce - 1).abs().min()) < 1e-3
+
+
+def test_a_clamped_square_plate_has_leissas_frequencies():
+    side, height = 0.2, 0.002
+    steel = Material(NOMINAL.density, NOMINAL.young, 0.3, *list(vars(NOMINAL).values())[3:])
+    clamped = Support((Patch("a side", (0.0, 1.0, 0.0)),), RIGID)
+    modes = elastic_modes(block((side, side, height), (14, 14, 1)), steel, count=5, support=clamped)
+    rigidity = steel.young * height**3 / 12 / (1 - 0.3**2)
+    unit = math.sqrt(rigidity / (steel.density * height)) / (2 * math.pi * side**2)
+    # Leissa, Journal of Sound and Vibration 31, 1973: a square plate with one side clamped, Poisson's ratio .3.
+    assert (modes.frequency / unit).tolist() == pytest.approx([3.4917, 8.5246, 21.429, 27.331, 31.111], rel=0.03)
+
+
+@pytest.mark.parametrize(("ratio", "error"), [(1e-3, 1e-4), (0.3, 3e-3), (1e3, 0.03)])
+def test_the_basis_of_free_and_attachment_modes_has_the_held_bodys_modes(ratio: float, error: float):
+    solid = block((0.2, 0.03, 0.004), (16, 3, 1))
+    held = HeldModes(solid, NOMINAL, count=24)
+    support = Support(held.basis.patches[:2], ratio * held.basis.unit)
+    found, true = held.on(support), elastic_modes(solid, NOMINAL, count=24, support=support)
+    assert found.frequency[:16].tolist() == pytest.approx(true.frequency[:16].tolist(), rel=error)
+    overlap = torch.einsum("nmd,nmd->m", found.shapes[:, :8], true.shapes[:, :8]).abs()
+    norms = found.shapes[:, :8].square().sum((0, 2)) * true.shapes[:, :8].square().sum((0, 2))
+    assert float((overlap / norms.sqrt()).min()) > 0.99
+
+
+def test_the_basis_of_a_free_body_is_the_free_body():
+    solid = block((0.1, 0.03, 0.004), (8, 3, 1))
+    free = elastic_modes(solid, NOMINAL, count=12)
+    assert HeldModes(solid, NOMINAL, count=12).free.frequency.tolist() == pytest.approx(free.frequency.tolist())
+
+
+def test_a_patch_that_is_not_of_the_basis_is_refused():
+    held = HeldModes(block((0.1, 0.03, 0.004), (4, 2, 1)), NOMINAL, count=4)
+    with raises(SimulationError, name="patches", value="the moon"):
+        held.on(Support((Patch("the moon", (0.0, 0.0, 1.0)),), 1.0))
 
 
 def test_a_lying_plate_may_be_held_along_each_of_its_sides():
     mesh = SecondOrder.of(block((0.24, 0.16, 0.003), (12, 8, 1)))
-    found = supports_of(mesh)
+    sides = [mesh.nodes[patch.nodes(mesh)] for patch in patches_of(mesh)]
     # Not at its face, which is half of it.
-    assert [each.name for each in found] == [f"held along lower edge {number}" for number in range(1, 5)]
-    sides = [mesh.nodes[each.nodes(mesh)] for each in found]
-    assert [round(float(np.ptp(side[:, :2], axis=0).max()), 6) for side in sides] == [0.24, 0.24, 0.16, 0.16]
+    assert sorted(round(float(np.ptp(side[:, :2], axis=0).max()), 6) for side in sides) == [0.16, 0.16, 0.24, 0.24]
     assert all(np.ptp(side[:, :2], axis=0).min() < 0.01 for side in sides)
 
 
-def test_a_cone_on_its_tip_is_held_at_a_point():
+def test_a_cone_on_its_tip_may_be_held_at_its_tip():
     flat = block((1.0, 1.0, 1.0), (4, 4, 4))
     points = flat.points.clone()
     points[:, :2] = (points[:, :2] - 0.5) * (0.05 + points[:, 2:])
-    [support] = supports_of(SecondOrder.of(Solid.build(points, flat.cells)))
-    assert support.name == "held at its lowest point"
-
-
-def test_a_body_that_turns_about_its_support_has_no_mode_at_zero():
-    solid = block((0.1, 0.02, 0.01), (6, 2, 1))
-    edge = np.flatnonzero((SecondOrder.of(solid).nodes[:, [0, 2]] == 0).all(axis=1))
-    frequency = elastic_modes(solid, NOMINAL, count=4, fixed=edge).frequency
-    assert bool(torch.isfinite(frequency).all())
-    assert float(frequency[0]) > 100.0
+    mesh = SecondOrder.of(Solid.build(points, flat.cells))
+    tip = next(patch for patch in patches_of(mesh) if patch.name == "its lowest part")
+    assert float(np.ptp(mesh.nodes[tip.nodes(mesh)], axis=0).max()) < 0.1

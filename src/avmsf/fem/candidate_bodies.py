@@ -32,13 +32,12 @@ from avmsf.fem.body_meshes import (
     shape_solid,
     wall_solids,
 )  # fmt: skip
-from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
+from avmsf.fem.elastic_modes import ElasticModes, HeldModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
-from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import MAX_FREQUENCY_ERROR, NOMINAL, Material
 from avmsf.fem.meshing import CheckedSurface, checked, millimeters
 from avmsf.fem.solid import Solid
-from avmsf.fem.supports import Support, supports_of
+from avmsf.fem.supports import Support
 from avmsf.mesh.surface import Surface
 
 Supports = Literal["auto", "free", "try"]
@@ -92,7 +91,7 @@ def body_name(thickness: float | None) -> str:
 class CandidateBodies:
     """Bodies of which each is a hypothesis; by themselves those that are known, as `SurfaceBodies` those of a surface.
 
-    `refined`, `supported` and `with_thickness` compute more of them, where that can be done.
+    `refined`, `held` and `with_thickness` compute more of them, where that can be done.
     """
 
     bodies: tuple[CandidateBody, ...]
@@ -112,9 +111,9 @@ class CandidateBodies:
         """Return a body with finer elements; itself where it is fine already or that fails."""
         return body
 
-    def supported(self, body: CandidateBody) -> Sequence[CandidateBody]:
-        """Return a free body and, of the same elements, with each support; nothing where they cannot be computed."""
-        return ()
+    def held(self, body: CandidateBody) -> HeldModes | None:
+        """Return the modes of a body on any support, with few elements; None where they cannot be computed."""
+        return None
 
     def with_thickness(self, thickness: float) -> CandidateBody | None:
         """Return the body with a wall of a thickness, meters; None where that fails."""
@@ -231,28 +230,17 @@ class SurfaceBodies(CandidateBodies):
             self._log(f"{body.name}: using the coarse mesh: {error}")
             return body
 
-    def supported(self, body: CandidateBody) -> Sequence[CandidateBody]:
-        """Return a free body, and held where an object may be: at its lowest face or point, or an edge.
+    def held(self, body: CandidateBody) -> HeldModes | None:
+        """Return the modes of a body on any support; None where they cannot be computed.
 
-        All have the same tetrahedra, few enough to choose by; `refined` makes the chosen one fine, without a check of
-        its convergence. Those whose modes cannot be computed are left out, and `log` is called with the reason; none
-        are returned if the free one's cannot.
+        Of tetrahedra that are few enough to choose by; `refined` makes the chosen body fine, without a check of its
+        convergence. `log` is called with the reason for None.
         """
-        few, fine = self._coarse_dofs, self.dofs <= self._coarse_dofs
         try:
-            supports = supports_of(SecondOrder.of(self.solid(body.thickness, few)))
-            free = self.modes(body.thickness, dofs=few, perturbed=fine)
+            return HeldModes(self.solid(body.thickness, self._coarse_dofs), self._material, count=self._count)
         except SimulationError as error:
             self._log(f"{body.name}: no supports tested: {error}")
-            return []
-        bodies = [CandidateBody(body.thickness, free, fine)]
-        for support in supports:
-            try:
-                held = self.modes(body.thickness, dofs=few, support=support, perturbed=fine)
-                bodies.append(CandidateBody(body.thickness, held, fine, support))
-            except SimulationError as error:
-                self._log_refused(f"{body.name}, {support.name}: {error}")
-        return bodies
+            return None
 
     def with_thickness(self, thickness: float) -> CandidateBody | None:
         """Return the body with a wall of this thickness, meters, coarse as of several; None if that fails.
@@ -359,9 +347,8 @@ class SurfaceBodies(CandidateBodies):
             solid = self.solid(thickness, dofs)
             size = count_dofs(solid)
             self._log(f"{self._count} elastic modes of {size} degrees of freedom")
-            fixed = None if support is None else support.nodes(SecondOrder.of(solid))
             try:
-                return elastic_modes(solid, self._material, count=self._count, fixed=fixed, perturbed=perturbed)
+                return elastic_modes(solid, self._material, count=self._count, support=support, perturbed=perturbed)
             except MemoryError as error:
                 wanted = f"enough memory for {size} degrees of freedom"
                 advice = f"use {max(dofs // 2, MIN_DOFS)} (--set body.dofs=N), or close other programs"

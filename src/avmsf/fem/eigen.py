@@ -51,8 +51,8 @@ def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_
         motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arms)
     flat = motions.reshape(-1, _RIGID)
     # The turns are lengths and the shifts are not, so each is scaled before they are made orthogonal.
-    flat /= np.sqrt((flat * _times(mass, flat)).sum(axis=0))
-    lower = np.linalg.cholesky(flat.T @ _times(mass, flat))
+    flat /= np.sqrt((flat * times(mass, flat)).sum(axis=0))
+    lower = np.linalg.cholesky(flat.T @ times(mass, flat))
     return scipy.linalg.solve_triangular(lower, flat.T, lower=True).T
 
 
@@ -107,6 +107,28 @@ def lowest_vibrations(
     if wanted + 2 * _RIGID > dofs:
         least, advice = f"{wanted // 3 + 5} or more for {count} modes", "ask for fewer modes or a finer detail"
         raise SimulationError.expected(least, dofs // 3, name="nodes", advice=advice)
+    solve = factorize(stiffness, mass, shift=shift)
+    weighted = times(mass, rigid)
+
+    def respond(forces: np.ndarray) -> np.ndarray:
+        moved = solve(forces)
+        return moved if supported else moved - rigid @ (weighted.T @ moved)
+
+    responses, shapes = _largest_responses(respond, mass, wanted)
+    squares = 1.0 / responses - shift
+    if supported:
+        elastic = ((weighted.T @ shapes) ** 2).sum(axis=0) < 0.5
+        squares, shapes = squares[elastic][:count], shapes[:, elastic][:, :count]
+    return Vibrations(squares, shapes * _signs(shapes))
+
+
+def factorize(
+    stiffness: scipy.sparse.sparray, mass: scipy.sparse.csr_array, *, shift: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function from forces [dofs, columns] to the motions that stiffness + shift x mass answers with.
+
+    Raises SimulationError where cells have such bad form that there is none.
+    """
     heavy = scipy.sparse.kron(mass, scipy.sparse.eye_array(3), format="csc")
     try:
         factored = splu(
@@ -118,18 +140,7 @@ def lowest_vibrations(
         raise SimulationError.expected(
             "an invertible matrix", got=str(error), name="stiffness", advice=advice
         ) from error
-    weighted = _times(mass, rigid)
-
-    def respond(forces: np.ndarray) -> np.ndarray:
-        moved = factored.solve(np.asfortranarray(forces))
-        return moved if supported else moved - rigid @ (weighted.T @ moved)
-
-    responses, shapes = _largest_responses(respond, mass, wanted)
-    squares = 1.0 / responses - shift
-    if supported:
-        elastic = ((weighted.T @ shapes) ** 2).sum(axis=0) < 0.5
-        squares, shapes = squares[elastic][:count], shapes[:, elastic][:, :count]
-    return Vibrations(squares, shapes * _signs(shapes))
+    return lambda forces: factored.solve(np.asfortranarray(forces))
 
 
 def _largest_responses(
@@ -145,13 +156,13 @@ def _largest_responses(
     basis = np.empty((dofs, longest + _BLOCK), order="F")
     band = np.zeros((longest + _BLOCK, longest + _BLOCK))
     drawn = np.random.default_rng(0).standard_normal((dofs, min(_BLOCK, dofs)))
-    block, _ = _orthonormal(respond(drawn), mass, basis[:, :0])
+    block, _ = orthonormal(respond(drawn), mass, basis[:, :0])
     begin, end = 0, block.shape[1]
     basis[:, :end] = block
     while True:
-        moved = respond(_times(mass, basis[:, begin:end]))
-        band[:end, begin:end] = basis[:, :end].T @ _times(mass, moved)
-        block, rest = _orthonormal(moved, mass, basis[:, :end])
+        moved = respond(times(mass, basis[:, begin:end]))
+        band[:end, begin:end] = basis[:, :end].T @ times(mass, moved)
+        block, rest = orthonormal(moved, mass, basis[:, :end])
         size = block.shape[1]
         if end >= wanted or not size:
             values, vectors = np.linalg.eigh(band[:end, :end], UPLO="U")
@@ -166,18 +177,20 @@ def _largest_responses(
         begin, end = end, end + size
 
 
-def _orthonormal(motions: np.ndarray, mass: scipy.sparse.csr_array, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def orthonormal(
+    motions: np.ndarray, mass: scipy.sparse.csr_array, basis: np.ndarray, *, least: float = 1e-12
+) -> tuple[np.ndarray, np.ndarray]:
     """Return motions without their part in the basis, mass-normalized and orthogonal, and what makes them of those.
 
-    Directions in which nothing is left are left out.
+    Directions in which less than `least` of the largest is left are left out.
     """
-    scale = np.sqrt((motions * _times(mass, motions)).sum(axis=0).max())
+    scale = np.sqrt((motions * times(mass, motions)).sum(axis=0).max())
     made = np.eye(motions.shape[1])
     # The second time mends what rounding left of the first.
     for _ in range(2):
-        motions = motions - basis @ (basis.T @ _times(mass, motions))
-        squares, turned = np.linalg.eigh(motions.T @ _times(mass, motions))
-        kept = squares > (1e-12 * scale) ** 2
+        motions = motions - basis @ (basis.T @ times(mass, motions))
+        squares, turned = np.linalg.eigh(motions.T @ times(mass, motions))
+        kept = squares > (least * scale) ** 2
         length = np.sqrt(squares[kept])
         motions = motions @ (turned[:, kept] / length)
         made = (length[:, None] * turned[:, kept].T) @ made
@@ -185,7 +198,7 @@ def _orthonormal(motions: np.ndarray, mass: scipy.sparse.csr_array, basis: np.nd
     return motions, made
 
 
-def _times(mass: scipy.sparse.csr_array, vectors: np.ndarray) -> np.ndarray:
+def times(mass: scipy.sparse.csr_array, vectors: np.ndarray) -> np.ndarray:
     """Return the mass matrix, the same for all three components, times one vector or several."""
     spread = np.ascontiguousarray(vectors).reshape(mass.shape[0], -1)
     return (mass @ spread).reshape(vectors.shape)

@@ -17,11 +17,10 @@ from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
 from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.fem.solid import Solid
+from avmsf.fem.supports import Support, SupportBasis, patches_of
 from avmsf.mesh.closest_point import Closest, ClosestPoints
 from avmsf.mesh.surface import Surface, surface_points
 
-_PENDULUM = 1e-9
-"""Squared frequency over the largest, below which a body turns about the nodes that it is held at: rounding alone."""
 RELATIVE_SHIFT = 1e-5
 """Shift of the eigenvalues over E / (density size^2), which is a tenth of the squared angular frequency of a bar."""
 
@@ -125,7 +124,7 @@ def elastic_modes(
     stiffness_factor: Float[Tensor, " cells"] | None = None,
     density_factor: Float[Tensor, " cells"] | None = None,
     springs: Sequence[tuple[Float[Tensor, " 3"], float]] | None = None,
-    fixed: Int[np.ndarray, " fixed"] | None = None,
+    support: Support | None = None,
     perturbed: bool = False,
 ) -> ElasticModes:
     """Return the lowest `count` elastic modes of a body by second-order finite elements.
@@ -134,8 +133,8 @@ def elastic_modes(
     on its surface and their stiffness in newtons per meter, the same in all directions. A free body's six rigid
     motions are no modes of it. On soft springs they are slow modes, and every mode that has more than half of its
     kinetic energy in a rigid motion is left out. Springs so stiff that the body bends before it moves as a whole
-    leave no such mode, and then none is left out. `fixed` names nodes of `SecondOrder.of(solid)` that do not move. With
-    `perturbed` the modes come with the first-order changes of their matrices, for a body without factors.
+    leave no such mode, and then none is left out. On a `support` they are modes like all others. With `perturbed` the
+    modes come with the first-order changes of their matrices, for a body without factors.
 
     Raises SimulationError for a body of several parts or too few nodes, and factors and springs that are not positive.
     """
@@ -153,11 +152,40 @@ def elastic_modes(
     if springs:
         forces = forces + _support(mesh, springs)
     shift = RELATIVE_SHIFT * material.young / (material.density * solid.size**2)
-    if fixed is None:
-        rigid = rigid_motions(mesh.nodes, weights)
-        found = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=bool(springs))
-    else:
-        found = _vibrations_of_free_nodes(forces, weights, fixed, count=count, shift=shift)
+    if support is not None:
+        forces = forces + support.springs(mesh)
+    rigid = rigid_motions(mesh.nodes, weights)
+    found = lowest_vibrations(
+        forces, weights, rigid if support is None else np.zeros_like(rigid), count=count, shift=shift,
+        supported=bool(springs) or support is not None,
+    )  # fmt: skip
+    return _on_surface(mesh, found, material, float((solid.volumes * light).sum()) * material.density, perturbed)
+
+
+class HeldModes:
+    """The modes of a body on any support, of one computation of its free ones."""
+
+    def __init__(self, solid: Solid, material: Material, *, count: int = 64) -> None:
+        """Compute the free modes and the responses to forces on `patches_of` the body. Raises as `elastic_modes`."""
+        solid.expect_connected()
+        self._mesh, self._material = SecondOrder.of(solid), material
+        density = torch.full((len(solid.cells),), material.density, dtype=torch.float64)
+        weights = mass(self._mesh, density)
+        forces = stiffness(self._mesh, material, torch.ones_like(density))
+        rigid = rigid_motions(self._mesh.nodes, weights)
+        shift = RELATIVE_SHIFT * material.young / (material.density * solid.size**2)
+        free = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=False)
+        self._mass = float(solid.volumes.sum()) * material.density
+        self.free = _on_surface(self._mesh, free, material, self._mass, False)
+        self.basis = SupportBasis(self._mesh, forces, weights, free, rigid, patches_of(self._mesh))
+
+    def on(self, support: Support) -> ElasticModes:
+        """Return the lowest modes on a support of some of the basis' patches."""
+        return _on_surface(self._mesh, self.basis.held(support), self._material, self._mass, False)
+
+
+def _on_surface(mesh: SecondOrder, found: Vibrations, material: Material, mass: float, perturbed: bool) -> ElasticModes:
+    """Return vibrations as they are seen on the body's surface."""
     whole = found.shapes.reshape(len(mesh.nodes), 3, -1)
     outer, triangles = mesh.surface
     return ElasticModes(
@@ -166,27 +194,9 @@ def elastic_modes(
         triangles=torch.from_numpy(triangles),
         shapes=torch.from_numpy(np.ascontiguousarray(whole[outer].transpose(0, 2, 1))),
         material=material,
-        mass=float((solid.volumes * light).sum()) * material.density,
+        mass=mass,
         perturbations=perturbations(mesh, whole, material) if perturbed else None,
     )
-
-
-def _vibrations_of_free_nodes(
-    forces: scipy.sparse.sparray, weights: scipy.sparse.csr_array, fixed: Int[np.ndarray, " fixed"], *, count: int,
-    shift: float,
-) -> Vibrations:  # fmt: skip
-    """Return the lowest vibrations of a body some of whose nodes do not move."""
-    nodes = weights.shape[0]
-    free = np.setdiff1d(np.arange(nodes), fixed)
-    moving = (3 * free[:, None] + np.arange(3)).ravel()
-    forces, weights = forces.tocsr()[moving][:, moving], weights[free][:, free]
-    # A cantilever's lowest mode is mostly a turn, and yet none of a rigid body.
-    rigid = np.zeros((len(moving), 6))
-    found = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=True)
-    bending = found.squares > _PENDULUM * found.squares.max()
-    shapes = np.zeros((3 * nodes, int(bending.sum())))
-    shapes[moving] = found.shapes[:, bending]
-    return Vibrations(found.squares[bending], shapes)
 
 
 def _support(mesh: SecondOrder, springs: Sequence[tuple[Tensor, float]]) -> scipy.sparse.csr_array:

@@ -16,9 +16,9 @@ from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, body_name
-from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.elastic_modes import ElasticModes, HeldModes
 from avmsf.fem.material import largest_factor
-from avmsf.fem.supports import FREE, FREE_PRIOR
+from avmsf.fem.supports import FREE, FREE_PRIOR, STIFFNESS_RATIOS, Patch, Support
 from avmsf.fem.thickness import search_thickness
 from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModelName
@@ -134,7 +134,8 @@ class MixtureEstimator(GainEstimator):
         found = self._refined(fit, bodies)
         judgment = fit.assess(found)
         if found.best is not None and self.bodies is not None and self._may_be_held(judgment):
-            held = fit.more_probable(others(fit.sites, judgment.rows), self.bodies.supported(found.best))
+            modes = self.bodies.held(found.best)
+            held = None if modes is None else fit.held(others(fit.sites, judgment.rows), found.best, modes)
             if held is not None:
                 # All modes have the support in common, so free bodies are no hypotheses any more.
                 found = self._refined(fit, [held])
@@ -320,20 +321,41 @@ class _Fit:
         elastic = (WeighedFamily.of(self.elastic(rows, body.elastic), measured) for body in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
 
-    def more_probable(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> CandidateBody | None:
-        """Return the most probable held body by the evidence of all modes, or None where the first, free, is the best.
+    def support(self, rows: Int[Tensor, " rows"], modes: HeldModes) -> Support | None:
+        """Return the most probable support by the evidence of the gains of all modes; None for a free body.
 
-        Where both bodies are far from the object, evidence between them means little: the held one also has to predict
-        contacts left out surely better.
+        Forward selection: patches are added one at a time, all of one stiffness, while the posterior probability grows,
+        the second whether or not the first alone is more probable than none. Supports of a number of patches share
+        the probability of being held alike.
         """
-        if len(bodies) < 2:
-            return None
-        free, *held = self.evidence(rows, bodies)
-        best = max(range(len(held)), key=held.__getitem__)
-        if held[best] - free <= math.log(FREE_PRIOR / (1.0 - FREE_PRIOR) * len(held)):
-            return None
-        new, old = (self(rows, [body]).model.leave_one_out() for body in (bodies[1 + best], bodies[0]))
-        return bodies[1 + best] if predicts_better(new, old, self.measured.take(rows), candidates=len(held)) else None
+        patches, unit = modes.basis.patches, modes.basis.unit
+        families = self.families(rows)
+        measured = self.measured.take(rows)
+        others = [WeighedFamily.of(each, measured) for each in families]
+
+        def probability(elastic: ElasticModes, count: int) -> float:
+            evidence = total_evidence([*others, WeighedFamily.of(self.elastic(rows, elastic), measured)], measured)
+            ways = math.comb(len(patches), count) * len(STIFFNESS_RATIOS) * len(patches)
+            return evidence + math.log((1.0 - FREE_PRIOR) / ways if count else FREE_PRIOR)
+
+        best: Support | None = None
+        held: tuple[Patch, ...] = ()
+        highest = probability(modes.free, 0)
+        while len(held) < len(patches):
+            tried = [
+                Support((*held, patch), ratio * unit)
+                for patch in patches
+                if patch not in held
+                for ratio in STIFFNESS_RATIOS
+            ]
+            values = [probability(modes.on(each), len(each.patches)) for each in tried]
+            first = max(range(len(tried)), key=values.__getitem__)
+            if values[first] > highest:
+                best, highest = tried[first], values[first]
+            elif held:
+                break
+            held = tried[first].patches
+        return best
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
