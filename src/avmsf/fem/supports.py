@@ -23,9 +23,9 @@ from avmsf.fem.elements import SecondOrder
 FREE = "free"
 FREE_PRIOR = 0.7
 """Probability that an object is free; recordings are meant to be made so. The supports share the rest."""
-STIFFNESS_RATIOS = (0.03, 0.3, 1000.0)
-"""Stiffness of a patch that is tried, over the body's mass times its mean squared angular frequency: soft, a hand or a
-clamp, and rigid."""
+STIFFNESS_RATIOS = (0.03, 0.003, 0.3, 1000.0)
+"""Stiffness of a patch over the body's mass times its mean squared angular frequency: that of a clamp on a measured
+strip, which supports are compared at first, a softer one, a stiffer one, and one that is rigid."""
 _HELD_DISTANCE = 0.01
 """Distance from the extreme plane, over the body's size, within which nodes belong to a patch."""
 _MAX_HELD_RATIO = 0.3

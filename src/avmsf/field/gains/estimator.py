@@ -3,9 +3,11 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
+from itertools import combinations
+from operator import itemgetter
 from typing import Any
 
 import torch
@@ -324,38 +326,32 @@ class _Fit:
     def support(self, rows: Int[Tensor, " rows"], modes: HeldModes) -> Support | None:
         """Return the most probable support by the evidence of the gains of all modes; None for a free body.
 
-        Forward selection: patches are added one at a time, all of one stiffness, while the posterior probability grows,
-        the second whether or not the first alone is more probable than none. Supports of a number of patches share
-        the probability of being held alike.
+        All patches and all pairs of them are tried at one stiffness, then the best with one patch more for as long as
+        that is more probable, then other stiffnesses. Numbers of patches share the probability of being held alike.
         """
-        patches, unit = modes.basis.patches, modes.basis.unit
-        families = self.families(rows)
-        measured = self.measured.take(rows)
-        others = [WeighedFamily.of(each, measured) for each in families]
+        patches, unit, measured = modes.basis.patches, modes.basis.unit, self.measured.take(rows)
+        others = [WeighedFamily.of(each, measured) for each in self.families(rows)]
 
-        def probability(elastic: ElasticModes, count: int) -> float:
-            evidence = total_evidence([*others, WeighedFamily.of(self.elastic(rows, elastic), measured)], measured)
-            ways = math.comb(len(patches), count) * len(STIFFNESS_RATIOS) * len(patches)
-            return evidence + math.log((1.0 - FREE_PRIOR) / ways if count else FREE_PRIOR)
+        def weighed(patches_held: Iterable[Patch], ratio: float) -> tuple[float, Support]:
+            support = Support(tuple(patches_held), ratio * unit)
+            ways = math.comb(len(patches), len(support.patches)) * len(patches) * len(STIFFNESS_RATIOS)
+            return evidence(modes.on(support)) + math.log((1.0 - FREE_PRIOR) / ways), support
 
-        best: Support | None = None
-        held: tuple[Patch, ...] = ()
-        highest = probability(modes.free, 0)
-        while len(held) < len(patches):
-            tried = [
-                Support((*held, patch), ratio * unit)
-                for patch in patches
-                if patch not in held
-                for ratio in STIFFNESS_RATIOS
-            ]
-            values = [probability(modes.on(each), len(each.patches)) for each in tried]
-            first = max(range(len(tried)), key=values.__getitem__)
-            if values[first] > highest:
-                best, highest = tried[first], values[first]
-            elif held:
+        def evidence(elastic: ElasticModes) -> float:
+            return total_evidence([*others, WeighedFamily.of(self.elastic(rows, elastic), measured)], measured)
+
+        def best(tried: Iterable[tuple[float, Support]]) -> tuple[float, Support]:
+            return max(tried, key=itemgetter(0))
+
+        typical, *ratios = STIFFNESS_RATIOS
+        found = best(weighed(each, typical) for count in (1, 2) for each in combinations(patches, count))
+        while others_left := [patch for patch in patches if patch not in found[1].patches]:
+            more = best(weighed((*found[1].patches, patch), typical) for patch in others_left)
+            if more[0] <= found[0]:
                 break
-            held = tried[first].patches
-        return best
+            found = more
+        found = best([found, *(weighed(found[1].patches, ratio) for ratio in ratios)])
+        return found[1] if found[0] > evidence(modes.free) + math.log(FREE_PRIOR) else None
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
