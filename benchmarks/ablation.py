@@ -8,26 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
-from torch import Tensor
 
-from avmsf.capture import Impacts
 from avmsf.evaluation.objects import roughened
 from avmsf.evaluation.splits import split
-from avmsf.features.feature_field import FeatureField
-from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
-from avmsf.fem.elements import SecondOrder
+from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, STEEL
-from avmsf.fem.supports import supports_of
-from avmsf.field.config import FitConfig
-from avmsf.field.gains.data import GainData
+from avmsf.fem.supports import Patch, Support
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
 from avmsf.field.gains.kernels import Smooth, ThinPlate
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
@@ -36,6 +27,7 @@ from avmsf.simulate.shapes import make_shape
 from benchmarks.report import Options, Report, Table, log
 from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
 from tests.oracles.block import block
+from tests.oracles.known_gains import known_gains
 
 DEFAULT = "default"
 _ALONE = tuple(f"{kind} alone" for kind in FAMILIES)
@@ -165,18 +157,16 @@ def supports(options: Options) -> Report:
     figures = {}
     mug = make_shape("mug", size=0.1, wall=0.003)
     objects = (
-        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, "held along lower edge 3"),
-        ("mug", mug.solid, CERAMIC, "held at its lowest face"),
+        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, Patch("a short side", (-1.0, 0.0, 0.0))),
+        ("mug", mug.solid, CERAMIC, Patch("its base", (0.0, 0.0, -1.0))),
     )
-    for kind, solid, material, place in objects[: 1 if options.quick_look else None]:
-        mesh = SecondOrder.of(solid)
-        [held] = [each for each in supports_of(mesh) if each.name == place]
+    for kind, solid, material, patch in objects[: 1 if options.quick_look else None]:
+        held = Support((patch,), 1e10)
         along = solid.points[solid.cells].mean(1)[:, 0] / solid.size
         uneven = 1 + 0.1 * torch.sin(2 * torch.pi * along).double()
         for support in (None, held):
-            fixed = None if support is None else support.nodes(mesh)
-            true = elastic_modes(solid, material, count=30, stiffness_factor=uneven, fixed=fixed)
-            case, points, ways = _gains_of(true)
+            true = elastic_modes(solid, material, count=30, stiffness_factor=uneven, support=support)
+            case, points, ways = known_gains(true)
             exact = true.gains(points, ways)
             row: list[str | float] = [f"{kind}, {'free' if support is None else support.name}"]
             for tried in ("free", "auto", "try", None):
@@ -190,27 +180,3 @@ def supports(options: Options) -> Report:
             log(f"{row}")
     columns = ("object", "taken for free", "default", "supports tried", "found", "no body")
     return Report(tables=(Table("relative error of gains at 200 contacts, 12 known", columns, rows),), figures=figures)
-
-
-def _gains_of(true: ElasticModes) -> tuple[GainData, Float64[Tensor, "others 3"], Float64[Tensor, "others 3"]]:
-    """Return gains at 12 contacts with errors of place, direction and force, and 200 other contacts with directions."""
-    generator = torch.Generator().manual_seed(0)
-
-    def drawn(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    points = true.nodes[torch.randperm(len(true.nodes), generator=generator)[:212]]
-    ways = -true.normals(points)
-    known, others = points[:12], points[12:]
-    struck = ways[:12] + 0.05 * drawn(12, 3)
-    gains = true.gains(known + 0.0015 * drawn(12, 3) / 3**0.5, struck / struck.norm(dim=1, keepdim=True))
-    gains = gains * (1 + 0.02 * drawn(12, 1))
-    impacts = Impacts(
-        contacts=known.float(), sounds=torch.zeros(12, 4410), sample_rate=44100.0,
-        names=tuple(f"{row:03d}" for row in range(12)), directions=ways[:12].float(),
-    )  # fmt: skip
-    bank = ModalBank(true.frequency, torch.full_like(true.frequency, 20.0))
-    found = Extraction(bank, gains + 0j, Residual(torch.zeros(1025)))
-    phase = torch.zeros(len(true), dtype=torch.float64)
-    features = FeatureField.from_points(true.nodes.float())
-    return GainData(impacts, features, found, phase, gains, FitConfig()), others, ways[12:]

@@ -10,8 +10,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, Supports
-from avmsf.fem.supports import Support
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import GainData, gain_data, gain_variance
@@ -32,21 +31,15 @@ CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, d
 
 
 class Asked(CandidateBodies):
-    """Makes bodies finer in name alone, a known body into the free one held, and remembers which were asked for."""
+    """Makes bodies finer in name alone, and remembers which were asked for."""
 
-    def __init__(self, *known: CandidateBody, held: CandidateBody | None = None, supports: Supports = "free") -> None:
+    def __init__(self, *known: CandidateBody) -> None:
         super().__init__(known or bodies())
-        self.supports, self.held = supports, held
         self.asked: list[CandidateBody] = []
 
     def refined(self, body: CandidateBody) -> CandidateBody:
         self.asked.append(body)
         return replace(body, fine=True)
-
-    def supported(self, body: CandidateBody) -> tuple[CandidateBody, ...]:
-        self.asked.append(body)
-        assert self.held is not None
-        return body, replace(self.held, support=Support("held at its lowest face"))
 
 
 def estimator(*known: CandidateBody, kinds: tuple[str, ...] = ()) -> MixtureEstimator:
@@ -124,24 +117,6 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert candidates.asked == [good]
     assert (first["wall_thickness"], first["refined"]) == (0.00396, True)
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
-
-
-@pytest.mark.parametrize("free", [0, 1])
-def test_a_held_body_is_named_if_it_is_more_probable_than_the_free_one(free: int) -> None:
-    candidates = Asked(bodies()[free], held=bodies()[1 - free], supports="try")
-    [found] = MixtureEstimator(bodies=candidates).solve(case())[0].report["bodies"]
-    assert candidates.asked == [bodies()[free]]
-    assert found["support"] == ("free" if free else "held at its lowest face")
-    assert found["body"] == bodies()[1].name + ("" if free else ", held at its lowest face")
-
-
-def test_supports_are_not_tried_where_the_free_body_predicts_the_gains() -> None:
-    candidates = Asked(bodies()[1], held=bodies()[0], supports="auto")
-    assert MixtureEstimator(bodies=candidates).solve(case())[0].report["credibility"]["credible"]
-    assert not candidates.asked
-    candidates.supports = "try"
-    MixtureEstimator(bodies=candidates).solve(case())
-    assert candidates.asked
 
 
 def test_a_fine_body_is_not_computed_again() -> None:

@@ -323,35 +323,43 @@ class _Fit:
         elastic = (WeighedFamily.of(self.elastic(rows, body.elastic), measured) for body in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
 
-    def support(self, rows: Int[Tensor, " rows"], modes: HeldModes) -> Support | None:
-        """Return the most probable support by the evidence of the gains of all modes; None for a free body.
+    def held(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody | None:
+        """Return a body on its most probable support, by the evidence of all modes; None where it is free.
 
         All patches and all pairs of them are tried at one stiffness, then the best with one patch more for as long as
-        that is more probable, then other stiffnesses. Numbers of patches share the probability of being held alike.
+        that is more probable, then other stiffnesses. Where both bodies are far from the object, evidence between them
+        means little: the held one also has to predict contacts left out better.
         """
-        patches, unit, measured = modes.basis.patches, modes.basis.unit, self.measured.take(rows)
-        others = [WeighedFamily.of(each, measured) for each in self.families(rows)]
-
-        def weighed(patches_held: Iterable[Patch], ratio: float) -> tuple[float, Support]:
-            support = Support(tuple(patches_held), ratio * unit)
-            ways = math.comb(len(patches), len(support.patches)) * len(patches) * len(STIFFNESS_RATIOS)
-            return evidence(modes.on(support)) + math.log((1.0 - FREE_PRIOR) / ways), support
-
-        def evidence(elastic: ElasticModes) -> float:
-            return total_evidence([*others, WeighedFamily.of(self.elastic(rows, elastic), measured)], measured)
-
-        def best(tried: Iterable[tuple[float, Support]]) -> tuple[float, Support]:
-            return max(tried, key=itemgetter(0))
-
+        patches, unit = modes.basis.patches, modes.basis.unit
         typical, *ratios = STIFFNESS_RATIOS
-        found = best(weighed(each, typical) for count in (1, 2) for each in combinations(patches, count))
-        while others_left := [patch for patch in patches if patch not in found[1].patches]:
-            more = best(weighed((*found[1].patches, patch), typical) for patch in others_left)
+
+        def best(held: Iterable[tuple[Patch, ...]], *ratios: float) -> tuple[float, CandidateBody]:
+            supports = [Support(each, ratio * unit) for each in held for ratio in ratios]
+            bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
+            # Numbers of patches share the probability of being held alike.
+            ways = [math.comb(len(patches), len(each.patches)) for each in supports]
+            probable = [found - math.log(each) for found, each in zip(self.evidence(rows, bodies), ways, strict=True)]
+            row = max(range(len(bodies)), key=probable.__getitem__)
+            return probable[row], bodies[row]
+
+        def patches_of(found: tuple[float, CandidateBody]) -> tuple[Patch, ...]:
+            return () if found[1].support is None else found[1].support.patches
+
+        if not patches:
+            return None
+        found = best([each for count in (1, 2) for each in combinations(patches, count)], typical)
+        while left := [patch for patch in patches if patch not in patches_of(found)]:
+            more = best([(*patches_of(found), patch) for patch in left], typical)
             if more[0] <= found[0]:
                 break
             found = more
-        found = best([found, *(weighed(found[1].patches, ratio) for ratio in ratios)])
-        return found[1] if found[0] > evidence(modes.free) + math.log(FREE_PRIOR) else None
+        found = max(found, best([patches_of(found)], *ratios), key=itemgetter(0))
+        free = CandidateBody(body.thickness, modes.free, fine=False)
+        odds = (1.0 - FREE_PRIOR) / FREE_PRIOR / (len(patches) * len(STIFFNESS_RATIOS))
+        if found[0] + math.log(odds) <= self.evidence(rows, [free])[0]:
+            return None
+        new, old = (self(rows, [each]).model.leave_one_out() for each in (found[1], free))
+        return found[1] if predicts_better(new, old, self.measured.take(rows)) else None
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""

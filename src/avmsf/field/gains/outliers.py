@@ -315,15 +315,12 @@ def predicts_better(
     new: Complex128[Tensor, "contacts modes"],
     old: Complex128[Tensor, "contacts modes"],
     measured: MeasuredGains,
-    *,
-    candidates: int = 1,
 ) -> bool:
     """Return whether gains are surely predicted better, from leave-one-place-out predictions at the same contacts.
 
     The errors over measured and predicted gains, each mode by its energy, have to fall more than by chance: Wilcoxon's
-    signed-rank test of the paired differences, with Bonferroni's correction where `new` is the best of several
-    candidates. Over the measured ones alone, a contact near a support would outweigh all others, as it would in a test
-    of the mean.
+    signed-rank test of the paired differences. Over the measured ones alone, a contact near a support would outweigh
+    all others, as it would in a test of the mean.
     """
 
     def energy(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, " contacts"]:
@@ -332,7 +329,7 @@ def predicts_better(
     power = energy(measured.values)
     less, more = ((energy(each - measured.values) / (power + energy(each))).sqrt() for each in (new, old))
     fall = (more - less)[power > 0].numpy()
-    return bool(fall.any()) and float(scipy.stats.wilcoxon(fall, alternative="greater").pvalue) < CHANCE / candidates
+    return bool(fall.any()) and float(scipy.stats.wilcoxon(fall, alternative="greater").pvalue) < CHANCE
 
 
 def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> PredictiveRatios:
