@@ -114,7 +114,7 @@ class BodyConfig:
     dofs: int = 40_000
     """Approximate degrees of freedom of the finite elements."""
     supports: Literal["auto", "free", "try"] = "auto"
-    """Supports at the object's lowest face or point, or along a lower edge (z is upwards). auto: tried if the free body
+    """Whether the object may have been held at its lowest part (z is upwards) or its ends. auto: tried if the free body
     predicts little better than none by leave-one-out. free: it lay on foam or hung. try: always tried, which takes 10
     to 30 s more."""
 
