@@ -167,8 +167,8 @@ def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> CandidateBody:
 
 
 ELSEWHERE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
-    "unit mm": lambda x: 1000.0 * x,
-    "unit inches": lambda x: x / 0.0254,
+    'unit "mm"': lambda x: 1000.0 * x,
+    'unit "in"': lambda x: x / 0.0254,
     "(x, y, z) taken as": lambda x: x[:, [0, 2, 1]] * x.new_tensor([1, -1, 1]),
     "frame": lambda x: x @ torch.linalg.qr(torch.tensor([[1.0, 2, 3], [3, 1, -2], [1, -4, 1]]).double()).Q + 0.07,
 }
@@ -225,5 +225,5 @@ def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
     surface = Surface(1000.0 * dome().vertices, dome().faces)
     with raises(FitError, name="contacts") as caught:
         candidate_bodies(surface, impacts=recorded(12)[0], log=told.append)
-    assert "unit mm" in str(caught.value)
+    assert 'unit "mm"' in str(caught.value)
     assert told == []

@@ -104,7 +104,7 @@ def patches_of(mesh: SecondOrder) -> list[Patch]:
     import trimesh
 
     outer = mesh.surface[0]
-    axes = trimesh.bounds.oriented_bounds(mesh.nodes[outer])[0][:3, :3]
+    axes = trimesh.bounds.oriented_bounds(mesh.nodes[outer])[0][:3, :3]  # type: ignore[no-untyped-call]
     directions = [np.array([0.0, 0.0, -1.0]), *(sign * axis for axis in axes for sign in (-1.0, 1.0))]
     found: list[Patch] = []
     seen: list[set[int]] = []
