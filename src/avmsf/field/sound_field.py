@@ -182,9 +182,7 @@ class SoundField:
     def dampings(self, contacts: ArrayLike) -> Float[Tensor, "contacts modes"]:
         """Return the dampings at the contacts, 1/s: the bank's where they are shared."""
         places, _ = self._impacts(contacts, None)
-        factors = self.known(places).damping
-        shared = self.bank.damping.expand(len(places), -1)
-        return shared if factors is None else shared * factors
+        return self.known(places).dampings(self.bank.damping).expand(len(places), -1)
 
     def render(
         self,
@@ -273,12 +271,11 @@ class SoundField:
 
     def modal_sounds(self, known: Gains, samples: int) -> Float[Tensor, "contacts samples"]:
         """Return the sounds of the audible modes with these gains, without noise."""
-        damping = self.bank.damping if known.damping is None else self.bank.damping * known.damping
         rows = torch.nonzero(self.audible).flatten()
         return synthesize(
             known.mean[:, rows],
             self.bank.frequency[rows],
-            damping[..., rows],
+            known.dampings(self.bank.damping)[..., rows],
             self.phase[rows],
             samples=samples,
             sample_rate=self.sample_rate,

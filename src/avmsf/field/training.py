@@ -177,7 +177,7 @@ class TrainingRun(nn.Module):
         sounds = synthesize(
             gains.mean,
             bank.frequency,
-            bank.damping if gains.damping is None else bank.damping * gains.damping,
+            gains.dampings(bank.damping),
             self.phase,
             samples=self.samples,
             sample_rate=self.sample_rate,

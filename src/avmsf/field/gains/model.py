@@ -46,9 +46,13 @@ class Gains:
         """Squares of the amplitudes, whatever their phase."""
         return self.parts.square().sum(2)
 
+    def dampings(self, shared: Float64[Tensor, " modes"]) -> Float64[Tensor, "*contacts modes"]:
+        """Return the modes' dampings, 1/s: those that all contacts share, times the factors if there are any."""
+        return shared if self.damping is None else shared * self.damping
+
     def energy(self, damping: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
         """Return each mode's energy over time, gain^2 / (4 d), as the mean over the contacts; damping d in 1/s."""
-        return (self.power / (4.0 * (damping if self.damping is None else damping * self.damping))).mean(0)
+        return (self.power / (4.0 * self.dampings(damping))).mean(0)
 
 
 def series_of(values: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, "contacts series"]:
