@@ -10,7 +10,7 @@ import trimesh
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.ply import read_splats, write_splats
+from avmsf.gaussians.ply import holds_gaussians, read_splats, write_splats
 from factories.clouds import random_cloud
 from factories.raising import raises
 
@@ -153,3 +153,10 @@ def test_a_file_that_cannot_be_read_or_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with raises(SceneError, file="file/cloud.ply"):
         write_splats(_cloud(), tmp_path / "file" / "cloud.ply")
+
+
+def test_gaussians_are_told_from_a_mesh_by_the_header(tmp_path: Path) -> None:
+    write_splats(_cloud(), tmp_path / "cloud.ply")
+    trimesh.creation.box().export(tmp_path / "mesh.ply")
+    names = ("cloud.ply", "mesh.ply", "none.ply")
+    assert [holds_gaussians(tmp_path / name) for name in names] == [True, False, False]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.config import SplatConfig
-from avmsf.photographs.cameras import View
+from avmsf.photographs.cameras import MIN_VIEWS, View
 
 _MAX_PLAIN_STEP, _MIN_PLAIN_FRACTION = 24, 0.9
 """A background is plain where this part of its pixels lies within so many levels of 255 of the median color."""
@@ -65,9 +65,9 @@ def comparable_views(views: Sequence[View], background: Float[Tensor, " 3"] | No
             message = f"views without a mask are not used, since the background is not plain: {', '.join(unknown)}"
             warnings.warn(CaptureWarning(message, name="masks", value=unknown), stacklevel=3)
         kept = [view for view in kept if view.mask is not None]
-    if len(kept) < 3:
+    if len(kept) < MIN_VIEWS:
         got = f"{len(kept)} of {len(views)} that can be used"
-        raise SceneError.expected("3 or more", len(kept), got=got, name="views", advice="give more")
+        raise SceneError.expected(f"{MIN_VIEWS} or more", len(kept), got=got, name="views", advice="give more")
     return kept
 
 

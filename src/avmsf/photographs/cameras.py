@@ -12,6 +12,9 @@ from torch import Tensor
 from avmsf._utils.arrays import short_repr
 from avmsf.errors import CaptureError
 
+MIN_VIEWS = 3
+"""Views of an object below which nothing is made of them: two bound a shape on two sides alone."""
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:

@@ -19,13 +19,12 @@ from avmsf._utils.files import new_folder
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, Remark
 from avmsf.photographs import colmap, nerf_json
-from avmsf.photographs.cameras import Camera, View, nearest_to_lines
+from avmsf.photographs.cameras import MIN_VIEWS, Camera, View, nearest_to_lines
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap
 from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, scale, size_of
 from avmsf.photographs.lenses import CameraFile, Lens, Photograph, undistort
 from avmsf.photographs.nerf_json import OPENCV_FROM_OPENGL, read_transforms
 
-MIN_VIEWS = 3
 _NO_CAMERAS = "neither: photographs without cameras need structure from motion first"
 Findings = defaultdict[str, list[str]]
 """Names of images, by the keys of `KINDS`."""

@@ -16,10 +16,9 @@ from scipy import ndimage
 
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.cameras import MIN_VIEWS, Camera, View
 from avmsf.photographs.visual_hull import carve, silhouette
 
-MIN_VIEWS = 3
 Mask = Bool[np.ndarray, "height width"]
 ROUNDS = 2
 """Times that masks are made to agree with the hull of the masks before."""

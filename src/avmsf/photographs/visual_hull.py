@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int64, Real, Shaped, UInt16
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureWarning, SceneError
-from avmsf.photographs.cameras import Camera, View, nearest_to_lines
+from avmsf.photographs.cameras import MIN_VIEWS, Camera, View, nearest_to_lines
 
 COARSE_CELLS, FINE_CELLS = 40**3, 80**3
 """Cells of the hull on its first and its second grid."""
@@ -225,7 +225,7 @@ def _bounds(
 def masked_views(views: Sequence[View]) -> list[View]:
     """Return the views whose masks show something; a CaptureWarning names those whose masks are empty.
 
-    Raises SceneError for fewer than 3.
+    Raises SceneError for fewer than `MIN_VIEWS`.
     """
     known = [view for view in views if view.mask is not None]
     shown = [view for view in known if view.foreground.any()]
@@ -237,8 +237,8 @@ def masked_views(views: Sequence[View]) -> list[View]:
     if empty:
         message = f"views whose masks are empty are not used: {', '.join(empty)}"
         warnings.warn(CaptureWarning(message, name="masks", value=empty), stacklevel=3)
-    if len(shown) < 3:
-        wanted, got = "3 or more views with a mask", f"{len(shown)} of {len(views)}"
+    if len(shown) < MIN_VIEWS:
+        wanted, got = f"{MIN_VIEWS} or more views with a mask", f"{len(shown)} of {len(views)}"
         advice = "give masks, images with alpha or a plain background, or initial points"
         raise SceneError.expected(wanted, len(shown), got=got, name="views", advice=advice)
     return shown
