@@ -91,16 +91,17 @@ class FileKind:
         try:
             with open(path, "rb") as file:
                 start = file.read(9)
-            # Eight bytes of length, then the header's opening brace.
-            if not start or start[8:] == b"{":
-                found = "a truncated or damaged file" if start else "an empty file"
-                advice = f"copy it again, or {self.advice}"
-            else:
-                found, advice = f"a file that starts with {start[:8]!r}", f"name another, or {self.advice}"
-        except IsADirectoryError:
-            found, advice = "a folder", "name the file in it"
         except OSError as error:
             found, advice = f"an unreadable file ({error.strerror})", "check its permissions"
+            if path.is_dir():
+                found, advice = "a folder", "name the file in it"
+        else:
+            # Eight bytes of length, then the header's opening brace.
+            found, advice = "a truncated or damaged file", f"copy it again, or {self.advice}"
+            if not start:
+                found = "an empty file"
+            elif start[8:] != b"{":
+                found, advice = f"a file that starts with {start[:8]!r}", f"name another, or {self.advice}"
         return self.error.expected(self.what, found, got=found, file=path, advice=advice)
 
     def damaged(self, path: Path, error: Exception, *, name: str | None = None) -> AvmsfError:
