@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from avmsf._utils.text import read_json
+from avmsf._utils.text import read_json_object
 from avmsf.errors import SceneError, download_failure
 from avmsf.features.encoder import unit_image
 
@@ -123,7 +123,7 @@ def _load_model(folder: Path) -> nn.Module:
     for name in (_CONFIG, _WEIGHTS):
         if not (folder / name).is_file():
             raise SceneError.expected("a DINOv2 model", got=f"no {name}", file=folder, name=name, advice=advice)
-    kind = _read_settings(folder / _CONFIG).get("model_type")
+    kind = read_json_object(folder / _CONFIG, raising=SceneError).get("model_type")
     if kind not in list(classes):
         wanted = f"a model of type {' or '.join(classes)}"
         raise SceneError.expected(wanted, kind, file=folder / _CONFIG, name="model_type")
@@ -142,19 +142,9 @@ def _load_model(folder: Path) -> nn.Module:
     return model
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
-    try:
-        record = read_json(path)
-    except (OSError, ValueError) as error:
-        raise SceneError.expected("a JSON file", got=str(error), file=path, advice="copy it again") from error
-    if not isinstance(record, dict):
-        raise SceneError.expected("a JSON object", type(record).__name__, file=path, advice="copy it again")
-    return record
-
-
 def _read_normalization(path: Path) -> list[Float[Tensor, "3 1 1"]]:
     """Return the mean and standard deviation of colors in a preprocessor's file, ImageNet's without one."""
-    record = IMAGENET | (_read_settings(path) if path.is_file() else {})
+    record = IMAGENET | (read_json_object(path, raising=SceneError) if path.is_file() else {})
     found = [record[name] for name in IMAGENET]
     try:
         return [torch.tensor(values, dtype=torch.float32).reshape(3, 1, 1) for values in found]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from avmsf._utils.text import read_json
+from avmsf._utils.text import read_json, read_json_object
 from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import FrameMismatch
 from avmsf.errors import CaptureError
@@ -33,7 +33,7 @@ def read_transforms(path: Path) -> CameraFile:
     Poses are camera to world with OpenGL's axes; intrinsics stand at the top or in each frame. Raises CaptureError
     where the file is not JSON, lacks something, or holds a pose or a camera model that cannot be used.
     """
-    record = _load_record(path)
+    record = read_json_object(path, raising=CaptureError)
     frames = record.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         wanted, kind = "a list 'frames', each with file_path and transform_matrix", type(frames).__name__
@@ -62,7 +62,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
 
     Gray where they have none; None where it names no file or there are no points.
     """
-    named = _load_record(path).get("ply_file_path")
+    named = read_json_object(path, raising=CaptureError).get("ply_file_path")
     if not isinstance(named, str) or not named:
         return None
     cloud = path.parent / named.replace("\\", "/")
@@ -102,18 +102,6 @@ def stated_moves(folder: Path, *, meters: float = 1.0) -> list[FrameMismatch]:
             words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
             found.append(FrameMismatch(factor, matrix[:, :3] / stretch, shift, stated=f"{name} ({words})"))
     return found
-
-
-def _load_record(path: Path) -> dict[str, Any]:
-    """Return the file's JSON object; raises CaptureError for anything else."""
-    try:
-        record = read_json(path)
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"{path}: expected a JSON file, got one that cannot be read ({error})", file=path) from error
-    if not isinstance(record, dict):
-        kind = type(record).__name__
-        raise CaptureError.expected("a JSON object with 'frames'", kind, got=kind, file=path)
-    return record
 
 
 def _lens(settings: Mapping[str, Any], where: Location, fisheye: bool, image_width: int, image_height: int) -> Lens:
