@@ -214,23 +214,6 @@ def test_the_thin_plate_mean_is_scipys_spline(dimensions, count, share):
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-8)
 
 
-@pytest.mark.parametrize("count", [4, 12])
-def test_the_affine_part_has_its_share_of_the_variance(count):
-    family = ThinPlate(impacts(count, seed=1), SIZE)
-    parts = family.shares * family.diagonal(family.reference).mean(1)
-    expected = torch.tensor([[0.7, 0.3], [0.3, 0.7], [0.05, 0.95]], dtype=torch.float64)
-    assert torch.allclose(parts, expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize("dimensions", [1, 2, 3])
-def test_a_nearly_affine_thin_plate_reproduces_affine_functions(dimensions):
-    family, sites, _ = spline_case(dimensions, 12)
-    slope = torch.tensor([[2.0], [-1.0], [0.5]], dtype=torch.float64)
-    family.shares = torch.tensor([[1e-3, 1e9]], dtype=torch.float64)
-    values = family.reference.points @ slope + 3.0
-    assert torch.allclose(mean_of(family, 0, 0, sites, values), sites.points @ slope + 3.0, rtol=1e-6, atol=1e-6)
-
-
 def test_a_plate_bends_if_its_places_are_many_not_its_contacts():
     three = scattered(2, 3)
     family = ThinPlate(alike(three.repeat(4, 1)), 0.4)

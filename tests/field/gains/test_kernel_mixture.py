@@ -286,17 +286,6 @@ def test_the_prior_is_learned_by_five_rounds_of_expectation_maximization():
     assert learned_prior(torch.from_numpy(likelihood), given).numpy() == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_category_that_no_series_supports_keeps_what_the_pseudo_count_gives_it(monkeypatch):
-    monkeypatch.setattr(module, "_NEGLIGIBLE", 0.0)
-    likelihood = torch.zeros(KERNELS, len(NOISE_SHARES), 20, dtype=torch.float64)
-    likelihood[0, 1] = 50.0
-    given = hypotheses(log_prior=torch.zeros(KERNELS, 20, dtype=torch.float64))
-    learned = learned_prior(likelihood, given)
-    expected = 0.1 * (given.category_prior / len(NOISE_SHARES))[:, None].expand_as(learned).clone()
-    expected[0, 1] += 1.0
-    assert torch.allclose(learned, expected / 1.1, rtol=1e-6)
-
-
 def test_a_series_that_says_little_borrows_from_the_others():
     generator = np.random.default_rng(6)
     chosen = np.linalg.cholesky(among()[2] + 0.003 * np.eye(CONTACTS)) @ generator.normal(size=(CONTACTS, 20))

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.capture.impacts import SAME_PLACE, places_of
 from avmsf.field.gains import mixture_gains as module
 from avmsf.field.gains.fitting import fit_mixture
 from avmsf.field.gains.kernels import Sites
@@ -116,26 +115,6 @@ def test_covariances_are_those_of_the_most_probable_hypothesis(make):
         assert torch.allclose(covariance, sum(part[1] for part in both), rtol=1e-6, atol=1e-9)
         assert noise == pytest.approx(sum(part[2] for part in both), rel=1e-9)
         assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * noise
-
-
-def test_covariances_at_the_contacts_are_below_the_noise():
-    given = model()
-    for covariance, noise in given.covariances(given.contacts, given.training.directions):
-        assert float(covariance.diagonal().max()) < noise
-
-
-def test_without_noise_nothing_is_unknown_at_the_contacts():
-    sites = impacts(12, seed=1)
-    given = fit_mixture(
-        families(sites),
-        replace(measured(sites), variance=torch.zeros(MODES).double()),
-        sites.points.float(),
-        directional=True,
-        noise_shares=(1e-9,),
-    )
-    for covariance, _ in given.covariances(sites.points, sites.directions):
-        assert float(covariance.diagonal().max()) < 1e-6 * float(given.values.abs().square().max())
-    assert torch.allclose(gains_at(given, sites), given.values, rtol=1e-3, atol=1e-4)
 
 
 def test_shares_are_of_the_families_that_modes_come_from():
@@ -316,28 +295,3 @@ def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
     pairs = zip(*(each.covariances(ASKED.points, None) for each in (back, given)), strict=True)
     assert all(torch.equal(one[0], other[0]) and one[1] == other[1] for one, other in pairs)
     assert back.record() == record
-
-
-def test_contacts_nearer_than_a_hundredth_are_one_place():
-    """Of the diagonal of the box around all; farther ones are not, and equal ones are always."""
-    corners = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], dtype=torch.float64)
-    near = torch.tensor([[1.0, 1.0, 0.0], [1.049, 1.0, 0.0], [2.0, 2.0, 0.0], [2.051, 2.0, 0.0]], dtype=torch.float64)
-    places = places_of(torch.cat([corners, near, near[:1], corners[1:]]))
-    assert places.unique().tolist() == [0, 1, 2, 3, 4]
-    groups = [[0], [1, 7], [2, 3, 6], [4], [5]]
-    assert sorted(torch.nonzero(places == place).flatten().tolist() for place in places.unique()) == groups
-    assert places_of(corners[:1]).tolist() == [0]
-    assert places_of(corners[[0, 0]]).tolist() == [0, 0]
-
-
-def test_places_do_not_grow_along_a_row():
-    """Of contacts each near to the next; nothing depends on the order of contacts."""
-    along = torch.linspace(0.0, 1.0, 161, dtype=torch.float64)
-    contacts = along[:, None] * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-    places = places_of(contacts)
-    for place in places.unique():
-        assert float(along[places == place].max() - along[places == place].min()) <= SAME_PLACE
-    assert len(places.unique()) < 161
-    order = torch.randperm(161, generator=torch.Generator().manual_seed(0))
-    together = places[:, None] == places
-    assert torch.equal((places_of(contacts[order])[:, None] == places_of(contacts[order])), together[order][:, order])

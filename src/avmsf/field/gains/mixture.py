@@ -1,31 +1,24 @@
 """Gaussian process regression averaged over kernels and noise shares by their evidence: the mathematics alone.
 
 A series is one real function of the contacts, here one part of a mode's gains. Given a kernel K (contacts x contacts,
-mean diagonal one) and a noise share q, the values y of a series are
+mean diagonal one) and a noise share q, its values are
 
     y ~ N(0, s^2 C),   C = K + v I,   v = q + floor,
 
-where floor is the variance that the estimation of the gains is known to have, over the gains' mean square. With
-K = U diag(lambda) U' and z = U' y,
+where floor is the variance that the estimation of the gains is known to have, over the gains' mean square. The scale
+has the prior 1/s and is integrated out. With K = U diag(lambda) U', z = U' y and n contacts, up to a constant of n,
 
-    Q = y' C^-1 y = sum_i z_i^2 / (lambda_i + v),   log|C| = sum_i log(lambda_i + v),
+    Q = y' C^-1 y = sum_i z_i^2 / (lambda_i + v),   log p(y | K, q) = -n/2 log Q - 1/2 sum_i log(lambda_i + v)
 
-so one eigendecomposition of each kernel serves all noise shares and all series. With the prior 1/s on the scale the
-evidence is, up to a constant of the number n of contacts (Rasmussen and Williams, Gaussian Processes for Machine
-Learning, 2006, chapter 5; the scale integrated out),
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 5), so that one eigendecomposition of a
+kernel serves all noise shares and series. A value at a new place, with k its covariances with the contacts and k0 its
+own variance, is Student t with n degrees of freedom, location k' C^-1 y and squared scale Q/n (k0 - k' C^-1 k).
 
-    log p(y | K, q) = -n/2 log Q - 1/2 log|C|,
-
-and a value at a new place, with k its covariances with the contacts and k0 its own variance, is Student t with n
-degrees of freedom, location k' C^-1 y and squared scale Q/n (k0 - k' C^-1 k).
-
-Where the mean square E that the values should have if a kernel is true is known beforehand, up to a factor, s^2 has an
-inverse-gamma prior of shape a and scale a E in place of 1/s, which adds to the log evidence, up to a constant of n,
+Where the mean square E of the values is expected beforehand, up to a factor, s^2 has an inverse-gamma prior of shape a
+and scale a E in place of 1/s: with few contacts it decides. It adds to the log evidence, and to the weights of kernels
+alone,
 
     a log E - (n/2 + a) log(Q + 2 a E) + n/2 log Q.
-
-It decides with few contacts: with one, the evidence above is the same for all kernels. Only the weights of kernels take
-it; predictions given a kernel, and their variances, keep the scale of the values alone.
 
 How probable a kernel is beforehand is learned from all series by expectation maximization: kernels come in categories,
 whose probabilities maximize the summed evidence with a pseudo-count. Within a category the prior may differ from series
@@ -229,7 +222,7 @@ class KernelMixture:
         """
         total = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
         for row, each in enumerate(cross, first):
-            pairs, along = self._pairs_of(row), each @ self.eigen[1][row]
+            pairs, along = self._by_kernel[row], each @ self.eigen[1][row]
             found = (along @ pairs.solved.T).square_().sub_(along.square() @ (pairs.scale[:, None] * pairs.inverse).T)
             total.index_add_(1, pairs.series, found.mul_(pairs.weight))
         return total
@@ -267,14 +260,15 @@ class KernelMixture:
         covariances between places and contacts, `own` its variance at each place.
         """
         found = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
-        for rows, (series, weight, solved, inverse, scale) in self._padded:
+        for rows, pairs in self._padded:
             along = cross[rows] @ self.eigen[1][rows]
-            each = along @ solved.mT
-            magnitude = each.abs()
+            mean = along @ pairs.solved.mT
+            magnitude = mean.abs()
             if share:
-                variance = scale[:, None] * (own[rows][..., None] - along.square() @ inverse.mT).clamp_min_(0.0)
-                magnitude = magnitude.lerp(_mean_magnitude(each, variance), share)
-            found.index_add_(1, series.flatten(), magnitude.mul_(weight[:, None]).transpose(0, 1).flatten(1))
+                within = (own[rows][..., None] - along.square() @ pairs.inverse.mT).clamp_min_(0.0)
+                magnitude = magnitude.lerp(_mean_magnitude(mean, pairs.scale[:, None] * within), share)
+            magnitude = magnitude.mul_(pairs.weight[:, None]).transpose(0, 1).flatten(1)
+            found.index_add_(1, pairs.series.flatten(), magnitude)
         return found
 
     @cached_property
@@ -289,12 +283,9 @@ class KernelMixture:
         return _Pairs(kernel, series, weight, variance, inverse, projected * inverse, quadratic, scale)
 
     @cached_property
-    def _ends(self) -> list[int]:
-        """Where the `_pairs` of each kernel begin, and where the last end."""
-        return torch.searchsorted(self._pairs.kernel, torch.arange(len(self.kernels) + 1)).tolist()
-
-    def _pairs_of(self, kernel: int) -> "_Pairs":
-        return self._pairs.take(slice(self._ends[kernel], self._ends[kernel + 1]))
+    def _by_kernel(self) -> list["_Pairs"]:
+        counts = torch.bincount(self._pairs.kernel, minlength=len(self.kernels)).tolist()
+        return [_Pairs(*each) for each in zip(*(torch.split(part, counts) for part in self._pairs), strict=True)]
 
     def _summed(self, values: Float64[Tensor, "pairs *rest"]) -> Float64[Tensor, "series *rest"]:
         """Return the sum over each series' `_pairs`."""
@@ -302,18 +293,13 @@ class KernelMixture:
         return total.index_add_(0, self._pairs.series, values)
 
     @cached_property
-    def _padded(self) -> list[tuple[Tensor, tuple[Tensor, ...]]]:
-        """Rows of some kernels; the series, weights, U' C^-1 y, 1 / (lambda + v) and s^2 of their `_pairs`.
-
-        Kernels with about as many pairs are together; those with fewer are filled with weights of zero.
-        """
+    def _padded(self) -> list[tuple[Tensor, "_Pairs"]]:
+        """Rows of kernels of about as many `_pairs`, and these, [kernels, pairs], filled with weights of zero."""
+        order = torch.argsort(torch.tensor([len(each.kernel) for each in self._by_kernel]), stable=True)
         found = []
-        order = torch.argsort(torch.tensor(self._ends).diff(), stable=True)
         for rows in torch.split(order, _TOGETHER):
-            pairs = [self._pairs_of(row) for row in rows.tolist()]
-            parts = ("series", "weight", "solved", "inverse", "scale")
-            each = (pad_sequence([getattr(pair, name) for pair in pairs], batch_first=True) for name in parts)
-            found.append((rows, tuple(each)))
+            parts = zip(*(self._by_kernel[row] for row in rows.tolist()), strict=True)
+            found.append((rows, _Pairs(*(pad_sequence(list(part), batch_first=True) for part in parts))))
         return found
 
 
