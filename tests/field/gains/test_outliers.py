@@ -11,7 +11,7 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.labels import order_advice, two_levels
+from avmsf.field.gains.labels import level_advice, order_advice
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import (
@@ -172,11 +172,11 @@ def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() ->
         gains = _gains(true)
         moved = replace(gains, values=gains.values[order.argsort()])
         families = [kind(true, 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
-        found = order_advice(given, families, rows, moved, true.points.float(), directional=True)
+        found = order_advice(given, families, rows, moved)
         assert found is not None
         changes = [f"{given[new]} for {given[row]}" for row, new in enumerate(order.tolist()) if new != row]
         assert ", ".join(changes[:4]) in found
-        assert order_advice(given, families, rows, gains, true.points.float(), directional=True) is None
+        assert order_advice(given, families, rows, gains) is None
 
 
 @pytest.mark.parametrize(("first", "level"), [(3, -10.0), (10, 5.0), (15, 20.0)])
@@ -185,11 +185,14 @@ def test_recordings_of_two_levels_are_found_with_where_the_second_begins(first: 
     families = [kind(true, 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
     moved = gains.values.clone()
     moved[first:] *= 10 ** (level / 20)
-    assert two_levels(families, replace(gains, values=moved)) == (first, level)
-    assert two_levels(families, gains) is None
+    names = [f"{row:02d}.wav" for row in range(CONTACTS)]
+    advice = level_advice(names, families, replace(gains, values=moved))
+    assert advice is not None
+    assert f"from {first:02d}.wav on are {abs(level):.0f} dB {'louder' if level > 0 else 'weaker'}" in advice
+    assert level_advice(names, families, gains) is None
     # Where places say nothing of the gains, no level is wrong.
     values = torch.view_as_complex(draw(CONTACTS, MODES, 2, seed=7))
-    assert two_levels(families, replace(gains, values=values)) is None
+    assert level_advice(names, families, replace(gains, values=values)) is None
 
 
 def test_a_recording_of_another_gain_is_named_as_such() -> None:

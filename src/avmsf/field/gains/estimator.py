@@ -393,8 +393,7 @@ class _Fit:
         if level is not None:
             return level
         families = [*self.families(rows), *(self.elastic(rows, body.elastic) for body in bodies)]
-        points, directional = self.data.features.points, self.directional
-        return order_advice(names, families, rows, self.measured, points, directional=directional)
+        return order_advice(names, families, rows, self.measured)
 
     def _spread_out(self, rows: Int[Tensor, " rows"]) -> Int[Tensor, " some"]:
         """Return which of some rows are far from each other, sorted: they say enough of what all have in common."""

@@ -17,10 +17,11 @@ order of their places, as a roving hammer's, may be weaker from one on since the
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import scipy
 import torch
-from jaxtyping import Float32, Float64, Int
+from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf._utils.text import counted
@@ -30,10 +31,10 @@ from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture,
 from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.outliers import CHANCE, WIDE_NOISE_SHARES, PredictiveRatios
 
-_FEWEST = 3
+_MIN_GROUP = 3
 """Recordings of a group: of fewer, each is judged by itself."""
-_COARSE = (-30.0, -24.0, -18.0, -12.0, -6.0, 6.0, 12.0, 18.0, 24.0, 30.0)
-_FINE = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
+_COARSE_DB = (-30.0, -24.0, -18.0, -12.0, -6.0, 6.0, 12.0, 18.0, 24.0, 30.0)
+_FINE_DB = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
 """Levels tried, dB, and those about the best of them."""
 _SURE = 0.5
 """Nats for each series by which the evidence has to rise, beside the logarithm of how many steps are tried."""
@@ -67,20 +68,17 @@ def order_advice(
     families: Sequence[KernelFamily],
     rows: Int[Tensor, " rows"],
     measured: MeasuredGains,
-    points: Float32[Tensor, "points 3"],
-    *,
-    directional: bool,
 ) -> str | None:
     """Return the changes of the table after which the recordings surely agree better with the contacts; None for none.
 
     Student's test of the log predictive ratios' differences over contacts, with Bonferroni's correction. `families` are
-    of the contacts `rows`; `names` and `measured` are all recordings', `points` the object's.
+    of the contacts `rows`; `names` and `measured` are all recordings'.
     """
 
     def ratios(order: Int[Tensor, " contacts"]) -> Float64[Tensor, " rows"]:
-        moved = measured.take(order[rows])
-        model = fit_mixture(families, moved, points, directional=directional, noise_shares=WIDE_NOISE_SHARES)
-        return PredictiveRatios(model, families[0].reference, moved).without(frozenset())[0]
+        moved, sites = measured.take(order[rows]), families[0].reference
+        model = fit_mixture(families, moved, sites.points.float(), directional=True, noise_shares=WIDE_NOISE_SHARES)
+        return PredictiveRatios(model, sites, moved).without(frozenset())[0]
 
     orders = candidate_orders(names)
     best = max(orders, key=lambda words: _evidence(families, measured.take(orders[words][rows])), default=None)
@@ -99,23 +97,10 @@ def order_advice(
 
 
 def level_advice(names: Sequence[str], families: Sequence[KernelFamily], measured: MeasuredGains) -> str | None:
-    """Return from which recording on the level is another, and what to do; None where all have one level."""
-    found = two_levels(families, measured)
-    if found is None:
-        return None
-    first, level = found
-    return (
-        f"the recordings from {names[first]} on are {abs(level):.0f} dB {'louder' if level > 0 else 'weaker'} than "
-        "those before let expect, as if the gain, the microphone's place or the force's scale had changed: bring all "
-        "to one level, or fit each group by itself"
-    )
+    """Return from which recording on the level is another, by how much, and what to do.
 
-
-def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tuple[int, float] | None:
-    """Return the first of the last contacts that are of another level, and by how many dB they are louder.
-
-    None where one level explains the gains about as well. `families` are those of the measured contacts, in the order
-    in which they were recorded.
+    None where one level explains the gains about as well. `names` and `families` are those of the measured contacts, in
+    the order in which they were recorded.
     """
     count, series = len(measured.values), float(measured.informative.sum())
 
@@ -125,16 +110,21 @@ def two_levels(families: Sequence[KernelFamily], measured: MeasuredGains) -> tup
         jacobian = series * (count - first) * level / 20 * math.log(10)
         return _evidence(families, replace(measured, values=values)) - jacobian
 
-    tried = {
-        (first, level): evidence(first, level) for first in range(_FEWEST, count - _FEWEST + 1) for level in _COARSE
-    }
+    steps = product(range(_MIN_GROUP, count - _MIN_GROUP + 1), _COARSE_DB)
+    tried = {step: evidence(*step) for step in steps}
     if not tried:
         return None
     first, level = max(tried, key=tried.__getitem__)
-    near = {(first, float(level + more)): evidence(first, level + more) for more in _FINE}
+    near = {(first, float(level + more)): evidence(first, level + more) for more in _FINE_DB}
     best = max(near, key=near.__getitem__)
-    rise = near[best] - evidence(0, 0.0)
-    return best if rise > _SURE * series + math.log(len(tried)) else None
+    if near[best] - evidence(0, 0.0) <= _SURE * series + math.log(len(tried)):
+        return None
+    first, level = best
+    return (
+        f"the recordings from {names[first]} on are {abs(level):.0f} dB {'louder' if level > 0 else 'weaker'} than "
+        "those before let expect, as if the gain, the microphone's place or the force's scale had changed: bring all "
+        "to one level, or fit each group by itself"
+    )
 
 
 def _evidence(families: Sequence[KernelFamily], measured: MeasuredGains) -> float:
