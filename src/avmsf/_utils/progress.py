@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ def working(what: str, *, shown: bool) -> Iterator[None]:
     from rich.console import Console  # only here: verbs that show nothing are to begin at once
 
     console = Console(stderr=True)
-    with console.status(what) if is_live(console) else repeated(lambda: what):
+    with console.status(what) if is_live(console) else _repeated(what):
         yield
 
 
@@ -33,27 +33,15 @@ def is_live(console: "Console") -> bool:
 
 
 @contextmanager
-def repeated(describe: Callable[[], str]) -> Iterator[None]:
+def _repeated(what: str) -> Iterator[None]:
     """Print what is done, and the seconds since its beginning, every few seconds while the block runs."""
-    begun = time.monotonic()
-
-    def line() -> None:
-        print(f"{describe()} ... {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
-
-    with calling(line, every=REPEAT_SECONDS):
-        yield
-
-
-@contextmanager
-def calling(function: Callable[[], None], *, every: float) -> Iterator[None]:
-    """Call a function that prints every so many seconds while the block runs, in another thread."""
-    ended = threading.Event()
+    ended, begun = threading.Event(), time.monotonic()
 
     def repeat() -> None:
         # A standard error that was closed costs the lines alone.
         with suppress(OSError, ValueError):
-            while not ended.wait(every):
-                function()
+            while not ended.wait(REPEAT_SECONDS):
+                print(f"{what} ... {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
 
     thread = threading.Thread(target=repeat, name="avmsf-progress", daemon=True)
     thread.start()
