@@ -15,8 +15,7 @@ import pytest
 import torch
 
 from avmsf.cli import check, main
-from avmsf.cli.printing import print_json, show, table
-from avmsf.cli.progress import say
+from avmsf.cli.printing import print_json, say, show, table
 from avmsf.errors import CaptureError
 
 Streams = pytest.CaptureFixture[str]

@@ -18,8 +18,7 @@ from typing import Any, TextIO
 
 import avmsf
 from avmsf._utils.text import printable
-from avmsf.cli.printing import announcing_folders, print_json
-from avmsf.cli.progress import display
+from avmsf.cli.printing import display, print_json, say
 from avmsf.errors import NO_MEMORY, AvmsfError, AvmsfWarning, lacks_memory
 
 VERBS = {
@@ -111,14 +110,15 @@ def _run(words: list[str]) -> int:
             verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
             display.doing("loading")
-            paths = [getattr(options, name, None) for name in _OUTPUTS]
-            with announcing_folders(path.parent for path in paths if path is not None):
-                code: int = verb.run(options)
+            paths = [path for name in _OUTPUTS if (path := getattr(options, name, None)) is not None]
+            for folder in dict.fromkeys(path.parent for path in paths if not path.parent.exists()):
+                say(f"creating folder {folder}")
+            code: int = verb.run(options)
         except Exception as error:
             if not isinstance(error, AvmsfError) and not lacks_memory(error):
                 raise
             known = error if isinstance(error, AvmsfError) else AvmsfError(NO_MEMORY)
-            print(f"avmsf {words[0]}: {_sentence(known)}", file=sys.stderr)
+            say(f"avmsf {words[0]}: {_sentence(known)}")
             return _report_error(known, words)
         except SystemExit as ending:
             if ending.code == BAD_INPUT:
@@ -129,7 +129,7 @@ def _run(words: list[str]) -> int:
                 )
             raise
         except KeyboardInterrupt:
-            print(f"avmsf {words[0]}: interrupted", file=sys.stderr)
+            say(f"avmsf {words[0]}: interrupted")
             code = INTERRUPTED
         finally:
             display.close()

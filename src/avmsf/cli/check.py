@@ -12,8 +12,7 @@ from avmsf.capture.issues import shared_problems
 from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
 from avmsf.cli.alignment import AlignmentReport
 from avmsf.cli.options.check import Options
-from avmsf.cli.printing import console, decimals, next_command, print_json, table
-from avmsf.cli.progress import doing, say
+from avmsf.cli.printing import console, decimals, doing, next_command, print_json, say, table
 from avmsf.datasets import DatasetReport, ObjectReport, open_dataset
 from avmsf.errors import CaptureError, ExtractionError
 from avmsf.modal.extraction.extract import Extraction, extract_modes

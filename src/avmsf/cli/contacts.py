@@ -13,7 +13,7 @@ from avmsf.capture.settings import METRES
 from avmsf.capture.table import DIRECTION, REQUIRED, Row, is_inside, read_table
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Unit
-from avmsf.cli.progress import say
+from avmsf.cli.printing import say
 from avmsf.errors import PositionError
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.sound_field import SoundField

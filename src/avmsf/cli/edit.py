@@ -15,8 +15,7 @@ from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
 from avmsf.cli.options.common import Configured
 from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
 from avmsf.cli.options.settings import with_settings
-from avmsf.cli.printing import decimals, next_command, print_json, show, table
-from avmsf.cli.progress import display, doing, say
+from avmsf.cli.printing import decimals, display, doing, next_command, print_json, say, show, table
 from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, check_prompt
 from avmsf.errors import EditError
 from avmsf.fem.material import Material, material_named

@@ -15,8 +15,7 @@ from avmsf.cli.options.checks import expect_device, expect_modes
 from avmsf.cli.options.common import Configured, Flag
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.cli.options.settings import with_settings
-from avmsf.cli.printing import next_command, next_step, print_json, show, table
-from avmsf.cli.progress import display, say
+from avmsf.cli.printing import display, next_command, next_step, print_json, say, show, table
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.registry import PROTOCOLS, expect_suited, method_entry, protocol_named

@@ -15,8 +15,7 @@ from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
 from avmsf.cli.options.common import Flag, Printing, Unit, option_of
 from avmsf.cli.options.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
-from avmsf.cli.printing import next_step, print_result
-from avmsf.cli.progress import say
+from avmsf.cli.printing import next_step, print_result, say
 from avmsf.errors import ExportError
 from avmsf.export.writing import SUFFIXES, Axis, Format, Precision, check_free
 from avmsf.field.header import FIELD

@@ -17,8 +17,7 @@ from avmsf.cli.options.checks import OutputError, expect_device, expect_rows, re
 from avmsf.cli.options.common import Configured, Flag, option_of
 from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
 from avmsf.cli.options.settings import with_settings
-from avmsf.cli.printing import next_command, next_step, print_json, print_result, show
-from avmsf.cli.progress import display, doing, say
+from avmsf.cli.printing import display, doing, next_command, next_step, print_json, print_result, say, show
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import GainModelName

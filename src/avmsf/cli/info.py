@@ -10,8 +10,7 @@ from avmsf._utils.text import counted
 from avmsf.cli.options.checks import expect_capture, read_settings
 from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
-from avmsf.cli.printing import next_command, print_json, show
-from avmsf.cli.progress import doing, say
+from avmsf.cli.printing import doing, next_command, print_json, say, show
 from avmsf.errors import SceneError
 from avmsf.field.header import FIELD
 from avmsf.gaussians.ply_header import read_header

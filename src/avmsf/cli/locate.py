@@ -15,8 +15,7 @@ from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.cli.options.checks import OutputError
 from avmsf.cli.options.common import Flag, Printing, Unit
 from avmsf.cli.options.paths import ContactTable, Existing, FieldFile, OutputFolder, SettingsFile
-from avmsf.cli.printing import next_command, print_json, show
-from avmsf.cli.progress import doing, say
+from avmsf.cli.printing import doing, next_command, print_json, say, show
 from avmsf.errors import AvmsfError, LocationError
 
 if TYPE_CHECKING:

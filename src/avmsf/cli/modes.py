@@ -9,8 +9,7 @@ from avmsf._utils.text import counted
 from avmsf.cli.options.checks import expect_capture, read_settings
 from avmsf.cli.options.common import Printing
 from avmsf.cli.options.paths import CaptureFolder, PlotsFolder, SettingsFile
-from avmsf.cli.printing import next_command, print_json, show
-from avmsf.cli.progress import doing, say
+from avmsf.cli.printing import doing, next_command, print_json, say, show
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 

@@ -4,16 +4,21 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avmsf._utils.text import printable
-from avmsf.cli.progress import display, say
+from avmsf.pipeline.progress import ProgressDisplay
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+display = ProgressDisplay()
+"""What a verb is doing, on the standard error: quiet or verbose by the options of the verb that runs."""
+say = display.say
+doing = display.doing
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 1) -> str:
@@ -35,31 +40,8 @@ def decimals(value: float | int | None, places: int) -> str:
     return "–" if value is None else f"{value:.{places}f}"
 
 
-_absent: set[Path] = set()
-"""Folders of outputs that were not there when the verb began, and have not been printed since."""
-
-
-@contextmanager
-def announcing_folders(folders: Iterable[Path]) -> Iterator[None]:
-    """Print which of these folders the block has created: before what is useful next, or at its end."""
-    _absent.update(folder for folder in folders if not folder.exists())
-    try:
-        yield
-        _say_created()
-    finally:
-        _absent.clear()
-
-
-def _say_created() -> None:
-    for folder in sorted(_absent):
-        if folder.is_dir():
-            _absent.remove(folder)
-            say(f"created folder {folder}")
-
-
 def next_step(text: str) -> None:
     """Print what is useful next, unless --quiet is given: the last lines of a verb."""
-    _say_created()
     say(f"next: {text}")
 
 

@@ -12,8 +12,7 @@ import tyro
 from avmsf.cli.options.checks import OutputError, expect_writable
 from avmsf.cli.options.common import Flag, Printing, Unit
 from avmsf.cli.options.paths import ContactTable, FieldFile, NewFile, PositionList
-from avmsf.cli.printing import next_command, print_result
-from avmsf.cli.progress import doing, say
+from avmsf.cli.printing import doing, next_command, print_result, say
 from avmsf.errors import PositionWarning
 from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import MAX_CONTACT_SECONDS

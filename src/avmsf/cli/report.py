@@ -14,8 +14,7 @@ from torch import Tensor
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
-from avmsf.cli.printing import decimals, table
-from avmsf.cli.progress import display
+from avmsf.cli.printing import decimals, display, table
 from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.task import Renderer

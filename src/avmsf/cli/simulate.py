@@ -11,8 +11,7 @@ from avmsf.cli import INTERRUPTED
 from avmsf.cli.options.common import Configured, Flag
 from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
 from avmsf.cli.options.settings import with_settings
-from avmsf.cli.printing import next_command, print_json, print_result, show, table
-from avmsf.cli.progress import display, say
+from avmsf.cli.printing import display, next_command, print_json, print_result, say, show, table
 from avmsf.errors import SimulationError
 from avmsf.fem.material import MATERIALS
 from avmsf.simulate.recipe import EXAMPLE, NON_SYMMETRIC, SETS, ObjectRecipe, named_recipe

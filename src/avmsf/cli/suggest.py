@@ -12,8 +12,7 @@ from avmsf._utils.text import counted, format_number
 from avmsf.cli.options.checks import expect_capture
 from avmsf.cli.options.common import Flag, Printing
 from avmsf.cli.options.paths import FieldFile, OtherCapture, OutputFolder, SettingsFile
-from avmsf.cli.printing import next_step, print_json, show, table
-from avmsf.cli.progress import doing, say
+from avmsf.cli.printing import doing, next_step, print_json, say, show, table
 from avmsf.errors import FitError
 
 if TYPE_CHECKING:
