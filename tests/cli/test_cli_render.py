@@ -1,0 +1,121 @@
+"""`avmsf render`: noise, levels, softer hammers and directions."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from avmsf.cli import main
+from avmsf.cli.contacts import read_contacts
+from avmsf.modal.modes import ForcePulse
+from factories.made_fields import directional, positional, saved, sounding
+
+AT = ("--position", "0.05", "0.03", "0.002")
+PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)
+PLACES = torch.tensor([[0.05, 0.03, 0.002], [0.05, 0.03, 0.002], [-0.04, 0.01, 0.002]], dtype=torch.float64)
+DIRECTIONS = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+Streams = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return saved(positional(), tmp_path)
+
+
+def rendered(path: Path, capsys: Streams, *words: str) -> tuple[np.ndarray, dict, list[str]]:
+    """Return the sound, the JSON and the notes of a command."""
+    output = path.with_name("a.wav")
+    capsys.readouterr()
+    assert main(["render", str(path), *AT, "--output", str(output), "--json", *words]) == 0
+    out, err = capsys.readouterr()
+    notes = [line for line in err.splitlines() if line.startswith("note: ")]
+    return soundfile.read(output, dtype="float32")[0], json.loads(out), notes
+
+
+@pytest.mark.parametrize("words", [(), ("--contact-time", "0.002")])
+def test_without_noise_the_modes_are_rendered(path: Path, capsys: Streams, words: tuple[str, ...]) -> None:
+    noisy, modes = (rendered(path, capsys, *words, *more)[0] for more in ((), ("--no-noise",)))
+    # The sounds are float32, of peaks near 1.
+    assert np.abs(noisy - modes - sounding(positional()).noise().numpy()).max() < 1e-6
+    assert words or np.array_equal(modes, sounding(positional()).render(PLACE, noise=False)[0].numpy())
+
+
+@pytest.mark.parametrize("level", [-30.0, -10.0, 20.0])
+def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level: float) -> None:
+    loudest = 20 * np.log10(float(sounding(positional()).render(PLACE).abs().max()))
+    sound, told, notes = rendered(path, capsys, "--level-db", str(level - loudest))
+    assert told["peak_dbfs"] == pytest.approx(level, abs=1e-3)
+    assert np.abs(sound).max() == pytest.approx(10 ** (level / 20), rel=1e-4)
+    # Quiet ones and those that clip are noted, once.
+    advised = [note for note in notes if "--normalize peak" in note]
+    assert len(advised) == (0 if level == -10 else 1)
+
+
+def test_columns_that_are_not_used_are_named(path: Path, tmp_path: Path, capsys: Streams) -> None:
+    table = tmp_path / "places.csv"
+    table.write_text("File,x,y,z,nz,Hammer,force_newtons\na,0.05,0.03,0.002,1,felt,2\nb,0.02,0.03,0.002,1,felt,2\n")
+    assert read_contacts(table, meters=1.0).unused == ("hammer", "force_newtons")
+    assert main(["render", str(path), "--contact-table", str(table), "--output", str(tmp_path / "out")]) == 0
+    noted = [line for line in capsys.readouterr().err.splitlines() if str(table) in line]
+    assert [line.endswith("hammer, force_newtons") for line in noted] == [True]
+
+
+@pytest.mark.parametrize(("words", "shape"), [((), "half-sine"), (("--pulse", "hertz"), "hertz")])
+def test_render_softens_the_modes(path: Path, tmp_path: Path, words, shape) -> None:
+    sound_path = tmp_path / "soft.wav"
+    assert main(["render", str(path), *AT, "--output", str(sound_path), "--contact-time", "2e-3", *words]) == 0
+    expected = sounding(positional()).render(PLACE, pulse=ForcePulse(2e-3, shape))
+    assert np.array_equal(soundfile.read(sound_path, dtype="float32")[0], expected[0].numpy())
+
+
+def test_without_a_contact_time_a_blow_is_as_recorded(path: Path, tmp_path: Path) -> None:
+    assert main(["render", str(path), *AT, "--output", str(tmp_path / "hard.wav")]) == 0
+    assert np.array_equal(
+        soundfile.read(tmp_path / "hard.wav", dtype="float32")[0], sounding(positional()).render(PLACE)[0].numpy()
+    )
+
+
+def test_the_noise_knows_no_hammer() -> None:
+    """Modes alone are softened, so that what a pulse changes is their convolution with it."""
+    sound_field, pulse = sounding(positional()), ForcePulse(2e-3)
+    noise = sound_field.noise()
+    hard, soft = (sound_field.render(PLACE, forces=3.0, pulse=each) for each in (None, pulse))
+    expected = 3.0 * (pulse.soften(hard / 3.0 - noise, sample_rate=8000.0) + noise)
+    torch.testing.assert_close(soft, expected, rtol=0, atol=1e-6 * float(hard.abs().max()))
+
+
+@pytest.mark.parametrize("time", ["-0.001", "0.5", "nan"])
+def test_a_time_that_is_no_blows_is_refused(path: Path, tmp_path: Path, capsys, time: str) -> None:
+    assert main(["render", str(path), *AT, "--output", str(tmp_path / "x.wav"), "--contact-time", time]) == 2
+    assert "expected seconds from 0 to 0.02" in capsys.readouterr().err
+
+
+def test_directions_of_a_table_are_rendered(tmp_path: Path) -> None:
+    rows = [
+        f"{number}.wav,{','.join(map(str, place))},{','.join(map(str, way)) if any(way) else ',,'}"
+        for number, (place, way) in enumerate(zip(PLACES.tolist(), DIRECTIONS.tolist(), strict=True))
+    ]
+    (tmp_path / "impacts.csv").write_text("\n".join(["file,x,y,z,nx,ny,nz", *rows]) + "\n")
+    table = ("--contact-table", str(tmp_path / "impacts.csv"))
+    assert main(["render", str(saved(directional(), tmp_path)), *table, "--output", str(tmp_path / "all")]) == 0
+    expected = sounding(directional()).render(PLACES, directions=DIRECTIONS)
+    for number, sound in enumerate(expected):
+        found = soundfile.read(tmp_path / "all" / f"{number}.wav", dtype="float32")[0]
+        assert np.array_equal(found, sound.numpy())
+    assert not torch.equal(expected[0], expected[1])
+
+
+def test_the_direction_of_a_contact_is_rendered(tmp_path: Path) -> None:
+    words = ["--position", "0.05", "0.03", "0.002", "--direction", "0", "0", "1", "--output", str(tmp_path / "up.wav")]
+    assert main(["render", str(saved(directional(), tmp_path)), *words]) == 0
+    expected = sounding(directional()).render(PLACES[1:2], directions=DIRECTIONS[1:2])[0]
+    assert np.array_equal(soundfile.read(tmp_path / "up.wav", dtype="float32")[0], expected.numpy())
+
+
+def test_directions_and_contacts_are_as_many(tmp_path: Path) -> None:
+    words = ["--position", "0.05", "0.03", "0.002", *(["--direction", "0", "0", "1"] * 2)]
+    assert main(["render", str(saved(directional(), tmp_path)), *words, "--output", str(tmp_path / "up.wav")]) == 2
+    assert not (tmp_path / "up.wav").exists()
