@@ -142,10 +142,9 @@ def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: floa
     Raises SimulationError where all of them are over by more than the factor `most`, and what `make` raises of the
     last detail where none was made.
     """
-    counts: dict[float, int] = {}
-    made: list[tuple[int, Solid]] = []
+    made: dict[float, tuple[int, Solid]] = {}
     detail: float | None = _bounded(first)
-    while detail is not None and detail not in counts and len(made) < TOLERANCES.max_tries:
+    while detail is not None and detail not in made and len(made) < TOLERANCES.max_tries:
         try:
             solid = make(detail)
         except SimulationError as error:
@@ -154,10 +153,9 @@ def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: floa
                 break
             detail *= 1.0 / TOLERANCES.refinement if error.name == "timeout" else TOLERANCES.refinement
             solid = make(detail)
-        counts[detail] = count_dofs(solid)
-        made.append((counts[detail], solid))
-        detail = _next_detail(counts, dofs)
-    allowed = [each for each in made if each[0] <= most * dofs] or [min(made, key=itemgetter(0))]
+        made[detail] = count_dofs(solid), solid
+        detail = _next_detail({each: count for each, (count, _) in made.items()}, dofs)
+    allowed = [each for each in made.values() if each[0] <= most * dofs] or [min(made.values(), key=itemgetter(0))]
     best, solid = min(allowed, key=lambda each: abs(math.log(each[0] / dofs)))
     if best > most * dofs:
         wanted, got = f"a mesh of {dofs} degrees of freedom", f"{best} at least"
