@@ -7,7 +7,8 @@
 - `mixture_gains`, `attention`, `scaled`: the final classes, and their form in a file.
 - `outliers`, `labels`: log predictive ratios, by which labels are wrong and whether a body is credible.
 - `refinement`: the gains at the contacts, refined end to end on the recordings' spectra.
-- `estimator`: the order of all this in a fit, with the thickness of a wall, supports and model updating.
+- `regression`: the model of some contacts and bodies, with what gains say of supports and of changed stiffness.
+- `estimator`: the order of all this in a fit.
 
 A new family of kernels of the position is a subclass of `kernels.KernelFamily` in `kernels.POSITIONAL`: fits, reports
 and files take it from there.

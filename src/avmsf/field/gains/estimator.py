@@ -3,40 +3,31 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
-from itertools import combinations
-from operator import itemgetter
-from typing import Any
+from functools import partial
 
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, body_name
-from avmsf.fem.elastic_modes import ElasticModes, HeldModes
 from avmsf.fem.material import largest_factor
-from avmsf.fem.supports import FREE, FREE_PRIOR, STIFFNESS_RATIOS, Patch, Support
 from avmsf.fem.thickness import search_thickness
-from avmsf.fem.updating import update
 from avmsf.field.config import AUTO, NETWORK, GainModelName
 from avmsf.field.gains.attention import SHARED, Attention
-from avmsf.field.gains.data import GainData, along_phase, gain_variance
+from avmsf.field.gains.data import GainData, along_phase
 from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
-from avmsf.field.gains.kernels import POSITIONAL, KernelFamily, Sites, Unstructured, Visual
-from avmsf.field.gains.labels import level_advice, order_advice
-from avmsf.field.gains.mixture import NOISE_SHARES
+from avmsf.field.gains.kernels import POSITIONAL, Unstructured, Visual
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, others, predicts_better
+from avmsf.field.gains.outliers import Judgment, others, predicts_better
 from avmsf.field.gains.refinement import RefinedGains
+from avmsf.field.gains.regression import Regression, Solution, sites_of
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.trainer import FittedGains, GainEstimator, Trainer
-from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.symmetry.characters import Group, groups_of
 from avmsf.symmetry.symmetries import Symmetries
@@ -46,13 +37,9 @@ FAMILIES = (*(kind for kind in POSITIONAL if kind != Unstructured.kind), Symmetr
 KNOWN = (*FAMILIES, Visual.kind)
 """All families. Looks must be asked for by name: with the built-in descriptors of four simulated objects they made the
 errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothing with one."""
-_MAX_SPREAD = 64
-"""Contacts that a body is updated from, or orders and levels are compared at, at most."""
 _PREDICTS = 1.4
 """Nats per mode that a free body has to add, below which supports are tried. A plate clamped at an edge and taken for
 free adds .5, a free one 2.3; mugs add 1.1 (held at the base) and 1.5, an aircraft .8 to 1.3."""
-_PLACES = 500
-"""Points of the surface where the contacts that contradict the others may have been."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +116,7 @@ class MixtureEstimator(GainEstimator):
         searched = bool(bodies) and self.bodies is not None and self.bodies.searches_thickness
         # Of a wall that is too thin, shapes of high modes may fit as well as those of the right one.
         largest = largest_factor(searched=True) if searched else math.inf
-        fit = _Fit(data, self.kinds, _sites(data, bodies), directional, groups, largest)
+        fit = Regression(data, self.kinds, sites_of(data, bodies), directional, groups, largest)
         thickness = None
         if searched and self.bodies is not None:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.with_thickness)
@@ -158,7 +145,7 @@ class MixtureEstimator(GainEstimator):
         report["advice"] = None if judgment.informative else fit.advice(found.bodies)
         return replace(found.model, report=report), found.rows
 
-    def _refined(self, fit: "_Fit", bodies: Sequence[CandidateBody]) -> "_Solution":
+    def _refined(self, fit: Regression, bodies: Sequence[CandidateBody]) -> Solution:
         """Return the gain model of all contacts with the most probable body as fine as it can be had."""
         found = fit(torch.arange(len(fit.sites)), bodies)
         while (best := found.best) is not None and not best.fine and self.bodies is not None:
@@ -226,198 +213,3 @@ def estimator_for(
         if log is not None:
             log(f"no elastic mode shapes: {error}")
         return MixtureEstimator(kinds, missing=str(error), symmetries=symmetries())
-
-
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """The gain model of some contacts and bodies."""
-
-    model: MixtureGains
-    rows: Int[Tensor, " rows"]
-    bodies: Sequence[CandidateBody]
-    factors: Sequence[float]
-    """On the nominal frequencies of each body."""
-    weights: Sequence[float]
-    """Each body's posterior probability, mean over modes by their energy."""
-
-    @property
-    def best(self) -> CandidateBody | None:
-        """The most probable body."""
-        row = max(range(len(self.bodies)), key=self.weights.__getitem__, default=None)
-        return None if row is None else self.bodies[row]
-
-    def report(self) -> dict[str, Any]:
-        found: list[dict[str, Any]] = [
-            {
-                "body": body.name,
-                "wall_thickness": body.thickness,
-                "support": FREE if body.support is None else body.support.name,
-                "updating_nats": body.updated,
-                "refined": body.fine,
-                "weight": weight,
-                "frequency_factor": factor,
-            }
-            for body, factor, weight in zip(self.bodies, self.factors, self.weights, strict=True)
-        ]
-        return {"bodies": sorted(found, key=lambda each: -each["weight"])}
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Fits families and bodies to some of the data's contacts."""
-
-    data: GainData
-    kinds: tuple[str, ...]
-    sites: Sites
-    """All contacts."""
-    directional: bool
-    """Whether directions are known, or a body says which way its surface faces."""
-    groups: tuple[Group, ...]
-    """Symmetries of the object's shape."""
-    largest_factor: float
-    """The largest factor on the frequencies of bodies."""
-
-    @cached_property
-    def measured(self) -> MeasuredGains:
-        """The gains at all contacts, with the variance that background noise gives them."""
-        bank = self.data.modes.bank
-        return MeasuredGains(self.data.values, gain_variance(self.data), bank.frequency, bank.damping)
-
-    def families(self, rows: Int[Tensor, " rows"]) -> list[KernelFamily]:
-        """Return the families of these contacts that know of no body."""
-        sites, size, features = self.sites.take(rows), self._size, self.data.features
-        kinds = [kind for name, kind in POSITIONAL.items() if name in (Unstructured.kind, *self.kinds)]
-        found: list[KernelFamily] = [kind(sites, size) for kind in kinds]
-        if self.groups and Symmetric.kind in self.kinds:
-            found.append(Symmetric(sites, size, self.groups, directional=self.directional))
-        if Visual.kind in self.kinds and features.encoder != GEOMETRY:
-            found.append(Visual(sites, size, features.points, features.features))
-        return found
-
-    def elastic(self, rows: Int[Tensor, " rows"], modes: ElasticModes) -> Elastic:
-        """Return the family of these contacts and a body's modes."""
-        return Elastic(self.sites.take(rows), self._size, modes, largest_factor=self.largest_factor)
-
-    def __call__(
-        self,
-        rows: Int[Tensor, " rows"],
-        bodies: Sequence[CandidateBody],
-        noise_shares: tuple[float, ...] = NOISE_SHARES,
-    ) -> _Solution:
-        """Return the gain model of these contacts."""
-        elastic, measured = [self.elastic(rows, body.elastic) for body in bodies], self.measured
-        model = fit_mixture(
-            [*self.families(rows), *elastic], measured.take(rows), self.data.features.points,
-            directional=self.directional, noise_shares=noise_shares,
-        )  # fmt: skip
-        share = measured.energy / measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
-        parts = zip(model.families, (model.shares() @ share).tolist(), strict=True)
-        weights = {id(family.modes): part for family, part in parts if isinstance(family, Elastic)}
-        found = [weights.get(id(each.modes), 0.0) for each in elastic]
-        return _Solution(model, rows, bodies, [each.factor for each in elastic], found)
-
-    def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[float]:
-        """Return the log evidence of the gains of some contacts with each body by itself."""
-        measured = self.measured.take(rows)
-        others = [WeighedFamily.of(each, measured) for each in self.families(rows)]
-        elastic = (WeighedFamily.of(self.elastic(rows, body.elastic), measured) for body in bodies)
-        return [total_evidence([*others, each], measured) for each in elastic]
-
-    def held(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody | None:
-        """Return a body on its most probable support, by the evidence of all modes; None where it is free.
-
-        All patches and all pairs of them are tried at one stiffness, then the best with one patch more for as long as
-        that is more probable, then other stiffnesses. Where both bodies are far from the object, evidence between them
-        means little: the held one also has to predict contacts left out better.
-        """
-        patches, unit = modes.basis.patches, modes.basis.unit
-        typical, *ratios = STIFFNESS_RATIOS
-
-        def best(held: Iterable[tuple[Patch, ...]], *ratios: float) -> tuple[float, CandidateBody]:
-            supports = [Support(each, ratio * unit) for each in held for ratio in ratios]
-            bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
-            # Numbers of patches share the probability of being held alike.
-            ways = [math.comb(len(patches), len(each.patches)) for each in supports]
-            probable = [found - math.log(each) for found, each in zip(self.evidence(rows, bodies), ways, strict=True)]
-            row = max(range(len(bodies)), key=probable.__getitem__)
-            return probable[row], bodies[row]
-
-        def patches_of(found: tuple[float, CandidateBody]) -> tuple[Patch, ...]:
-            return () if found[1].support is None else found[1].support.patches
-
-        if not patches:
-            return None
-        found = best([each for count in (1, 2) for each in combinations(patches, count)], typical)
-        while left := [patch for patch in patches if patch not in patches_of(found)]:
-            more = best([(*patches_of(found), patch) for patch in left], typical)
-            if more[0] <= found[0]:
-                break
-            found = more
-        found = max(found, best([patches_of(found)], *ratios), key=itemgetter(0))
-        free = CandidateBody(body.thickness, modes.free, fine=False)
-        odds = (1.0 - FREE_PRIOR) / FREE_PRIOR / (len(patches) * len(STIFFNESS_RATIOS))
-        if found[0] + math.log(odds) <= self.evidence(rows, [free])[0]:
-            return None
-        new, old = (self(rows, [each]).model.leave_one_out() for each in (found[1], free))
-        return found[1] if predicts_better(new, old, self.measured.take(rows)) else None
-
-    def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
-        """Return the body with its stiffness and density updated; None where that has no higher evidence."""
-        if body.elastic.perturbations is None:
-            return None
-        # The cost goes with the cube of the number of contacts.
-        rows = rows[self._spread_out(rows)]
-        sites, measured = self.sites.take(rows), self.measured.take(rows)
-        others = [WeighedFamily.of(family, measured) for family in self.families(rows)]
-        found = update(
-            body.elastic, sites.points, sites.directions, measured.frequency, measured.values.real,
-            measured.informative.chunk(2)[0], lambda modes: matched(others, self.elastic(rows, modes), measured),
-        )  # fmt: skip
-        return None if found is None else replace(body, elastic=found[0], updated=found[1])
-
-    def assess(self, found: _Solution) -> Judgment:
-        """Return what contradicts the other contacts, and whether the most probable body is credible."""
-        points, best = found.model.points, found.best
-        places = found.model.sites(points[farthest_points(points, min(_PLACES, len(points)))])
-
-        def fitted(bodies: list[CandidateBody]) -> Fit:
-            return lambda rows, noise_shares: self(rows, bodies, noise_shares).model
-
-        return assess_contacts(fitted([]), None if best is None else fitted([best]), self.sites, places, self.measured)
-
-    def advice(self, bodies: Sequence[CandidateBody]) -> str | None:
-        """Return what makes the recordings agree with the contacts far better: one level, or another order."""
-        names, rows = self.data.train.names, self._spread_out(torch.arange(len(self.sites)))
-        positional = [kind(self.sites.take(rows), self._size) for kind in POSITIONAL.values()]
-        level = level_advice([names[row] for row in rows.tolist()], positional, self.measured.take(rows))
-        if level is not None:
-            return level
-        families = [*self.families(rows), *(self.elastic(rows, body.elastic) for body in bodies)]
-        return order_advice(names, families, rows, self.measured)
-
-    def _spread_out(self, rows: Int[Tensor, " rows"]) -> Int[Tensor, " some"]:
-        """Return which of some rows are far from each other, sorted: they say enough of what all have in common."""
-        return farthest_points(self.sites.points[rows], min(_MAX_SPREAD, len(rows))).sort().values
-
-    @property
-    def _size(self) -> float:
-        return 2.0 * self.data.features.half_diagonal
-
-
-def _sites(data: GainData, bodies: Sequence[CandidateBody]) -> Sites:
-    """Return the training impacts; unknown directions go straight into the body.
-
-    Without a body they are that of the nearest impact whose direction is known, or all alike where none is.
-    """
-    points, given = data.train.contacts.double(), data.train.directions
-
-    def otherwise(unknown: Float64[Tensor, "unknown 3"]) -> Float64[Tensor, "unknown 3"]:
-        if bodies:
-            return -bodies[0].elastic.normals(unknown)
-        known = torch.zeros(len(points), dtype=torch.bool) if given is None else given.any(1)
-        if given is None or not bool(known.any()):
-            return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(unknown), 3)
-        nearest = (unknown[:, None] - points[known]).square().sum(2).argmin(1)
-        return torch.nn.functional.normalize(given[known][nearest].double(), dim=1)
-
-    return Sites.along(points, given, otherwise)
