@@ -33,7 +33,7 @@ _LINK_FRACTION = 0.04
 _ANGLES = 360
 """Angles tried for a rotation about an axis that allows any."""
 _SYMMETRY_POINTS = 2000
-"""Points of the object in which symmetries are searched: of fewer than about 1200, some are lost in chance."""
+"""Points of the object in which symmetries are searched: of 500, a fifth would be lost in chance."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,12 @@
 """Where symmetries may be: principal axes, and pairs of points about which the surface is alike.
 
-Two points with their normals say which plane would mirror one onto the other, and about which axis by which angle one
-would turn into the other. Many pairs say something, most of it wrong; what they say is scored on a coarse picture of
-the cloud, and the best that differ are kept.
+Two points with their normals say which plane would mirror one onto the other, and about which axis a half turn would
+carry one to the other. Many pairs say something, most of it wrong; what they say is scored on a coarse picture of the
+cloud, and the best that differ are kept.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,7 +14,7 @@ from scipy.ndimage import distance_transform_edt
 
 from avmsf.gaussians.neighborhoods import Neighborhoods, describe_neighborhoods
 from avmsf.symmetry.alignment import draw_by_area
-from avmsf.symmetry.motion import Motion
+from avmsf.symmetry.motions import Motions, Points, reflections, rotations
 
 _PRIMES = (2, 3, 5, 7, 11)
 _MIRRORS, _AXES, _PRINCIPAL_AXES, _TURNS = 24, 30, 9, 40
@@ -26,27 +25,29 @@ _COARSE_DISTANCE = 0.03
 _DESCRIBED, _COUNTED, _PARTNERS = 900, 1800, 24
 _MIN_COSINE = math.cos(math.radians(25.0))
 """Of the angle between a point's normal and the moved one of its partner."""
-_SAME_DEGREES, _SAME_GAP = 9.0, 0.05
-"""Angle and distance, in diagonals, within which candidates are one."""
+_SAME_DISTANCE = 0.08
+"""How far apart two candidates may carry an object that are one: a plane or axis is off by about 9 degrees."""
 
-Points = Float[np.ndarray, "points 3"]
+Lines = tuple[Points, Points]
+"""Unit vectors, normals of planes or along axes, and a point of each plane or axis."""
 Pairs = tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]
 """Indices of the first and of the second points of pairs."""
 
 
-def candidates(surface: Neighborhoods, queries: Points, random: np.random.Generator) -> Iterator[Motion]:
+def candidates(surface: Neighborhoods, queries: Points, random: np.random.Generator) -> Iterator[Motions]:
     """Yield the turns and reflections to fit: the most promising of all axes, then planes; `queries` score them."""
     coarse = CoarseCloud(surface, queries[:_COARSE_POINTS])
-    principal = principal_motions(surface)
-    axes = distinct([motion for motion in principal if motion.angle is not None], most=_PRINCIPAL_AXES)
+    principal = principal_lines(surface)
     pairs = matching_pairs(surface, random)
-    axes += coarse.best(math.pi, *half_turns_of_pairs(surface, pairs), most=_AXES)
-    turns = [replace(axis, angle=2 * math.pi / prime) for axis in axes for prime in _PRIMES]
-    scores = coarse.score(np.stack([each.linear for each in turns]), np.stack([each.point for each in turns]))
-    yield from (turns[row] for row in np.argsort(-scores)[:_TURNS])
-    # Planes that contain an axis of any angle follow from it: axes are looked for first.
-    yield from (motion for motion in principal if motion.angle is None)
-    yield from coarse.best(None, *mirrors_of_pairs(surface, pairs), most=_MIRRORS)
+    main = distinct(principal, _PRINCIPAL_AXES)
+    matched = coarse.best(half_turns_of_pairs(surface, pairs), _AXES, 1.0)
+    axes, points = (np.concatenate(each) for each in zip(main, matched, strict=True))
+    linear = np.concatenate([rotations(axis, [2 * math.pi / prime for prime in _PRIMES]) for axis in axes])
+    turns = Motions.about(np.repeat(points, len(_PRIMES), axis=0), linear)
+    yield from (turns[row] for row in np.argsort(-coarse.score(turns))[:_TURNS])
+    for normals, points in (principal, coarse.best(mirrors_of_pairs(surface, pairs), _MIRRORS, -1.0)):
+        planes = Motions.about(points, reflections(normals))
+        yield from (planes[row] for row in range(len(planes)))
 
 
 class CoarseCloud:
@@ -62,45 +63,39 @@ class CoarseCloud:
         self._lowest = lowest - self._cell
         self._few = few
 
-    def score(
-        self, linear: Float[np.ndarray, "motions 3 3"], fixed: Float[np.ndarray, "motions 3"]
-    ) -> Float[np.ndarray, " motions"]:
-        """Return how much of the cloud each motion L, with a point that it leaves, carries onto the cloud, 0 to 1."""
-        scores, offset = np.empty(len(linear)), fixed - np.einsum("mij,mj->mi", linear, fixed) - self._lowest
-        for start in range(0, len(linear), 2000):
+    def score(self, motions: Motions) -> Float[np.ndarray, " motions"]:
+        """Return how much of the cloud each motion carries onto the cloud, 0 to 1."""
+        scores = np.empty(len(motions))
+        # Single precision is exact to a millionth of the object and takes half the time.
+        few, linear = self._few.astype(np.float32), motions.linear.astype(np.float32)
+        offset = (motions.shifts - self._lowest).astype(np.float32)
+        for start in range(0, len(motions), 2000):
             part = slice(start, start + 2000)
-            # Single precision is exact to a millionth of the object and takes half the time.
-            turned = self._few.astype(np.float32) @ linear[part].astype(np.float32).transpose(0, 2, 1)
-            cells = ((turned + offset[part, None].astype(np.float32)) / np.float32(self._cell)).astype(np.int32)
-            cells = np.clip(cells, 0, np.array(self._distances.shape) - 1)
+            turned = few @ linear[part].transpose(0, 2, 1) + offset[part, None]
+            cells = np.clip((turned / np.float32(self._cell)).astype(np.int32), 0, np.array(self._distances.shape) - 1)
             distance = self._distances[cells[..., 0], cells[..., 1], cells[..., 2]]
             scores[part] = np.exp(-((distance / _COARSE_DISTANCE) ** 2)).mean(axis=1)
         return scores
 
-    def best(self, angle: float | None, directions: Points, points: Points, *, most: int) -> list[Motion]:
-        """Return the half turns (angle pi) or reflections (None) of the best scores whose axes or planes differ."""
-        half_turns = 2 * directions[:, :, None] * directions[:, None, :] - np.eye(3)
-        rows = np.argsort(-self.score(half_turns if angle else -half_turns, points))[: 60 * most]
-        return distinct([Motion(directions[row], points[row], angle) for row in rows], most)
+    def best(self, lines: Lines, most: int, sign: float) -> Lines:
+        """Return the axes of half turns (sign 1) or planes of reflections (-1) with the best scores that differ."""
+        directions, points = lines
+        rows = np.argsort(-self.score(Motions.about(points, -sign * reflections(directions))))[: 60 * most]
+        return distinct((directions[rows], points[rows]), most)
 
 
-def principal_motions(surface: Neighborhoods) -> list[Motion]:
-    """Return reflections and half turns along the principal axes of the surface, through its means and box's middle."""
+def principal_lines(surface: Neighborhoods) -> Lines:
+    """Return the principal axes of the surface through its mean, its box's middle and its median."""
     areas = np.minimum(surface.spacing**2, 4 * np.median(surface.spacing**2))
     mean = (areas[:, None] * surface.points).sum(0) / areas.sum()
     centered = surface.points - mean
     _, axes = np.linalg.eigh((areas[:, None] * centered).T @ centered)
     along = surface.points @ axes
-    box = axes @ ((along.min(0) + along.max(0)) / 2)
-    return [
-        Motion(axes[:, column], center, angle)
-        for column in range(3)
-        for center in (mean, box, np.median(along, axis=0) @ axes.T)
-        for angle in (None, math.pi)
-    ]
+    centers = [mean, axes @ ((along.min(0) + along.max(0)) / 2), axes @ np.median(along, axis=0)]
+    return np.repeat(axes.T, 3, axis=0), np.tile(centers, (3, 1))
 
 
-def mirrors_of_pairs(surface: Neighborhoods, pairs: Pairs) -> tuple[Points, Points]:
+def mirrors_of_pairs(surface: Neighborhoods, pairs: Pairs) -> Lines:
     """Return normals and points of planes that mirror one point of a pair onto the other, with its normal."""
     start, end = (surface.points[rows] for rows in pairs)
     before, after = (surface.normals[rows] for rows in pairs)
@@ -109,7 +104,7 @@ def mirrors_of_pairs(surface: Neighborhoods, pairs: Pairs) -> tuple[Points, Poin
     return direction[fits], ((start + end) / 2)[fits]
 
 
-def half_turns_of_pairs(surface: Neighborhoods, pairs: Pairs) -> tuple[Points, Points]:
+def half_turns_of_pairs(surface: Neighborhoods, pairs: Pairs) -> Lines:
     """Return axes, and points of them, of half turns of one point of a pair onto the other, with its normal."""
     start, end = (surface.points[rows] for rows in pairs)
     before = surface.normals[pairs[0]]
@@ -128,15 +123,16 @@ def half_turns_of_pairs(surface: Neighborhoods, pairs: Pairs) -> tuple[Points, P
     return np.concatenate(directions), np.concatenate(points)
 
 
-def distinct(motions: list[Motion], most: int) -> list[Motion]:
-    """Return the first motions whose planes or axes differ from those before them."""
-    chosen: list[Motion] = []
-    for motion in motions:
-        if len(chosen) == most:
-            break
-        if not any(motion.is_near(other, _SAME_DEGREES, _SAME_GAP) for other in chosen):
-            chosen.append(motion)
-    return chosen
+def distinct(lines: Lines, most: int) -> Lines:
+    """Return the first lines whose half turns differ from those before them."""
+    directions, points = lines
+    flips = Motions.about(points, -reflections(directions))
+    chosen: list[int] = []
+    left = np.ones(len(flips), dtype=bool)
+    while left.any() and len(chosen) < most:
+        chosen.append(int(left.argmax()))
+        left &= flips.distances(flips[chosen[-1]]) >= _SAME_DISTANCE
+    return directions[chosen], points[chosen]
 
 
 def matching_pairs(surface: Neighborhoods, random: np.random.Generator) -> Pairs:

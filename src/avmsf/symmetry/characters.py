@@ -6,13 +6,14 @@ Representations of Finite Groups, 1977, section 2).
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf.symmetry.motions import Matrices, Motions, Points, reflections, rotations
 from avmsf.symmetry.symmetries import Symmetries
 
 TURNS = 12
@@ -20,6 +21,8 @@ TURNS = 12
 _MAX_SINE = math.sin(math.radians(7.5))
 """Sine of the angle up to which lines are parallel or perpendicular: axes of groups up to order 12 are 15 degrees
 apart, so that no other lies nearer."""
+_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0]])
+"""The characters of a group of two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,81 +37,64 @@ class Group:
 
 def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
     """Return the groups that an object's symmetries form; none where it has none beyond doubt."""
-    planes = [(each.normal.double(), -1.0) for each in symmetries.mirrors]
-    axes = [(each.axis.double(), 1.0) for each in symmetries.rotations]
-    orders = [TURNS if each.order is None else each.order for each in symmetries.rotations]
-    points = [each.point.double() for each in symmetries.mirrors]
-    points += [each.point.double() for each in symmetries.rotations]
-    if not points:
+    mirrors, turns = symmetries.mirrors, symmetries.rotations
+    if not symmetries:
         return ()
-    center = _center(torch.stack(points), torch.stack([_flip(*line) for line in (*planes, *axes)]))
-    found = [([_flip(*plane)], _SIGNS) for plane in planes]
-    found += [(_turns(axis, order), _cyclic(order)) for (axis, _), order in zip(axes, orders, strict=True)]
-    flips = planes + [axis for axis, order in zip(axes, orders, strict=True) if order % 2 == 0]
-    found += [(each, torch.kron(_SIGNS, _SIGNS)) for each in _pairs(flips)]
+    lines = torch.stack([*(each.normal for each in mirrors), *(each.axis for each in turns)]).double().numpy()
+    points = torch.stack([*(each.point for each in mirrors), *(each.point for each in turns)]).double().numpy()
+    signs = np.repeat([-1.0, 1.0], [len(mirrors), len(turns)])
+    # The point nearest to all planes and axes, which meet where an object is bounded.
+    middle = points.mean(0)
+    center = middle + Motions.about(points - middle, _flips(lines, signs)).center()
+    found = [(_flips(lines[row : row + 1], signs[row : row + 1]), _SIGNS) for row in range(len(mirrors))]
+    for each in turns:
+        angles = each.angles(TURNS)
+        found.append((rotations(each.axis.double().numpy(), angles[1:]), _cyclic(len(angles))))
+    flips = [True] * len(mirrors) + [len(each.angles(TURNS)) % 2 == 0 for each in turns]
+    found += [(pair, np.kron(_SIGNS, _SIGNS)) for pair in _pairs(lines[flips], signs[flips])]
     groups = []
-    for moved, characters in found:
-        linear = torch.stack([_ONE, *moved])
-        groups.append(Group(torch.cat([linear, (center - linear @ center)[..., None]], dim=2), characters))
+    for linear, characters in found:
+        motions = Motions.about(center, np.concatenate([np.eye(3)[None], linear]))
+        matrices = torch.from_numpy(np.concatenate([motions.linear, motions.shifts[..., None]], axis=2))
+        groups.append(Group(matrices, torch.from_numpy(characters)))
     return tuple(groups)
 
 
-_ONE = torch.eye(3, dtype=torch.float64)
-_SIGNS = torch.tensor([[1.0, 1.0], [1.0, -1.0]], dtype=torch.float64)
-"""The characters of a group of two."""
+def _flips(lines: Points, signs: Float[np.ndarray, " points"]) -> Matrices:
+    """Return the half turn about each line (sign 1), or the reflection along it (sign -1)."""
+    return -signs[:, None, None] * reflections(lines)
 
 
-def _flip(line: Float64[Tensor, " 3"], sign: float) -> Float64[Tensor, "3 3"]:
-    """Return the half turn about a line (sign 1), or the mirror whose normal it is (sign -1)."""
-    return sign * (2.0 * torch.outer(line, line) - _ONE)
-
-
-def _turns(axis: Float64[Tensor, " 3"], order: int) -> list[Float64[Tensor, "3 3"]]:
-    """Return all turns of an axis but the identity."""
-    cross = torch.linalg.cross(axis.expand(3, 3), _ONE).T
-    angles = [2.0 * math.pi * step / order for step in range(1, order)]
-    return [_ONE + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross for angle in angles]
-
-
-def _cyclic(order: int) -> Float64[Tensor, "characters order"]:
+def _cyclic(order: int) -> Float[np.ndarray, "characters order"]:
     """Return the real characters of a turn's group: waves of each number around the axis."""
-    step = torch.arange(order, dtype=torch.float64)
-    return torch.cos(2.0 * math.pi / order * torch.outer(step[: order // 2 + 1], step))
+    return np.cos(2.0 * np.pi / order * np.outer(np.arange(order // 2 + 1), np.arange(order)))
 
 
-def _pairs(flips: Sequence[tuple[Float64[Tensor, " 3"], float]]) -> list[list[Float64[Tensor, "3 3"]]]:
+def _pairs(lines: Points, signs: Float[np.ndarray, " points"]) -> list[Matrices]:
     """Return what every two flips that commute form with their product, each group once.
 
     Lines that were found are off by a degree or so. Their nearest perpendicular or common ones are taken, so that the
     flips commute exactly.
     """
-    found: list[list[Tensor]] = []
-    for (line, sign), (other, other_sign) in itertools.combinations(flips, 2):
-        cosine = float(line @ other)
+    found: list[Matrices] = []
+    for pair in itertools.combinations(range(len(lines)), 2):
+        one, other = lines[list(pair)]
+        cosine = float(one @ other)
         if abs(cosine) <= _MAX_SINE:
-            left, _, right = torch.linalg.svd(torch.stack([line, other]), full_matrices=False)
-            one, two = left @ right
+            left, _, right = np.linalg.svd(np.stack([one, other]), full_matrices=False)
+            exact = left @ right
         elif 1.0 - cosine**2 <= _MAX_SINE**2:
-            one = two = torch.nn.functional.normalize(line + math.copysign(1.0, cosine) * other, dim=0)
+            common = one + math.copysign(1.0, cosine) * other
+            exact = np.tile(common / np.linalg.norm(common), (2, 1))
         else:
             continue
-        first, second = _flip(one, sign), _flip(two, other_sign)
-        group = [second, first, first @ second]
+        first, second = _flips(exact, signs[list(pair)])
+        group = np.stack([second, first, first @ second])
         if not any(_same(group, known) for known in found):
             found.append(group)
     return found
 
 
-def _same(group: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
+def _same(group: Matrices, other: Matrices) -> bool:
     """Return whether two groups hold the same motions, up to how well their lines are known."""
-    return all(any(float((each - one).norm()) < 4.0 * _MAX_SINE for one in other) for each in group)
-
-
-def _center(points: Float64[Tensor, "flips 3"], flips: Float64[Tensor, "flips 3 3"]) -> Float64[Tensor, " 3"]:
-    """Return the point nearest to all planes and axes, which meet where an object is bounded, from a point of each."""
-    # What leads away from a plane or axis, its flip turns round.
-    across = (_ONE - flips) / 2.0
-    side = (across @ points[..., None]).flatten()
-    # The least change to the mean of their points: along what none of them fixes, it stays there.
-    middle, matrix = points.mean(0), across.flatten(0, 1)
-    return middle + torch.linalg.pinv(matrix, rtol=_MAX_SINE) @ (side - matrix @ middle)
+    return all((np.linalg.norm(each - other, axis=(1, 2)) < 4.0 * _MAX_SINE).any() for each in group)

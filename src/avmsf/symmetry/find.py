@@ -1,4 +1,4 @@
-"""Finding the symmetries of a cloud: candidates, refined, tested, and completed by one another."""
+"""The symmetries of a cloud of points as planes and axes in its own frame."""
 
 import math
 
@@ -12,8 +12,8 @@ from avmsf.errors import SceneError
 from avmsf.gaussians.neighborhoods import NEIGHBORS
 from avmsf.symmetry.alignment import SymmetryTest, draw_by_area, read_surface
 from avmsf.symmetry.candidates import candidates
-from avmsf.symmetry.group import SymmetryGroup
-from avmsf.symmetry.motion import Motion
+from avmsf.symmetry.motions import Vector
+from avmsf.symmetry.search import find_group
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 
 LIMIT = 8000
@@ -30,19 +30,17 @@ def find_symmetries(
     """Return the rotations and mirror planes that carry a cloud of an object's surface onto itself.
 
     The cloud may be noisy, cover the object unevenly, and lie in any pose. At most `limit` points are used, drawn so
-    that dense parts lose most. Candidates come from the principal axes, from pairs of points with similar surfaces
-    around them, and from compositions of symmetries already found; each is refined to its best fit.
+    that dense parts lose most. What is returned is one point group, the largest that holds: candidates come from the
+    principal axes and from pairs of points with similar surfaces around them, and those that hold generate groups.
 
-    **The error.** One half of the points is moved onto the surface that the other half samples. The error is the
-    root mean square of their distances from it, without what the distances are when nothing is moved (noise), in
-    spacings of that half; a spacing below 1 or above 1.6 % of the object's diagonal counts as that. A distance counts
-    up to 3 spacings. So the tolerance of .38 lets the whole surface be off by that many spacings, or
-    (.38 / 3)^2 = 1.6 % of it have no counterpart at all. The tolerance is less where the points are few or noisy: its
-    square loses two standard errors of the noise. Where nothing of it is left, often below 600 points, no symmetry can
-    be told from chance, and none is returned.
+    **The error.** Each quarter of the points is moved onto the surface that the others sample. The error is the root
+    mean square of their distances from it, without what the distances are when nothing is moved (noise), in spacings of
+    three quarters; a spacing below 1 or above 1.6 % of the object's diagonal counts as that. A distance counts up to 3
+    spacings. So the tolerance of .38 lets the whole surface be off by that many spacings, or (.38 / 3)^2 = 1.6 % of it
+    have no counterpart at all. It holds for the mean over a group; each motion may have 1.15 times the error. Where the
+    points are so few or noisy that chance changes squared errors by more than the tolerance, no symmetry is returned.
 
     An object that is damaged, or of which large parts are in no view, has only the symmetries of what is there.
-    Compositions of two symmetries may have 1.15 times the error.
 
     Orders 2 to 12 are distinguished; an axis is continuous if every angle holds and no order holds better than the
     angles between its turns. Planes that contain a continuous axis and half turns across it follow from it and are not
@@ -55,31 +53,35 @@ def find_symmetries(
     places, middle, diagonal = _normalized(points)
     if len(places) > limit:
         places = places[draw_by_area(read_surface(places), limit, random, max_ratio=9.0)]
-    surface = read_surface(places)
     test = SymmetryTest(places, random)
-    group = SymmetryGroup(test)
+    group, rejected = None, [math.inf]
     if test.tolerance > 0.0:
-        for motion in candidates(surface, test.queries, random):
-            group.consider(motion)
-        group.drop_crowded_mirrors()
-        group.complete()
+        group, outside = find_group(test, candidates(test.surface, test.queries, random))
+        rejected += outside
 
-    def vectors(motion: Motion) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        point, direction = middle + diagonal * motion.centered().point, motion.direction
-        # Of two opposite vectors the one whose largest number is positive.
-        return torch.from_numpy(direction * np.sign(direction[np.argmax(np.abs(direction))])), torch.from_numpy(point)
+    turns: list[RotationalSymmetry] = []
+    mirrors: list[MirrorSymmetry] = []
+    if group is not None:
+        center = group.motions.center()
+        for axis, order, rows in group.axes():
+            foot = torch.from_numpy(middle + diagonal * (center - (center @ axis) * axis))
+            turns.append(RotationalSymmetry(_signed(axis), foot, order, _root(group.squares[rows].mean())))
+        for normal, row in group.planes():
+            foot = torch.from_numpy(middle + diagonal * (center @ normal) * normal)
+            mirrors.append(MirrorSymmetry(_signed(normal), foot, _root(group.squares[row])))
+    turns.sort(key=lambda each: (not each.continuous, -(each.order or 0), each.error))
+    mirrors.sort(key=lambda each: each.error)
+    return Symmetries(tuple(turns), tuple(mirrors), test.spacing * diagonal, test.tolerance, _root(min(rejected)))
 
-    turns = sorted(group.turns, key=lambda each: (not each.continuous, -(each.order or 0), each.error))
-    mirrors = sorted(group.mirrors, key=lambda each: each.error)
-    return Symmetries(
-        tuple(RotationalSymmetry(*vectors(each), each.order, each.error) for each in turns),
-        tuple(MirrorSymmetry(*vectors(each), each.error) for each in mirrors),
-        test.spacing * diagonal,
-        test.tolerance,
-        # Of what was tried and failed, only what is no symmetry after all; some failed before what implies them was
-        # found.
-        min((each.error for each in group.rejected if not group.knows(each)), default=math.inf),
-    )
+
+def _root(square: float) -> float:
+    """Return an error from its square, which chance makes negative for a symmetry as often as positive."""
+    return math.sqrt(max(square, 0.0))
+
+
+def _signed(direction: Vector) -> Float[Tensor, " 3"]:
+    """Return the one of two opposite vectors whose largest number is positive."""
+    return torch.from_numpy(direction * np.sign(direction[np.argmax(np.abs(direction))]))
 
 
 def _normalized(
