@@ -1,15 +1,20 @@
 """Kernel families: what makes them covariances, what they are invariant to, and splines as an independent oracle."""
 
 from dataclasses import replace
+from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
 import torch
 from scipy.interpolate import RBFInterpolator
 
+from avmsf.field.gains import kernels
 from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
+from avmsf.field.gains.mixture_gains import MixtureGains
 from factories.gain_cases import POSITIONAL, SIZE, draw, impacts, plate
 from oracles import gain_model as oracle
 
@@ -37,6 +42,28 @@ def turn() -> torch.Tensor:
 def alike(points: torch.Tensor) -> Sites:
     """Return impacts that all go along one direction."""
     return Sites(points, UP.expand(len(points), 3))
+
+
+def test_the_family_of_the_page_takes_part_in_fits_and_files(monkeypatch):
+    page = (Path(__file__).parents[3] / "docs" / "gain-models.md").read_text()
+    code = page[page.index("    class Periodic") : page.index("### Elastic mode shapes")]
+    made: dict[str, type[KernelFamily]] = {}
+    exec(dedent(code), {"torch": torch, "KernelFamily": KernelFamily}, made)
+    monkeypatch.setitem(kernels.POSITIONAL, "periodic", made["Periodic"])
+    sites = alike(draw(12, 3, seed=1))
+    around = torch.atan2(*(sites.points - sites.points.mean(0))[:, [1, 0]].T)
+    values = torch.stack([around.cos(), (around + 1.0).sin()], dim=1).to(torch.complex128)
+    families = [kind(sites, 1.0) for kind in kernels.POSITIONAL.values()]
+    ones = torch.ones(2, dtype=torch.float64)
+    given = fit_mixture(
+        families, MeasuredGains(values, 1e-6 * ones, 500.0 * (ones + ones.cumsum(0)), ones), sites.points.float(),
+        directional=False,
+    )  # fmt: skip
+    share = dict(zip((each.kind for each in given.families), given.shares().mean(1).tolist(), strict=True))
+    assert share["periodic"] > 0.9
+    back = MixtureGains.restore(given.record(), given.tensors())
+    asked = draw(5, 3, seed=2)
+    assert torch.equal(back.predict(asked).mean, given.predict(asked).mean)
 
 
 def test_elastic_kernels_are_loadings_times_factors():
@@ -144,9 +171,9 @@ def test_a_larger_object_has_the_same_kernels(kind, count):
 def test_contacts_may_lie_at_a_point_on_a_line_or_in_a_plane(kind, dimensions, count):
     family, others = kind(alike(scattered(dimensions, count)), 0.4), alike(scattered(3, 6, seed=8))
     for each in (family.reference, others):
-        kernels = family.between(each, each)
-        assert bool(torch.isfinite(kernels).all())
-        assert float(torch.linalg.eigvalsh(kernels).min()) > -1e-9 * float(kernels.abs().max())
+        among = family.between(each, each)
+        assert bool(torch.isfinite(among).all())
+        assert float(torch.linalg.eigvalsh(among).min()) > -1e-9 * float(among.abs().max())
 
 
 def test_smooth_kernels_are_the_written_ones():
