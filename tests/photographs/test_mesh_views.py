@@ -336,6 +336,8 @@ def test_bad_requests_are_refused() -> None:
         render_views(ball, [facing(8)], supersample=0)
     with raises(CaptureError, name="background", value=(255.0, 255.0, 255.0)):
         render_views(ball, [facing(8)], background=(255.0, 255.0, 255.0))
+    with raises(CaptureError, name="area", value=0.0):
+        MeshTracer(Surface(torch.zeros(3, 3), torch.tensor([[0, 1, 2]])))
     with raises(CaptureError, name="surface", value=0.0):
         orbit_cameras(Surface(torch.zeros(2, 3), torch.zeros(0, 3, dtype=torch.int64)))
 

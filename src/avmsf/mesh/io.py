@@ -160,6 +160,13 @@ def check_corners(faces: np.ndarray, vertices: int) -> None:
             raise CaptureError(message, name="faces", value=corner)
 
 
+def check_area(corners: np.ndarray) -> None:
+    """Raise CaptureError where no triangle of these corners [faces, 3, 3] has an area."""
+    if not np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
+        message = f"expected triangles with an area, got {len(corners)} without; export the mesh again"
+        raise CaptureError(message, name="area", value=0.0)
+
+
 def _plain_mesh(path: Path) -> bytes | None:
     """Return the rewritten content of an OBJ or GLB file; None where the file is plain already, or of another kind."""
     suffix = path.suffix.lower()

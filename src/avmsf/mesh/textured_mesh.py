@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from avmsf.errors import CaptureError, Remark
-from avmsf.mesh.io import check_corners, check_finite_vertices, load_parts
+from avmsf.mesh.io import check_area, check_corners, check_finite_vertices, load_parts
 from avmsf.mesh.surface import Surface
 
 GRAY = 0.7
@@ -230,8 +230,4 @@ def _check_mesh(vertices: Tensor, faces: Tensor) -> None:
         )
     check_finite_vertices(vertices.numpy())
     check_corners(faces.numpy(), len(vertices))
-    corners = vertices.double()[faces]
-    doubled = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if not bool((doubled != 0).any()):
-        message = f"expected triangles with an area, got {len(faces)} without; export the mesh again"
-        raise CaptureError(message, name="area", value=0.0)
+    check_area(vertices.double()[faces].numpy())

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.errors import CaptureError
+from avmsf.mesh.io import check_area
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.texture import TextureAtlas
@@ -52,8 +53,11 @@ class MeshTracer:
     """A surface's triangles made ready for the rays of cameras (by Embree, on the CPU)."""
 
     def __init__(self, surface: Surface) -> None:
+        """Raise CaptureError for a surface without area."""
         self.vertices, self.faces = surface.vertices.double().numpy(), surface.faces.numpy()
-        self.caster = RayCaster(self.vertices[self.faces])
+        corners = self.vertices[self.faces]
+        check_area(corners)
+        self.caster = RayCaster(corners)
 
     def depth(self, camera: Camera) -> Float[Tensor, "height width"]:
         """Return the depth of the face behind the center of each pixel, meters along the optical axis.
