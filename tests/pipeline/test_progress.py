@@ -42,5 +42,8 @@ def test_a_stage_is_a_line_with_its_time_on_the_right(stream: type, monkeypatch:
 def test_quiet_leaves_notes_and_verbose_adds_parts(
     options: dict, count: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    work(ProgressDisplay(**options))
-    assert len(capsys.readouterr().err.splitlines()) == count
+    display = ProgressDisplay()
+    for _ in range(2):
+        display.begin(**options)
+        work(display)
+        assert len(capsys.readouterr().err.splitlines()) == count

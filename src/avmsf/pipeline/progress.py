@@ -35,10 +35,13 @@ class ProgressDisplay:
     """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready."""
 
     def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
-        """Show nothing but notes with `quiet`, and with `verbose` print each part of a stage as it begins."""
-        self.quiet, self.verbose = quiet, verbose
         self._bar: Progress | None = None
         self._shown: tuple[str, TaskID] | None = None
+        self.begin(quiet=quiet, verbose=verbose)
+
+    def begin(self, *, quiet: bool = False, verbose: bool = False) -> None:
+        """Begin anew: with `quiet` show nothing but notes, with `verbose` print each part of a stage as it begins."""
+        self.quiet, self.verbose = quiet, verbose
         self._objects, self._begun = 0, time.monotonic()
 
     def __enter__(self) -> "ProgressDisplay":
