@@ -21,7 +21,7 @@ def work(display: ProgressDisplay) -> None:
         display.listener.step("splat", 1, 2, "loss [red]1")
         display.listener.ready("splat", 2.0)
         display.listener.ready("modes", None)
-        display.objects("mug", 1, 1)
+        display.objects()("mug", 1, 1)
         display.listener.note("few recordings")
 
 
@@ -42,8 +42,7 @@ def test_a_stage_is_a_line_with_its_time_on_the_right(stream: type, monkeypatch:
 def test_quiet_leaves_notes_and_verbose_adds_parts(
     options: dict, count: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    display = ProgressDisplay()
+    display = ProgressDisplay(**options)
     for _ in range(2):
-        display.begin(**options)
         work(display)
         assert len(capsys.readouterr().err.splitlines()) == count

@@ -106,7 +106,7 @@ def _run(words: list[str]) -> int:
             # A verb imports what computes when it runs: help and mistakes are answered before torch is loaded.
             options = options_of(words[0], words[1:])
             options.check_inputs()
-            display.begin(quiet=options.quiet, verbose=options.verbose)
+            display.quiet, display.verbose = options.quiet, options.verbose
             verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
             display.doing("loading")
@@ -133,7 +133,7 @@ def _run(words: list[str]) -> int:
             code = INTERRUPTED
         finally:
             display.close()
-            display.begin()
+            display.quiet = display.verbose = False
         return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
 
 

@@ -1,7 +1,7 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
 import shlex
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from avmsf.datasets.dataset import Dataset
     from avmsf.evaluation.case_run import Evaluation
     from avmsf.evaluation.registry import Protocol
-    from avmsf.evaluation.results import ResultsFolder
     from avmsf.evaluation.task import Method, VisualInput
 
 OPTIONS = {"predefined": ("test",), "shots": ("counts", "starts")}
@@ -162,6 +161,7 @@ def run(options: Options) -> int:
     from avmsf.evaluation.objects import choose_objects, members
     from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
     from avmsf.evaluation.results import IDENTITY, ResultsFolder
+    from avmsf.evaluation.runner import run_objects
 
     protocol = _protocol_of(options)
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
@@ -184,7 +184,8 @@ def run(options: Options) -> int:
     names = tuple(method.name for method in methods)
     write = partial(write_summary, results, subsets=groups, wanted=dict.fromkeys(objects, names))
     try:
-        run_shown(evaluation, objects, results, options.workers, options.ray, after_each=write)
+        shown = display.objects(write)
+        run_objects(evaluation, objects, results, workers=options.workers, address=options.ray, progress=shown)
         summary = write()
         parts = write_page(results)
         figures = write_figures(results) if options.figures else []
@@ -302,29 +303,6 @@ def _note_start(methods: "Sequence[Method]", time_zero: TimeZero | None) -> None
         wanted = method.pipeline.time_zero if isinstance(method, FieldMethod) else None
         if wanted not in (None, time_zero):
             say(f"note: {method.name} is published with sounds from their {wanted}s: --time-zero {wanted}")
-
-
-def run_shown(
-    evaluation: "Evaluation",
-    objects: Sequence[str],
-    results: "ResultsFolder",
-    workers: int,
-    address: str | None,
-    *,
-    after_each: Callable[[], object] = lambda: None,
-) -> None:
-    """Run an evaluation under a progress bar, and call `after_each` after each object."""
-    from avmsf.evaluation.runner import run_objects
-
-    finished = [0]
-
-    def show(message: str, done: int, total: int) -> None:
-        if done > finished[0]:
-            after_each()
-        finished[0] = done
-        display.objects(message, done, total)
-
-    run_objects(evaluation, objects, results, workers=workers, address=address, progress=show)
 
 
 def settled_lifts(

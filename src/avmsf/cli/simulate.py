@@ -103,7 +103,7 @@ def run(options: Options) -> int:
     assert options.output is not None
     recipes, folder = _chosen(options, options.output)
     try:
-        simulate_set(recipes, folder, cache=options.cache, progress=display.objects)
+        simulate_set(recipes, folder, cache=options.cache, progress=display.objects())
     except KeyboardInterrupt:
         say("avmsf simulate: interrupted; repeat the command to continue")
         return INTERRUPTED

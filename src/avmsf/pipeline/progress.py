@@ -35,14 +35,10 @@ class ProgressDisplay:
     """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready."""
 
     def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+        """Show nothing but notes with `quiet`, and with `verbose` print each part of a stage as it begins."""
+        self.quiet, self.verbose = quiet, verbose
         self._bar: Progress | None = None
         self._shown: tuple[str, TaskID] | None = None
-        self.begin(quiet=quiet, verbose=verbose)
-
-    def begin(self, *, quiet: bool = False, verbose: bool = False) -> None:
-        """Begin anew: with `quiet` show nothing but notes, with `verbose` print each part of a stage as it begins."""
-        self.quiet, self.verbose = quiet, verbose
-        self._objects, self._begun = 0, time.monotonic()
 
     def __enter__(self) -> "ProgressDisplay":
         return self
@@ -75,12 +71,22 @@ class ProgressDisplay:
         """Print that a stage is ready, with its time on the right."""
         self.say(f"{name:24}{'cached' if seconds is None else f'{seconds:.1f} s':>12}")
 
-    def objects(self, message: str, done: int, total: int) -> None:
-        """Show how many objects are done, and what begins or ends; print a line for each object that is done."""
-        if done > self._objects:
-            self.say(f"{message} ({done} of {total}, {time.monotonic() - self._begun:.0f} s)")
-        self._objects = done
-        self._show("objects", message, done, total)
+    def objects(self, after_each: Callable[[], object] = _ignore) -> Callable[[str, int, int], None]:
+        """Return what receives which of several objects begins or ends, how many are done, and how many there are.
+
+        When one is done it calls `after_each` and prints a line.
+        """
+        finished, begun = 0, time.monotonic()
+
+        def show(message: str, done: int, total: int) -> None:
+            nonlocal finished
+            if done > finished:
+                after_each()
+                self.say(f"{message} ({done} of {total}, {time.monotonic() - begun:.0f} s)")
+            finished = done
+            self._show("objects", message, done, total)
+
+        return show
 
     def close(self) -> None:
         """Remove the line that moves, until something is shown again."""
