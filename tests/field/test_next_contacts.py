@@ -123,7 +123,7 @@ def test_what_is_not_known_of_places_has_no_negative_variance(made: type, count:
     contacts = bar_contacts(count)
     rows = [*range(count), 0]
     known = made(contacts[rows], drawn_gains(contacts, seed=4)[rows]).covariances(bar_contacts(40, seed=9), None)
-    for covariance, noise in known:
+    for _, covariance, noise in known:
         size = float(torch.diagonal(covariance).max())
         assert noise > 0
         assert torch.allclose(covariance, covariance.T, atol=1e-9 * size)

@@ -134,7 +134,8 @@ class _ExpectedError:
         places = torch.cat([points, candidates.points])
         directions = torch.cat([gains.sites(points).directions, candidates.directions])
         weights = (1.0 / (4.0 * field.bank.damping)).tolist()
-        for weight, (covariance, noise) in zip(weights, gains.covariances(places, directions), strict=True):
+        for mode, covariance, noise in gains.covariances(places, directions):
+            weight = weights[mode]
             self.variance += weight * torch.diagonal(covariance)[: self.points].clamp_min(0.0)
             self.modes.append((weight * covariance[:, self.points :], weight * noise))
         self.energy = float(energy_of(field, gains.predict(points.float()).parts).mean() + self.variance.mean())

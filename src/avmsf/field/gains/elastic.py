@@ -82,7 +82,8 @@ class Elastic(KernelFamily):
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
         self.frequency_weights = torch.softmax(frequency_log_prior(largest_factor), dim=0)
         """Probability of each pair of `FACTORS` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
-        self._latest: tuple[tuple[Sites, Float64[Tensor, "sites shapes"]], ...] = ()
+        # Shared by the families that are taken of this one.
+        self._latest: list[tuple[Sites, Float64[Tensor, "sites shapes"]]] = []
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
@@ -229,11 +230,10 @@ class Elastic(KernelFamily):
         if sites is self.reference:
             return self._known
         # Covariances ask for the same impacts several times in a row.
-        latest = self._latest
-        found = next((along for known, along in latest if known is sites), None)
+        found = next((along for known, along in self._latest if known is sites), None)
         if found is None:
             found = self.modes.gains(sites.points, sites.directions)
-            self._latest = (*latest[-1:], (sites, found))
+            self._latest[:] = [*self._latest[-1:], (sites, found)]
         return found
 
     def _residual_kernel(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:

@@ -31,6 +31,8 @@ _FORM_ENTRIES = 16_000_000
 """Largest number of entries of one family's matrices for the variance, which are kept: 128 MB."""
 _PRODUCTS = 64
 """Sites whose products of factors are held at once."""
+_COVARIANCE_KERNELS = 8
+"""Kernels whose covariances between places are held at once."""
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
 """Families that know something of the object, and the entry of the record with its size."""
 
@@ -145,29 +147,32 @@ class MixtureGains(GainModel):
 
     def covariances(
         self, contacts: Float64[Tensor, "places 3"], directions: Float64[Tensor, "places 3"] | None
-    ) -> Iterator[tuple[Float64[Tensor, "places places"], float]]:
-        """Yield the posterior covariance of each mode's gains at places, and the noise variance of one more gain.
+    ) -> Iterator[tuple[int, Float64[Tensor, "places places"], float]]:
+        """Yield each mode, its gains' posterior covariance at places, and the noise variance of one more gain.
 
-        By the mode's most probable hypothesis; both are sums over the two parts of the gains.
+        Modes come in no order. By the mode's most probable hypothesis; both are sums over the two parts of the gains.
         """
         sites, weights, values = self.sites(contacts, directions), self.mixture.weights, self.mixture.values
         best = (weights * values.square().sum(0)).reshape(*weights.shape[:2], 2, -1).sum(2).flatten(0, 1).argmax(0)
         rows, shares = best // weights.shape[1], best % weights.shape[1]
         used, place = torch.unique(rows, return_inverse=True)
-        # Lists, for one tensor of all would take the memory twice.
-        own, cross = (
-            [kernel for family in self.families_of(used) for kernel in family.between(sites, others)]
-            for others in (sites, self.training)
-        )
-        for mode, (row, share, column) in enumerate(zip(rows.tolist(), shares.tolist(), place.tolist(), strict=True)):
-            noise = float(self.mixture.noise_variance[share, mode])
-            root = torch.linalg.cholesky(self.mixture.kernels[row] + noise * torch.eye(len(values)).double())
-            half, parts = (
-                torch.linalg.solve_triangular(root, each, upper=False)
-                for each in (cross[column].T, values[:, [mode, mode + len(best)]])
+        # Some at a time: the kernels of all modes between many places would be the largest tensor of a fit.
+        for first in range(0, len(used), _COVARIANCE_KERNELS):
+            kernels = used[first : first + _COVARIANCE_KERNELS]
+            own, cross = (
+                [kernel for family in self.families_of(kernels) for kernel in family.between(sites, others)]
+                for others in (sites, self.training)
             )
-            size = float(parts.square().sum()) / len(values)
-            yield size * (own[column] - half.T @ half), size * noise
+            for mode in torch.nonzero(torch.isin(rows, kernels)).flatten().tolist():
+                row, noise = int(place[mode]) - first, float(self.mixture.noise_variance[shares[mode], mode])
+                known = self.mixture.kernels[rows[mode]] + noise * torch.eye(len(values)).double()
+                root = torch.linalg.cholesky(known)
+                half, parts = (
+                    torch.linalg.solve_triangular(root, each, upper=False)
+                    for each in (cross[row].T, values[:, [mode, mode + len(best)]])
+                )
+                size = float(parts.square().sum()) / len(values)
+                yield mode, size * (own[row] - half.T @ half), size * noise
 
     def families_of(self, rows: Int[Tensor, " rows"]) -> Iterator[KernelFamily]:
         """Yield the families of some of the mixture's kernels, given by their sorted rows, with these kernels alone."""
