@@ -1,4 +1,21 @@
-"""Stages from a capture folder to a sound field."""
+"""Stages from a capture folder to a sound field, each kept in a folder and made again only where something changed.
+
+In goes a `Capture` (recordings, contacts, and a mesh, photographs, a video or Gaussians) and one `PipelineConfig`; out
+comes a `SoundField`. Start reading at `fit.fit`, which `avmsf.fit` and `avmsf fit` call.
+
+- `stages`: a `Stage` is a name, the stages that it depends on and a function; a `Pipeline` makes them when they are
+  asked for, a `StageFolder` (`CAPTURE/.avmsf`) keeps each output next to the record of what it was made from.
+- `views`, `scene`: from what shows the object to views with cameras and masks (structure from motion, rendering), to
+  Gaussians, and to features on the surface (`features`: lifted, reduced, pooled over symmetries).
+- `shape`, `cloud_shape`: the object's points, symmetries and surface, from its mesh or from views. `frame_check`: that
+  contacts, mesh, masks and Gaussians are of one object in one frame. `visuals`: what `avmsf check` says of them.
+- `bodies`: the finite-element models that a surface may enclose. `fit`: modes and gains. `guess`: a field of a known
+  shape and material without recordings.
+- `config`: settings of all stages, and the presets `default` and `paper`. `record`: what a field's file says of them.
+- `progress`: what the stages report, and how it is shown.
+
+Raises AvmsfError, by its kind: CaptureError, SceneError, SimulationError, ExtractionError, FitError, FolderInUseError.
+"""
 
 import lazy_loader
 
