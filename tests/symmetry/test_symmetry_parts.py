@@ -85,6 +85,9 @@ def test_nothing_is_a_symmetry_where_chance_would_decide():
     rough = divided(egg(240) + 0.05 * np.random.default_rng(1).normal(size=(240, 3)))
     assert rough.noise_error > TOLERANCE**2
     assert rough.tolerance == 0.0
+    # Points all over a box's inside show no surface.
+    inside = np.stack(np.meshgrid(*(np.linspace(-0.4, 0.4, count) for count in (12, 9, 6))), axis=-1).reshape(-1, 3)
+    assert divided(inside * np.array([1.0, 0.7, 0.4])).tolerance == 0.0
 
 
 def test_a_part_on_one_side_is_wrong():

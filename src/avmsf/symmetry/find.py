@@ -38,7 +38,8 @@ def find_symmetries(
     three quarters; a spacing below 1 or above 1.6 % of the object's diagonal counts as that. A distance counts up to 3
     spacings. So the tolerance of .38 lets the whole surface be off by that many spacings, or (.38 / 3)^2 = 1.6 % of it
     have no counterpart at all. It holds for the mean over a group; each motion may have 1.15 times the error. Where the
-    points are so few or noisy that chance changes squared errors by more than the tolerance, no symmetry is returned.
+    points are so few or noisy that chance changes squared errors by more than the tolerance, or where they fill a
+    volume and show no surface, no symmetry is returned.
 
     An object that is damaged, or of which large parts are in no view, has only the symmetries of what is there.
 
