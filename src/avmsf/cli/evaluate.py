@@ -1,11 +1,11 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from avmsf.datasets.dataset import Dataset
     from avmsf.evaluation.case_run import Evaluation
     from avmsf.evaluation.registry import Protocol
+    from avmsf.evaluation.report_tables import Section
     from avmsf.evaluation.task import Method, VisualInput
 
 OPTIONS = {"predefined": ("test",), "shots": ("counts", "starts")}
@@ -196,20 +197,11 @@ def run(options: Options) -> int:
             say(f"wrote {SUMMARY} and {TABLES} in {folder}{lacking}")
         say(f"avmsf evaluate: interrupted; run the same command again to continue from {folder}")
         return INTERRUPTED
-    if not summary["methods"]:
-        first = summary["failures"][0]["failure"] if summary["failures"] else "no object"
-        count, got = len(summary["failures"]), f"none: {first}"
-        raise EvaluationError.expected("a result of a method", count, got=got, file=folder, name="failures")
-    lines = [
-        # Standard errors, which are in the reports, would fold every line of a narrow screen.
-        table(part.title, part.columns, [[cell.partition(" ±")[0] for cell in row] for row in part.rows])
-        for part in parts[1:3]
-        if part.columns
-    ]
     failures = summary["failures"]
-    lines += [f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}" for each in failures[:_SHOWN]]
-    if failures:
-        lines.append(f"{counted(len(failures), 'failure')}, listed in {TABLES}; run the command again to retry")
+    if not summary["methods"]:
+        got = f"none: {failures[0]['failure'] if failures else 'no object'}"
+        raise EvaluationError.expected("a result of a method", len(failures), got=got, file=folder, name="failures")
+    lines = [*_tables(parts[1:3]), *_failures(failures)]
     lines += [f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", *(f"wrote {path}" for path in figures)]
     show("\n".join(lines), json=options.json)
     if options.json:
@@ -217,6 +209,22 @@ def run(options: Options) -> int:
     next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
     next_command(f"avmsf evaluate {'farthest' if protocol.name == 'shots' else 'shots'}", options.data)
     return 0
+
+
+def _tables(parts: "Sequence[Section]") -> list[str]:
+    """Return tables without standard errors, which are in the reports and would fold a narrow screen's lines."""
+    return [
+        table(part.title, part.columns, [[cell.partition(" ±")[0] for cell in row] for row in part.rows])
+        for part in parts
+        if part.columns
+    ]
+
+
+def _failures(failures: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the first failures, and how many there are."""
+    lines = [f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}" for each in failures[:_SHOWN]]
+    count = counted(len(failures), "failure")
+    return [*lines, f"{count}, listed in the report; run the command again to retry"] if failures else []
 
 
 def _protocol_of(options: Options) -> "Protocol":
