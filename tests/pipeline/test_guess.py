@@ -22,8 +22,8 @@ from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.mesh.surface import Surface, write_surface
+from avmsf.pipeline.bodies import expect_no_recordings, guess_field
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
-from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from factories.raising import raises
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.02, 0.012

@@ -28,9 +28,8 @@ from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import finder_named
-from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.bodies import candidate_bodies, expect_no_recordings, guess_field
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE, PipelineConfig
-from avmsf.pipeline.guess import expect_no_recordings, guess_field
 from avmsf.pipeline.progress import ProgressDisplay, ProgressListener
 from avmsf.pipeline.record import modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import SceneStages
