@@ -11,7 +11,7 @@ import torch
 
 from avmsf.cli import edit, main
 from avmsf.cli.edit import Options, run
-from avmsf.cli.options.checks import OutputError
+from avmsf.cli.paths import OutputError
 from avmsf.editing.material import RATIO_ONLY, change_material, infer_material, rayleigh_damping
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.editing.reference import Reference

@@ -8,7 +8,7 @@ import soundfile
 import torch
 
 from avmsf.cli import main
-from avmsf.cli.options.checks import OutputError
+from avmsf.cli.paths import OutputError
 from avmsf.cli.writing import write_sound
 from avmsf.field.store import save
 from avmsf.modal.residual_noise import Residual

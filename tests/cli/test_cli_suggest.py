@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli.options.checks import OutputError
+from avmsf.cli.paths import OutputError
 from avmsf.cli.suggest import Options, run
 from avmsf.errors import FitError
 from avmsf.field.store import save

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli.options.paths import ExistingField, InputError
+from avmsf.cli.paths import ExistingField, InputError
 from avmsf.errors import SimulationError
 from avmsf.fem.material import material_named
 from avmsf.gaussians.ply_header import NEEDED

@@ -12,7 +12,7 @@ import trimesh
 from avmsf.cli import main
 from avmsf.cli.fit import Options
 from avmsf.cli.info import gains_at
-from avmsf.cli.options.checks import OutputError
+from avmsf.cli.paths import OutputError
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from avmsf.mesh import Surface, read_surface

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.locate import Options, run
-from avmsf.cli.options.checks import OutputError
+from avmsf.cli.paths import OutputError
 from avmsf.errors import CaptureError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save

@@ -139,8 +139,7 @@ def _run(words: list[str]) -> int:
 
 def options_of(verb: str, words: Sequence[str]) -> Any:
     """Return a verb's options that the words spell. Raises SystemExit for help and for words that are no options."""
-    home = "avmsf.cli.options" if verb == "check" else "avmsf.cli"
-    return import_module(f"{home}.{verb}").Options.parse(words)
+    return import_module(f"avmsf.cli.{verb}").Options.parse(words)
 
 
 def _report_error(error: AvmsfError, words: Sequence[str]) -> int:

@@ -1,23 +1,27 @@
 """`avmsf check`: what each recording of a capture is worth, what a dataset holds, and what is wrong."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
+import tyro
 
 from avmsf._utils.text import counted
-from avmsf.capture import CaptureReport, CaptureSettings, Impacts
-from avmsf.capture.folder import check_and_read
-from avmsf.capture.issues import shared_problems
-from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
-from avmsf.cli.alignment import AlignmentReport
-from avmsf.cli.options.check import Options
-from avmsf.cli.printing import console, decimals, doing, next_command, print_json, say, table
-from avmsf.datasets import DatasetReport, ObjectReport, open_dataset
+from avmsf.capture.settings import SETTINGS, TABLE, CaptureSettings
+from avmsf.capture.table import read_rows
+from avmsf.cli.common import Flag, Printing, read_settings
+from avmsf.cli.paths import Existing, SettingsFile
+from avmsf.cli.printing import decimals, doing, next_command, print_json, say, show, table
+from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import CaptureError, ExtractionError
-from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.modal.extraction.finders import HighResolution
-from avmsf.pipeline.visuals import inputs, misplaced
+
+if TYPE_CHECKING:
+    from avmsf.capture import CaptureReport, Impacts
+    from avmsf.capture.proposals import Proposal
+    from avmsf.cli.alignment import AlignmentReport
+    from avmsf.datasets import DatasetReport, ObjectReport
+    from avmsf.modal.extraction.extract import Extraction
 
 UNREADABLE = 2
 _STRONGEST = 32
@@ -26,42 +30,87 @@ MAX_PRINTED = 1000
 """Rows, and messages below them, of the printed report: as much as a terminal's scrollback holds."""
 
 
+@dataclass(frozen=True)
+class Options(Printing):
+    """Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.
+
+    Prints one row per recording and the problems below. The peak is relative to full scale, the noise (root mean
+    square) to the recording's own peak. The delay, in samples, aligns a recording with the others. The exit code is 0
+    if the capture can be read, with or without warnings, and 2 if it cannot.
+
+    Of a dataset (ObjectFolder Real, RealImpact, or a folder of captures) the objects are listed instead: what can be
+    read, and what is missing; sounds are not read. The exit code is then 0 if at least one object can be read.
+    """
+
+    capture: tyro.conf.Positional[
+        Annotated[Path, tyro.conf.arg(metavar="CAPTURE|DATASET"), Existing("a capture or a dataset", ("a folder",))]
+    ]
+    """Folder with impacts.csv and the recordings that it names, or of a dataset."""
+    settings: SettingsFile = None
+    """Use this capture.toml instead of the folder's own."""
+    write_settings: Flag = False
+    """Write the proposed settings, with the reasons, to the folder's capture.toml, and check with them. An existing
+    capture.toml is not changed."""
+    contact_data: Annotated[
+        Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))
+    ] = None
+    """ObjectFolder Real's contacts: SonicGauss's lists in a folder, or one of them."""
+
+    @property
+    def is_dataset(self) -> bool:
+        """Whether the folder is a dataset: it holds no recordings itself."""
+        return not (self.capture / TABLE).is_file() and not any(self.capture.glob("*.wav"))
+
+    def check_inputs(self) -> None:
+        """Raise the package's errors for options that cannot be used, before anything is loaded."""
+        super().check_inputs()
+        if self.write_settings and self.settings is not None:
+            wanted, advice = "--write-settings without it", f"the new {SETTINGS} would not contain its settings"
+            raise CaptureError.expected(wanted, got="both", file=self.settings, name="--write-settings", advice=advice)
+        if self.is_dataset:
+            detect_dataset(self.capture)
+            for option, given in (("--settings", self.settings), ("--write-settings", self.write_settings or None)):
+                if given is not None:
+                    raise CaptureError.expected("a capture with it", "a dataset", file=self.capture, name=option)
+        elif not self.json:
+            # JSON reports also what is wrong with the folder as a whole.
+            read_settings(self.capture, self.settings)
+            read_rows(self.capture)
+
+
 def run(options: Options) -> int:
     """Print the report; return 2 where the capture, or every object of a dataset, cannot be read."""
+    from avmsf.capture.folder import check_and_read
+    from avmsf.capture.issues import shared_problems
+    from avmsf.capture.proposals import propose_settings
+    from avmsf.cli.alignment import AlignmentReport
+    from avmsf.pipeline.visuals import inputs, misplaced
+
     if options.is_dataset:
         return _check_dataset(options)
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
-    screen = console(errors=options.json)
     doing(f"reading {options.capture}")
     visual = inputs(options.capture, settings)
     outside = [] if visual is None else misplaced(options.capture, settings, visual)
     factor = next((each.value for each in outside if each.name == "unit"), None)
     proposals = propose_settings(options.capture, settings, factor=factor)
     if proposals and options.write_settings:
-        _write(options, proposals, screen)
+        _write(options, proposals)
         if any(each.key == "unit" for each in proposals):
             outside = [each for each in outside if each.name != "unit"]
     report, impacts = check_and_read(options.capture, settings)
     doing("finding the modes that align the recordings")
     modes = None if impacts is None else _modes(impacts)
     aligned = None if modes is None or impacts is None else AlignmentReport.of(modes, impacts)
-    if report.recordings:
-        screen.print(_table(report, str(options.capture), aligned))
-    if visual is not None:
-        screen.print(visual.sentence, soft_wrap=True)
     # The folder's first, then the recordings', common ones once.
     problems = [*report.problems, *shared_problems(report.recordings)]
     problems += [] if visual is None else [*visual.problems, *visual.unused]
     problems += map(str, outside)
-    hidden = len(problems) - MAX_PRINTED
-    for problem in [*problems[:MAX_PRINTED], *([f"and {hidden} more; --json prints all"] if hidden > 0 else [])]:
-        screen.print(problem, soft_wrap=True)
-    if options.write_settings and not proposals:
-        left = "; settings that the messages above name are yours to choose" if problems else ""
-        screen.print(f"the folder's files determine no further setting: nothing was written{left}", soft_wrap=True)
-    if not options.write_settings:
-        for each in proposals:
-            screen.print(f"proposed: {each.line} (--write-settings writes it). {each.reason}", soft_wrap=True)
+    lines = [_table(report, str(options.capture), aligned)] if report.recordings else []
+    lines += [] if visual is None else [visual.sentence]
+    lines += [*_first(problems), *_settings_lines(options, proposals, bool(problems))]
+    if lines:
+        show("\n".join(lines), json=options.json)
     if options.json:
         print_json(
             {
@@ -74,14 +123,14 @@ def run(options: Options) -> int:
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again")
         return UNREADABLE
-    for sentence in (*(report.remarks if modes else ()), *(aligned.sentences() if aligned else ())):
-        screen.print(sentence, soft_wrap=True)
+    lines = [*report.remarks, *(aligned.sentences() if aligned else ())]
     if modes is None:
-        screen.print("no mode was found to align the recordings: noisy or too short (see avmsf modes)")
+        lines = ["no mode was found to align the recordings: noisy or too short (see avmsf modes)"]
     wrong = len(problems) + (modes is None)
     if aligned is not None:
         wrong += bool(aligned.not_aligned) + bool(aligned.inverted) + len(aligned.faults())
-    screen.print("no problem found" if not wrong else f"readable, with {counted(wrong, 'warning')}", soft_wrap=True)
+    verdict = f"readable, with {counted(wrong, 'warning')}" if wrong else "no problem found"
+    show("\n".join([*lines, verdict]), json=options.json)
     if visual is not None and visual.reconstructs:
         next_command("avmsf fit", options.capture, "-o field.safetensors")
     else:
@@ -89,31 +138,49 @@ def run(options: Options) -> int:
     return 0
 
 
-def _modes(impacts: Impacts) -> Extraction | None:
+def _first(problems: Sequence[str]) -> list[str]:
+    """Return the problems that are printed, and how many more there are."""
+    hidden = len(problems) - MAX_PRINTED
+    return [*problems[:MAX_PRINTED], *([f"and {hidden} more; --json prints all"] if hidden > 0 else [])]
+
+
+def _settings_lines(options: Options, proposals: "Sequence[Proposal]", has_problems: bool) -> list[str]:
+    """Return the proposed settings; with --write-settings, that there are none."""
+    if not options.write_settings:
+        return [f"proposed: {each.line} (--write-settings writes it). {each.reason}" for each in proposals]
+    left = "; settings that the messages above name are yours to choose" if has_problems else ""
+    return [] if proposals else [f"the folder's files determine no further setting: nothing was written{left}"]
+
+
+def _modes(impacts: "Impacts") -> "Extraction | None":
     """Return the strongest modes; None where there is no mode."""
+    from avmsf.modal.extraction.extract import extract_modes
+    from avmsf.modal.extraction.finders import HighResolution
+
     try:
         return extract_modes(impacts, HighResolution(modes=_STRONGEST))
     except ExtractionError:
         return None
 
 
-def _write(options: Options, proposals: Sequence[Proposal], screen: Console) -> None:
+def _write(options: Options, proposals: "Sequence[Proposal]") -> None:
     """Write the proposals and print them; raise `CaptureError` where they cannot be written."""
+    from avmsf.capture.proposals import settings_text, write_settings
+
     try:
         path = write_settings(options.capture, proposals)
     except CaptureError:
-        screen.print(settings_text(proposals), soft_wrap=True)
+        show(settings_text(proposals), json=options.json)
         raise
-    screen.print(f"{path}: written, with {', '.join(each.line for each in proposals)}", soft_wrap=True)
+    show(f"{path}: written, with {', '.join(each.line for each in proposals)}", json=options.json)
 
 
-def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -> object:
+def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None") -> str:
     delays = {} if aligned is None else aligned.delays
     left = [] if aligned is None else aligned.not_aligned
     doubtful = [] if aligned is None else [*left, *aligned.inverted, *aligned.rate_factors, *aligned.gain_changes_db]
-    # Short lines leave the width to the names of the recordings.
-    levels = ["peak\ndBFS", "noise dB\nre peak"]
-    columns = ["recording", "state", "length\ns", "rate\nHz", *levels, "clipped", "onset\ns", "second\nimpact s"]
+    levels = ["peak (dBFS)", "noise (dB)"]
+    columns = ["recording", "state", "length (s)", "rate (Hz)", *levels, "clipped", "onset (s)", "second impact (s)"]
     rows = [
         (
             row.file,
@@ -129,42 +196,40 @@ def _table(report: CaptureReport, title: str, aligned: AlignmentReport | None) -
         )
         for row in report.recordings[:MAX_PRINTED]
     ]
-    return table(title, [*columns, "delay\nsamples"] if delays else columns, rows, words=2)
+    return table(title, [*columns, "delay (samples)"] if delays else columns, rows, words=2)
 
 
 def _check_dataset(options: Options) -> int:
     """Print which objects of a dataset can be read, and what is missing; return 2 where none can be."""
+    from avmsf.datasets import open_dataset
+
     report = open_dataset(options.capture, contacts=options.contact_data).check()
-    screen = console(errors=options.json)
-    screen.print(_objects(report, f"{report.dataset} in {options.capture}"))
-    for line in _lines(report):
-        screen.print(line, soft_wrap=True)
+    lines = [_objects(report, f"{report.dataset} in {options.capture}"), *_lines(report)]
+    show("\n".join(lines), json=options.json)
     if options.json:
         print_json(asdict(report))
     readable = sum(_readable(each) for each in report.objects)
     if not readable:
         say(f"avmsf check: {options.capture}: expected a readable object, found none; fix the listed problems")
         return UNREADABLE
-    recordings = sum(each.recordings for each in report.objects)
-    screen.print(
-        f"{readable} of {counted(len(report.objects), 'object')} can be read, with {counted(recordings, 'recording')}",
-        soft_wrap=True,
-    )
+    objects = counted(len(report.objects), "object")
+    recordings = counted(sum(each.recordings for each in report.objects), "recording")
+    show(f"{readable} of {objects} can be read, with {recordings}", json=options.json)
     next_command("avmsf evaluate farthest", options.capture)
     return 0
 
 
-def _readable(report: ObjectReport) -> bool:
+def _readable(report: "ObjectReport") -> bool:
     return report.recordings >= 2
 
 
-def _lines(report: DatasetReport) -> list[str]:
+def _lines(report: "DatasetReport") -> list[str]:
     """Return what is not in the table, a line each: missing parts, then problems, then remarks."""
     problems = [f"{each.facts.identifier}: {problem}" for each in report.objects for problem in each.problems]
     return [*(f"missing: {part}" for part in report.missing), *problems, *(f"note: {each}" for each in report.remarks)]
 
 
-def _objects(report: DatasetReport, title: str) -> object:
+def _objects(report: "DatasetReport", title: str) -> str:
     rows = []
     for each in report.objects:
         facts = each.facts

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from avmsf.capture.settings import METRES
 from avmsf.capture.table import DIRECTION, REQUIRED, Row, is_inside, read_table
-from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Unit
+from avmsf.cli.common import Unit
+from avmsf.cli.paths import OutputError
 from avmsf.cli.printing import say
 from avmsf.errors import PositionError
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains

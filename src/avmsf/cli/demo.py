@@ -11,9 +11,8 @@ import tyro
 
 from avmsf._utils.files import way_out
 from avmsf._utils.text import printable
-from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Common
-from avmsf.cli.options.paths import NewFolder
+from avmsf.cli.common import Common
+from avmsf.cli.paths import NewFolder, OutputError
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 
 BEGUN = ".begun"

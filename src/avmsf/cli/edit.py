@@ -11,11 +11,10 @@ import tyro
 
 from avmsf._utils.text import counted, format_number, read_json
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.options.checks import OutputError, expect_device, expect_writable
-from avmsf.cli.options.common import Configured
-from avmsf.cli.options.paths import NEW_TENSORS, FieldFile, NewFile, PlotsFolder
-from avmsf.cli.options.settings import with_settings
+from avmsf.cli.common import Configured, expect_device
+from avmsf.cli.paths import NEW_TENSORS, FieldFile, NewFile, OutputError, PlotsFolder, expect_writable
 from avmsf.cli.printing import decimals, display, doing, next_command, print_json, say, show, table
+from avmsf.cli.settings import with_settings
 from avmsf.editing.config import STABLE_AUDIO, DistillationConfig, GuidedEditConfig, check_prompt
 from avmsf.errors import EditError
 from avmsf.fem.material import Material, material_named

@@ -11,11 +11,10 @@ import tyro
 
 from avmsf._utils.text import counted
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.options.checks import expect_device, expect_modes
-from avmsf.cli.options.common import Configured, Flag
-from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
-from avmsf.cli.options.settings import with_settings
+from avmsf.cli.common import Configured, Flag, expect_device, expect_modes
+from avmsf.cli.paths import CacheFolder, Existing, OutputFolder
 from avmsf.cli.printing import display, next_command, next_step, print_json, say, show, table
+from avmsf.cli.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.registry import PROTOCOLS, expect_suited, method_entry, protocol_named

@@ -13,8 +13,8 @@ import tyro
 from avmsf._utils.text import counted, format_number
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
-from avmsf.cli.options.common import Flag, Printing, Unit, option_of
-from avmsf.cli.options.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
+from avmsf.cli.common import Flag, Printing, Unit, option_of
+from avmsf.cli.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
 from avmsf.cli.printing import next_step, print_result, say
 from avmsf.errors import ExportError
 from avmsf.export.writing import SUFFIXES, Axis, Format, Precision, check_free

@@ -13,11 +13,10 @@ from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.options.checks import OutputError, expect_device, expect_rows, read_settings
-from avmsf.cli.options.common import Configured, Flag, option_of
-from avmsf.cli.options.paths import CacheFolder, Existing, NewFile, PlotsFolder, SettingsFile
-from avmsf.cli.options.settings import with_settings
+from avmsf.cli.common import Configured, Flag, expect_device, expect_rows, option_of, read_settings
+from avmsf.cli.paths import CacheFolder, Existing, NewFile, OutputError, PlotsFolder, SettingsFile
 from avmsf.cli.printing import display, doing, next_command, next_step, print_json, print_result, say, show
+from avmsf.cli.settings import with_settings
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import GainModelName

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.options.checks import expect_capture, read_settings
-from avmsf.cli.options.common import Printing
-from avmsf.cli.options.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
+from avmsf.cli.common import Printing, expect_capture, read_settings
+from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
 from avmsf.cli.printing import doing, next_command, print_json, say, show
 from avmsf.errors import SceneError
 from avmsf.field.header import FIELD

@@ -12,9 +12,8 @@ import tyro
 
 from avmsf._utils.text import format_number
 from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.cli.options.checks import OutputError
-from avmsf.cli.options.common import Flag, Printing, Unit
-from avmsf.cli.options.paths import ContactTable, Existing, FieldFile, OutputFolder, SettingsFile
+from avmsf.cli.common import Flag, Printing, Unit
+from avmsf.cli.paths import ContactTable, Existing, FieldFile, OutputError, OutputFolder, SettingsFile
 from avmsf.cli.printing import doing, next_command, print_json, say, show
 from avmsf.errors import AvmsfError, LocationError
 

@@ -6,9 +6,8 @@ from typing import Annotated
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.options.checks import expect_capture, read_settings
-from avmsf.cli.options.common import Printing
-from avmsf.cli.options.paths import CaptureFolder, PlotsFolder, SettingsFile
+from avmsf.cli.common import Printing, expect_capture, read_settings
+from avmsf.cli.paths import CaptureFolder, PlotsFolder, SettingsFile
 from avmsf.cli.printing import doing, next_command, print_json, say, show
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero

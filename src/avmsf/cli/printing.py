@@ -6,14 +6,10 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from avmsf._utils.text import printable
 from avmsf.pipeline.progress import ProgressDisplay
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
 
 display = ProgressDisplay()
 """What a verb is doing, on the standard error: quiet or verbose by the options of the verb that runs."""
@@ -55,14 +51,6 @@ def show(text: str, *, json: bool = False) -> None:
     """Print a result for people: to the standard output, or with `json`, which is for programs, the standard error."""
     display.close()
     print(printable(text), file=sys.stderr if json else sys.stdout, flush=True)
-
-
-def console(*, errors: bool) -> "Console":
-    """Return a console that `show` replaces, for `avmsf check`."""
-    from rich.console import Console
-
-    stream = sys.stderr if errors else sys.stdout
-    return Console(file=stream, width=None if stream.isatty() else 120, markup=False, highlight=False, emoji=False)
 
 
 def print_json(value: Mapping[str, Any]) -> None:

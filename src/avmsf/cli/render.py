@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from avmsf.cli.options.checks import OutputError, expect_writable
-from avmsf.cli.options.common import Flag, Printing, Unit
-from avmsf.cli.options.paths import ContactTable, FieldFile, NewFile, PositionList
+from avmsf.cli.common import Flag, Printing, Unit
+from avmsf.cli.paths import ContactTable, FieldFile, NewFile, OutputError, PositionList, expect_writable
 from avmsf.cli.printing import doing, next_command, print_result, say
 from avmsf.errors import PositionWarning
 from avmsf.modal.config import PulseShape

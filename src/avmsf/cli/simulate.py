@@ -8,10 +8,10 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.options.common import Configured, Flag
-from avmsf.cli.options.paths import CacheFolder, Existing, OutputFolder
-from avmsf.cli.options.settings import with_settings
+from avmsf.cli.common import Configured, Flag
+from avmsf.cli.paths import CacheFolder, Existing, OutputFolder
 from avmsf.cli.printing import display, next_command, print_json, print_result, say, show, table
+from avmsf.cli.settings import with_settings
 from avmsf.errors import SimulationError
 from avmsf.fem.material import MATERIALS
 from avmsf.simulate.recipe import EXAMPLE, NON_SYMMETRIC, SETS, ObjectRecipe, named_recipe

@@ -8,9 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options.checks import expect_modes
-from avmsf.cli.options.common import Flag, Printing
-from avmsf.cli.options.paths import Existing, ShapeFile
+from avmsf.cli.common import Flag, Printing, expect_modes
+from avmsf.cli.paths import Existing, ShapeFile
 from avmsf.cli.printing import print_json, say
 from avmsf.errors import StudioError
 from avmsf.pipeline.config import Preset

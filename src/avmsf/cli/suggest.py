@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from avmsf._utils.text import counted, format_number
-from avmsf.cli.options.checks import expect_capture
-from avmsf.cli.options.common import Flag, Printing
-from avmsf.cli.options.paths import FieldFile, OtherCapture, OutputFolder, SettingsFile
+from avmsf.cli.common import Flag, Printing, expect_capture
+from avmsf.cli.paths import FieldFile, OtherCapture, OutputFolder, SettingsFile
 from avmsf.cli.printing import doing, next_step, print_json, say, show, table
 from avmsf.errors import FitError
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.capture.audio import wav_bytes
-from avmsf.cli.options.checks import OutputError
+from avmsf.cli.paths import OutputError
 from avmsf.cli.render import Coding
 
 _LARGEST_INT16 = 2**15 - 1

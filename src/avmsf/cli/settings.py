@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import tyro
 
-from avmsf.cli.options.paths import Existing, InputError
+from avmsf.cli.paths import Existing, InputError
 
 T = TypeVar("T")
 Assignments = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")]

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
+from avmsf._utils.files import temporary_path, unwritable
 from avmsf._utils.headers import FEATURES_KEY, read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
-from avmsf.cli.options.checks import OutputError, expect_writable, is_folder
 from avmsf.errors import AvmsfError
 from avmsf.field.header import FIELD
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
@@ -34,6 +34,10 @@ FILE_SUFFIXES = frozenset(
 
 class InputError(AvmsfError):
     """An option names a file or folder that does not exist, or is of another kind."""
+
+
+class OutputError(AvmsfError):
+    """An option or an output of a command cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,32 @@ PositionList = Annotated[
 """Vectors, one for each time that the option is given."""
 NEW_TENSORS = NewFile((".safetensors",))
 """A field or features to write."""
+
+
+def expect_writable(path: Path | None) -> None:
+    """Raise `OutputError` where no file can be written at `path`, where one is given: before work of minutes."""
+    if path is None:
+        return
+    if is_folder(path):
+        raise OutputError.expected("the name of a file", "folder", got="a folder", file=path)
+    folder = path.parent
+    existing = next(place for place in (folder, *folder.resolve().parents) if place.exists())
+    if not existing.is_dir():
+        advice = f"choose another folder for {path.name}"
+        raise OutputError.expected("a folder", "file", got="a file", file=existing, advice=advice)
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a folder is at the path of an output. Raises `OutputError` where the system accepts no such path.
+
+    Its name may be too long, or a folder above it may not be searched.
+    """
+    try:
+        # Files are written under a longer name first.
+        (temporary_path(path) if path.name else path).exists()
+        return path.is_dir()
+    except OSError as error:
+        raise unwritable(path, error, raising=OutputError) from error
 
 
 def path_mark(hint: Any) -> Existing | NewFile | NewFolder | None:

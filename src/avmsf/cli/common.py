@@ -1,4 +1,4 @@
-"""What the options of all verbs have in common: how they are parsed and checked."""
+"""What the options of verbs have in common: how they are parsed and checked, before what computes is loaded."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -8,14 +8,24 @@ from typing import Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
-from avmsf.cli.options.paths import InputError, path_mark
-from avmsf.cli.options.settings import Assignments, SettingsTable, as_toml, settings_of
+from avmsf.capture.filenames import find_surface_file
+from avmsf.capture.issues import Issues
+from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import settings_of as capture_settings_of
+from avmsf.capture.table import present_impacts, read_impacts
+from avmsf.cli.paths import InputError, path_mark
+from avmsf.cli.settings import Assignments, SettingsTable, as_toml, settings_of
+from avmsf.errors import AvmsfError, CaptureError, ExtractionError
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 """An option that is off unless it is given."""
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 _RENAMED = {"--at": "--position", "--picture": "--plots", "--to-material": "--to"}
 """Options of earlier versions, and what they are called now."""
+DEVICES = ("cpu", "cuda")
+"""Kinds of devices that commands compute on."""
+_PLY_HEADER_BYTES = 1 << 16
+"""Bytes in which the header of a .ply ends: a hundred times those of a mesh with colors and normals."""
 T = TypeVar("T")
 # Not Self, which run-time checks of types cannot read in a dataclass.
 C = TypeVar("C", bound="Common")
@@ -118,3 +128,40 @@ class Configured(Printing, ABC):
 def option_of(name: str) -> str:
     """Return the option of a field without a prefix."""
     return f"--{name.replace('_', '-')}"
+
+
+def expect_device(name: str | None, *, raising: type[AvmsfError]) -> None:
+    """Raise `raising` for the name of a device of another kind than `DEVICES`."""
+    if name is not None and name.partition(":")[0] not in DEVICES:
+        raise raising.expected(" or ".join(DEVICES), name, name="device")
+
+
+def expect_modes(modes: int) -> None:
+    """Raise `ExtractionError` unless at least one mode is asked for."""
+    if modes < 1:
+        raise ExtractionError.expected("1 or more", modes, name="modes")
+
+
+def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
+    """Return the settings of a file, or without one those of a capture folder."""
+    return capture_settings_of(folder) if settings is None else CaptureSettings.read(settings)
+
+
+def expect_capture(folder: Path, settings: Path | None) -> None:
+    """Raise `CaptureError` for a capture folder whose table, settings or surface cannot be used, see `expect_rows`."""
+    expect_rows(folder, read_settings(folder, settings))
+
+
+def expect_rows(folder: Path, settings: CaptureSettings) -> None:
+    """Raise `CaptureError` for a capture folder whose table cannot be used, or whose .ply has no such header."""
+    present_impacts(folder, read_impacts(folder, settings, Issues()), Issues())
+    surface = find_surface_file(folder, settings)
+    if surface is None or surface.suffix.lower() != ".ply" or not surface.is_file():
+        return
+    with surface.open("rb") as file:
+        start = file.read(_PLY_HEADER_BYTES)
+    if not start.startswith(b"ply") or b"end_header" not in start:
+        raise CaptureError.expected(
+            "a mesh or point cloud", start[:8], got="a file without the header of a .ply", file=surface,
+            advice="export it again",
+        )  # fmt: skip
