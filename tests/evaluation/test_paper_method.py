@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 import torch
 
-from avmsf.cli.evaluate import inputs_of, settled_lifts
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
 from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.field_methods import NETWORK, FieldMethod
 from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.plan import available_encoders, visual_inputs
 from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.scores import MetricSettings
@@ -71,21 +71,20 @@ def no_dino(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_dino")
-def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere() -> None:
+    said = list[str]()
     with raises(SceneError, value="facebook/dinov2-base"):
-        settled_lifts(LiftConfig(), {"visual", "paper"})
-    usual, paper = settled_lifts(LiftConfig(), {"visual"})
+        available_encoders(LiftConfig(), {"visual", "paper"}, log=said.append)
+    usual, paper = available_encoders(LiftConfig(), {"visual"}, log=said.append)
     assert (usual.encoder, paper.encoder) == (DESCRIPTORS, DINO)
-    assert "descriptors" in capsys.readouterr().err
-    named = settled_lifts(LiftConfig(encoder=DESCRIPTORS), {"paper"})
+    assert any("descriptors" in line for line in said)
+    named = available_encoders(LiftConfig(encoder=DESCRIPTORS), {"paper"}, log=said.append)
     assert [each.encoder for each in named] == [DESCRIPTORS, DESCRIPTORS]
     assert named[1].onto == "gaussians"
 
 
 def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    loaded = []
+    loaded, said = [], list[str]()
 
     def load(name: str, *, device: torch.device, **_: Any) -> Encoder:
         loaded.append((name, device.type))
@@ -94,17 +93,17 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
     monkeypatch.setattr(DinoEncoder, "load", load)
 
     def read_by(protocol: str, *names: str) -> frozenset[Any]:
-        return inputs_of([method_named(name) for name in names], PROTOCOLS[protocol])
+        return visual_inputs([method_named(name) for name in names], PROTOCOLS[protocol])
 
     read = read_by("farthest", "knn3", "white-noise", "diffsound")
-    assert settled_lifts(LiftConfig(), read, device="cpu")[0] == LiftConfig()
-    assert settled_lifts(LiftConfig(), read_by("localize", "field-auto"))[0] == LiftConfig()
+    assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0] == LiftConfig()
+    assert available_encoders(LiftConfig(), read_by("localize", "field-auto"), log=said.append)[0] == LiftConfig()
     assert loaded == []
     # Recordings are located at the points that features have.
     assert read_by("localize", "nearest") == {"surface"}
     read = read_by("farthest", "field", "field-auto", "paper-grid")
     assert read == {"visual", "surface", "paper"}
-    assert settled_lifts(LiftConfig(), read, device="cpu")[0].encoder == DINO
+    assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0].encoder == DINO
     assert loaded == [(DINO, "cpu")]
 
 

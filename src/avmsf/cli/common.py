@@ -15,7 +15,7 @@ from avmsf.capture.settings import settings_of as capture_settings_of
 from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.cli.paths import InputError, path_mark
 from avmsf.cli.settings import Assignments, SettingsTable, as_toml, settings_of
-from avmsf.errors import AvmsfError, CaptureError, ExtractionError
+from avmsf.errors import AvmsfError, CaptureError
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 """An option that is off unless it is given."""
@@ -134,12 +134,6 @@ def expect_device(name: str | None, *, raising: type[AvmsfError]) -> None:
     """Raise `raising` for the name of a device of another kind than `DEVICES`."""
     if name is not None and name.partition(":")[0] not in DEVICES:
         raise raising.expected(" or ".join(DEVICES), name, name="device")
-
-
-def expect_modes(modes: int) -> None:
-    """Raise `ExtractionError` unless at least one mode is asked for."""
-    if modes < 1:
-        raise ExtractionError.expected("1 or more", modes, name="modes")
 
 
 def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:

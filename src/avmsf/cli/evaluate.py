@@ -1,8 +1,8 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
 import shlex
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,65 +11,26 @@ import tyro
 
 from avmsf._utils.text import counted
 from avmsf.cli import INTERRUPTED
-from avmsf.cli.common import Configured, Flag, expect_device, expect_modes
+from avmsf.cli.common import Configured, Flag, expect_device
 from avmsf.cli.paths import CacheFolder, Existing, OutputFolder
 from avmsf.cli.printing import display, next_command, next_step, print_json, say, show, table
 from avmsf.cli.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.config import EvaluationSettings
 from avmsf.evaluation.registry import PROTOCOLS, expect_suited, method_entry, protocol_named
-from avmsf.gaussians.config import SplatConfig
-from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import (
-    AUTO,
-    DESCRIPTORS,
-    DINO,
-    PRESETS,
-    BodyConfig,
-    Geometry,
-    LiftConfig,
-    SceneConfig,
-    TimeZero,
-    ViewsConfig,
-)
+from avmsf.pipeline.config import TimeZero, ViewsConfig
 
 if TYPE_CHECKING:
     from avmsf.datasets.dataset import Dataset
-    from avmsf.evaluation.case_run import Evaluation
     from avmsf.evaluation.registry import Protocol
     from avmsf.evaluation.report_tables import Section
-    from avmsf.evaluation.task import Method, VisualInput
+    from avmsf.evaluation.task import Method
 
 OPTIONS = {"predefined": ("test",), "shots": ("counts", "starts")}
 """Options of one protocol alone."""
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
-
-
-@dataclass(frozen=True)
-class EvaluationSettings:
-    """What methods share."""
-
-    geometry: Geometry = "mesh"
-    """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
-    noisy: its mesh with vertices displaced by 2 % of its size."""
-    amplitude_scale: Literal["full-scale", "raw"] = "full-scale"
-    """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
-    values of different objects can be averaged. raw: in the recordings' unit."""
-    extraction: ExtractionMethod = "high-resolution"
-    """How the modes that methods share are extracted; see `avmsf modes --help`. The methods `paper` have their own."""
-    modes: int = 128
-    """Maximum number of the modes that methods share."""
-    splat: SplatConfig = field(default_factory=SplatConfig)
-    """How Gaussians are fitted."""
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    """How features are made. The methods `paper` use the paper's own settings and only the encoder given here: DINOv2
-    without `lift.encoder`, which then has to be installed."""
-    body: BodyConfig = field(default_factory=BodyConfig)
-    """Elastic bodies."""
-
-    def __post_init__(self) -> None:
-        expect_modes(self.modes)
 
 
 @dataclass(frozen=True)
@@ -159,9 +120,11 @@ def run(options: Options) -> int:
     from avmsf.datasets import open_dataset
     from avmsf.evaluation.methods import method_named
     from avmsf.evaluation.objects import choose_objects, members
+    from avmsf.evaluation.plan import dataset_title, plan_evaluation
     from avmsf.evaluation.report import PAGE, SUMMARY, TABLES, write_figures, write_page, write_summary
     from avmsf.evaluation.results import IDENTITY, ResultsFolder
     from avmsf.evaluation.runner import run_objects
+    from avmsf.evaluation.scores import MetricSettings
 
     protocol = _protocol_of(options)
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
@@ -169,12 +132,26 @@ def run(options: Options) -> int:
     contacts = None if options.contact_data is None else options.contact_data.resolve()
     opened = partial(open_dataset, options.data.resolve(), contacts=contacts)
     dataset = opened(time_zero=options.time_zero)
-    title = title_of(dataset, options.data)
+    title = dataset_title(dataset, options.data)
     objects = choose_objects(dataset, protocol, words_of(options.objects))
     if not options.objects:
         _note_subset(dataset, protocol, objects)
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    evaluation = evaluation_of(options, dataset, title, protocol, methods, folder)
+    settings, cdpam = options.all_settings, not options.no_cdpam and not protocol.locating
+    evaluation = plan_evaluation(
+        dataset,
+        title,
+        protocol,
+        methods,
+        settings=settings,
+        views=ViewsConfig(source=options.visual_source),
+        cache=(options.cache or folder / "features").resolve(),
+        metrics=MetricSettings(settings.amplitude_scale, cdpam, options.cdpam_contacts),
+        seed=options.seed,
+        device=options.device,
+        time_zero=options.time_zero,
+        log=say,
+    )
     if options.time_zero == "peak":
         evaluation = replace(evaluation, own_starts=opened())
     _note_start(methods, options.time_zero)
@@ -196,6 +173,18 @@ def run(options: Options) -> int:
             say(f"wrote {SUMMARY} and {TABLES} in {folder}{lacking}")
         say(f"avmsf evaluate: interrupted; run the same command again to continue from {folder}")
         return INTERRUPTED
+    _print_results(options, folder, summary, parts, figures)
+    next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
+    next_command(f"avmsf evaluate {'farthest' if protocol.name == 'shots' else 'shots'}", options.data)
+    return 0
+
+
+def _print_results(
+    options: Options, folder: Path, summary: Mapping[str, Any], parts: "Sequence[Section]", figures: Sequence[Path]
+) -> None:
+    """Print the main tables, failures and files. Raises EvaluationError where no method has a result."""
+    from avmsf.evaluation.report import PAGE, SUMMARY, TABLES
+
     failures = summary["failures"]
     if not summary["methods"]:
         got = f"none: {failures[0]['failure'] if failures else 'no object'}"
@@ -205,9 +194,6 @@ def run(options: Options) -> int:
     show("\n".join(lines), json=options.json)
     if options.json:
         print_json({**summary, "results": str(folder)})
-    next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
-    next_command(f"avmsf evaluate {'farthest' if protocol.name == 'shots' else 'shots'}", options.data)
-    return 0
 
 
 def _tables(parts: "Sequence[Section]") -> list[str]:
@@ -240,50 +226,6 @@ def _protocol_of(options: Options) -> "Protocol":
     return replace(protocol, cases=Predefined(words_of(options.test))) if protocol.name == "predefined" else protocol
 
 
-def evaluation_of(
-    options: Options,
-    dataset: "Dataset",
-    title: str,
-    protocol: "Protocol",
-    methods: "tuple[Method, ...]",
-    folder: Path,
-) -> "Evaluation":
-    """Return the plan of an evaluation with results in a folder, and features in it unless the options name another.
-
-    Raises SceneError for an encoder, and EvaluationError for a device, that is not available.
-    """
-    from avmsf._utils.device import TRAINABLE, usable_device
-    from avmsf.evaluation.case_run import Evaluation
-    from avmsf.evaluation.objects import ObjectInputs
-    from avmsf.evaluation.scores import MetricSettings
-    from avmsf.modal.extraction.finders import finder_named
-
-    device, shared = options.device, options.all_settings
-    if device is not None:
-        usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
-    kept = (options.cache or folder / "features").resolve()
-    lift, paper = settled_lifts(shared.lift, inputs_of(methods, protocol), device=device)
-    given = SceneConfig(ViewsConfig(source=options.visual_source), shared.splat, shared.lift)
-    inputs = ObjectInputs(
-        dataset, kept, replace(given, lift=lift), paper, shared.geometry, shared.body, device, seed=options.seed
-    )
-    cdpam = not options.no_cdpam and not protocol.locating
-    return Evaluation(
-        dataset,
-        title,
-        protocol,
-        methods,
-        inputs,
-        options.seed,
-        MetricSettings(level=shared.amplitude_scale, cdpam=cdpam, cdpam_contacts=options.cdpam_contacts),
-        finder_named(shared.extraction, shared.modes),
-        {"scene": asdict(given), "paper": asdict(paper), "geometry": shared.geometry, "body": asdict(shared.body)},
-        device,
-        None if lift == shared.lift else lift.encoder,
-        options.time_zero,
-    )
-
-
 def _note_subset(dataset: "Dataset", protocol: "Protocol", objects: Sequence[str]) -> None:
     """Print which objects a protocol takes of a dataset, where it does not take all."""
     from avmsf.evaluation.objects import SUBSETS
@@ -310,45 +252,3 @@ def _note_start(methods: "Sequence[Method]", time_zero: TimeZero | None) -> None
         wanted = method.pipeline.time_zero if isinstance(method, FieldMethod) else None
         if wanted not in (None, time_zero):
             say(f"note: {method.name} is published with sounds from their {wanted}s: --time-zero {wanted}")
-
-
-def settled_lifts(
-    lift: LiftConfig, inputs: "Collection[VisualInput]", *, device: str | None = None
-) -> tuple[LiftConfig, LiftConfig]:
-    """Return the settings of features, and those of the paper's form, with the encoders that `inputs` are made with.
-
-    Where no method reads views no encoder is loaded. The replacement of DINOv2 is printed. Raises SceneError where one
-    reads the paper's features and their encoder is not available.
-    """
-    from avmsf.features.descriptors import ImageDescriptors
-    from avmsf.pipeline.features import choose_encoder
-
-    paper = PRESETS["paper"].scene.lift
-    if lift.encoder != AUTO:
-        return lift, replace(paper, encoder=lift.encoder)
-    if any(visual_input.startswith("paper") for visual_input in inputs):
-        choose_encoder(paper, log=say, device=device)
-        return replace(lift, encoder=paper.encoder), paper
-    if not set(inputs) - {"surface"}:
-        return lift, paper
-    built_in = isinstance(choose_encoder(lift, log=say, device=device), ImageDescriptors)
-    return replace(lift, encoder=DESCRIPTORS if built_in else DINO), paper
-
-
-def inputs_of(methods: "Sequence[Method]", protocol: "Protocol") -> "frozenset[VisualInput]":
-    """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
-    from avmsf.evaluation.field_methods import FieldMethod
-
-    read = {method.visual_input for method in methods if isinstance(method, FieldMethod)}
-    return frozenset(read | {"surface"} if protocol.locating else read)
-
-
-def title_of(dataset: "Dataset", folder: Path) -> str:
-    """Return a dataset's name in reports: captures by their folder, which identifies them."""
-    from avmsf.datasets import CaptureCollection
-    from avmsf.evaluation.published import PUBLISHED
-
-    if not isinstance(dataset, CaptureCollection):
-        return dataset.name
-    name = folder.resolve().name
-    return f"{name} (captures)" if name in {dataset for dataset, _ in PUBLISHED} else name

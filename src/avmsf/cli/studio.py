@@ -8,10 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.common import Flag, Printing, expect_modes
+from avmsf.cli.common import Flag, Printing
 from avmsf.cli.paths import Existing, ShapeFile
 from avmsf.cli.printing import print_json, say
 from avmsf.errors import StudioError
+from avmsf.modal.config import expect_modes
 from avmsf.pipeline.config import Preset
 
 

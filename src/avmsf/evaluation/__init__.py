@@ -11,8 +11,9 @@ In go recordings with their contacts; out come one value for each metric, method
   located contacts (`localization`).
 - Methods: k nearest recordings, mean gains, thin-plate splines (`simple_methods`, `methods`), DiffSound and SonicGauss
   (`avmsf.baselines`), files of other systems (`recorded`), and configurations of the sound field (`field_methods`).
-- `run_objects` (`runner`) runs an `Evaluation` (`case_run`) in this process or on ray, into a `ResultsFolder`
-  (`results`) that a stopped run goes on with; `summary`, `report_tables` and `report` make means, ratios to `knn3`, and
+- `plan_evaluation` (`plan`) makes an `Evaluation` (`case_run`) of the settings that its methods share (`config`).
+  `run_objects` (`runner`) runs it in this process or on ray, into a `ResultsFolder` (`results`) that a stopped run goes
+  on with; `summary`, `report_tables` and `report` make means, ratios to `knn3`, and
   one report, as Markdown and as a page. `published` has the paper's values.
 
 Start at `evaluate` in `scores`, then `case_run.CaseRun.outcome`.

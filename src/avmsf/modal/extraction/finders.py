@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf.errors import ExtractionError
-from avmsf.modal.config import ExtractionMethod
+from avmsf.modal.config import ExtractionMethod, expect_modes
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Selection, chance_ratio, merge
@@ -37,8 +36,7 @@ class ModeFinder(ABC):
     """Maximum number of modes, the strongest as the method has it."""
 
     def __post_init__(self) -> None:
-        if self.modes < 1:
-            raise ExtractionError.expected("1 or more", self.modes, name="modes")
+        expect_modes(self.modes)
 
     @abstractmethod
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
