@@ -1,6 +1,7 @@
 """Bodies that are held at patches of their surface."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.optimize import brentq
 from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import HeldModes, elastic_modes
 from avmsf.fem.elements import SecondOrder
-from avmsf.fem.material import NOMINAL, Material
+from avmsf.fem.material import NOMINAL
 from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Patch, Support, patches_of
 from factories.raising import raises
@@ -80,7 +81,7 @@ def test_a_body_on_a_soft_patch_bounces_as_a_rigid_one():
 
 def test_a_clamped_square_plate_has_leissas_frequencies():
     side, height = 0.2, 0.002
-    steel = Material(NOMINAL.density, NOMINAL.young, 0.3, *list(vars(NOMINAL).values())[3:])
+    steel = replace(NOMINAL, poisson=0.3)
     clamped = Support((Patch("a side", (0.0, 1.0, 0.0)),), RIGID)
     modes = elastic_modes(block((side, side, height), (14, 14, 1)), steel, count=5, support=clamped)
     rigidity = steel.young * height**3 / 12 / (1 - 0.3**2)
@@ -94,7 +95,7 @@ def test_the_basis_of_free_and_attachment_modes_has_the_held_bodys_modes(ratio: 
     solid = block((0.2, 0.03, 0.004), (16, 3, 1))
     held = HeldModes(solid, NOMINAL, count=24)
     ends = tuple(patch for patch in held.basis.patches if abs(patch.direction[0]) > 0.99)
-    support = Support(ends, ratio * held.basis.unit)
+    support = Support(ends, ratio * held.basis.stiffness_scale)
     found, true = held.on(support), elastic_modes(solid, NOMINAL, count=24, support=support)
     assert found.frequency[:16].tolist() == pytest.approx(true.frequency[:16].tolist(), rel=error)
     overlap = torch.einsum("nmd,nmd->m", found.shapes[:, :8], true.shapes[:, :8]).abs()
@@ -129,3 +130,19 @@ def test_a_cone_on_its_tip_may_be_held_at_its_tip():
     mesh = SecondOrder.of(Solid.build(points, flat.cells))
     tip = next(patch for patch in patches_of(mesh) if patch.name == "its lowest part")
     assert float(np.ptp(mesh.nodes[tip.nodes(mesh)], axis=0).max()) < 0.1
+
+
+@pytest.mark.parametrize("held", ["point", "line"])
+def test_a_body_that_turns_about_its_support_has_no_mode_at_zero(held: str):
+    solid = block((0.1, 0.02, 0.01), (6, 2, 1))
+    # Upright on an edge or on a corner.
+    turn = {"line": (0.0, -1.0, -1.0), "point": (-1.0, -1.1, -1.2)}[held]
+    patch = Patch(held, tuple(float(each) for each in np.array(turn) / np.linalg.norm(turn)))
+    modes = elastic_modes(solid, NOMINAL, count=4, support=Support((patch,), RIGID))
+    assert bool(torch.isfinite(modes.frequency).all())
+    assert float(modes.frequency[0]) > 10.0
+
+
+def test_a_body_of_large_faces_alone_has_no_support():
+    with raises(SimulationError, name="patches"):
+        HeldModes(block((1.0, 1.0, 1.0), (1, 1, 1)), NOMINAL, count=2)

@@ -2,9 +2,9 @@
 
 A surface does not say whether the object is solid, how thick its wall is or where it was held, all of which decide the
 shapes of its modes. So several bodies are hypotheses, of few degrees of freedom, enough to choose by; the chosen one is
-refined, other thicknesses and supports are computed when the recordings ask for them. Refinement, thicknesses and
-supports are calls of one function, `SurfaceBodies.modes`, whose results are kept in memory and, by content, in a
-folder.
+refined, other thicknesses and supports are computed when the recordings ask for them. Refinement, thicknesses and the
+chosen support are calls of one function, `SurfaceBodies.modes`, whose results are kept in memory and, by content, in a
+folder. Supports are compared on a basis of few elements (`HeldModes`), which is not kept.
 """
 
 import hashlib
@@ -238,7 +238,7 @@ class SurfaceBodies(CandidateBodies):
         """
         try:
             return HeldModes(self.solid(body.thickness, self._coarse_dofs), self._material, count=self._count)
-        except SimulationError as error:
+        except (SimulationError, MemoryError) as error:
             self._log(f"{body.name}: no supports tested: {error}")
             return None
 

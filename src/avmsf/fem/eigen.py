@@ -29,6 +29,8 @@ _BLOCK = 16
 _MAX_BASIS_RATIO = 6
 """Most vectors altogether, over the number of modes and a block; three are usual."""
 _RIGID = 6
+PENDULUM = 1e-9
+"""Squared frequency over the largest, below which a body turns about the place that it is held at: rounding alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +119,7 @@ def lowest_vibrations(
     responses, shapes = _largest_responses(respond, mass, wanted)
     squares = 1.0 / responses - shift
     if supported:
-        elastic = ((weighted.T @ shapes) ** 2).sum(axis=0) < 0.5
+        elastic = (((weighted.T @ shapes) ** 2).sum(axis=0) < 0.5) & (squares > PENDULUM * squares[-1])
         squares, shapes = squares[elastic][:count], shapes[:, elastic][:, :count]
     return Vibrations(squares, shapes * _signs(shapes))
 

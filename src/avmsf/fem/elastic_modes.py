@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.eigen import Vibrations, lowest_vibrations, rigid_motions
+from avmsf.fem.eigen import lowest_vibrations, rigid_motions
 from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
 from avmsf.fem.perturbation import Perturbations, perturbations
@@ -133,7 +133,8 @@ def elastic_modes(
     on its surface and their stiffness in newtons per meter, the same in all directions. A free body's six rigid
     motions are no modes of it. On soft springs they are slow modes, and every mode that has more than half of its
     kinetic energy in a rigid motion is left out. Springs so stiff that the body bends before it moves as a whole
-    leave no such mode, and then none is left out. On a `support` they are modes like all others. With `perturbed` the
+    leave no such mode, and then none is left out. On a `support` they are modes like all others, but for turns about a
+    patch that no spring opposes. With `perturbed` the
     modes come with the first-order changes of their matrices, for a body without factors.
 
     Raises SimulationError for a body of several parts or too few nodes, and factors and springs that are not positive.
@@ -144,14 +145,12 @@ def elastic_modes(
         raise SimulationError.expected(
             "no stiffness or density factors", True, got="some", name="perturbed", advice="leave them out"
         )
-    solid.expect_connected()
     light = _factor(solid, density_factor, "density_factor")
-    mesh = SecondOrder.of(solid)
-    weights = mass(mesh, material.density * light)
-    forces = stiffness(mesh, material, _factor(solid, stiffness_factor, "stiffness_factor"))
+    mesh, forces, weights, shift = _matrices(
+        solid, material, light, _factor(solid, stiffness_factor, "stiffness_factor")
+    )
     if springs:
         forces = forces + _support(mesh, springs)
-    shift = RELATIVE_SHIFT * material.young / (material.density * solid.size**2)
     if support is not None:
         forces = forces + support.springs(mesh)
     rigid = rigid_motions(mesh.nodes, weights)
@@ -159,43 +158,65 @@ def elastic_modes(
         forces, weights, rigid if support is None else np.zeros_like(rigid), count=count, shift=shift,
         supported=bool(springs) or support is not None,
     )  # fmt: skip
-    return _on_surface(mesh, found, material, float((solid.volumes * light).sum()) * material.density, perturbed)
+    total = float((solid.volumes * light).sum()) * material.density
+    changes = perturbations(mesh, found.shapes.reshape(len(mesh.nodes), 3, -1), material) if perturbed else None
+    return replace(_modes(mesh, found.squares, _at_surface(mesh, found.shapes), material, total), perturbations=changes)
 
 
 class HeldModes:
     """The modes of a body on any support, of one computation of its free ones."""
 
     def __init__(self, solid: Solid, material: Material, *, count: int = 64) -> None:
-        """Compute the free modes and the responses to forces on `patches_of` the body. Raises as `elastic_modes`."""
-        solid.expect_connected()
-        self._mesh, self._material = SecondOrder.of(solid), material
-        density = torch.full((len(solid.cells),), material.density, dtype=torch.float64)
-        weights = mass(self._mesh, density)
-        forces = stiffness(self._mesh, material, torch.ones_like(density))
-        rigid = rigid_motions(self._mesh.nodes, weights)
-        shift = RELATIVE_SHIFT * material.young / (material.density * solid.size**2)
+        """Compute the free modes and the responses to forces on `patches_of` the body.
+
+        Raises SimulationError as `elastic_modes`, and for a body without a small part that it could be held at.
+        """
+        even = torch.ones(len(solid.cells), dtype=torch.float64)
+        mesh, forces, weights, shift = _matrices(solid, material, even, even)
+        rigid = rigid_motions(mesh.nodes, weights)
         free = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=False)
-        self._mass = float(solid.volumes.sum()) * material.density
-        self.free = _on_surface(self._mesh, free, material, self._mass, False)
-        self.basis = SupportBasis(self._mesh, forces, weights, free, rigid, patches_of(self._mesh))
+        self._mesh, self._material, self._mass = mesh, material, float(solid.volumes.sum()) * material.density
+        self.free = _modes(mesh, free.squares, _at_surface(mesh, free.shapes), material, self._mass)
+        self.basis = SupportBasis(mesh, forces, weights, free, rigid, patches_of(mesh))
 
     def on(self, support: Support) -> ElasticModes:
         """Return the lowest modes on a support of some of the basis' patches."""
-        return _on_surface(self._mesh, self.basis.held(support), self._material, self._mass, False)
+        found = self.basis.held(support)
+        return _modes(self._mesh, found.squares, found.shapes, self._material, self._mass)
 
 
-def _on_surface(mesh: SecondOrder, found: Vibrations, material: Material, mass: float, perturbed: bool) -> ElasticModes:
-    """Return vibrations as they are seen on the body's surface."""
-    whole = found.shapes.reshape(len(mesh.nodes), 3, -1)
+def _matrices(
+    solid: Solid, material: Material, light: Float64[Tensor, " cells"], stiff: Float64[Tensor, " cells"]
+) -> tuple[SecondOrder, scipy.sparse.sparray, scipy.sparse.csr_array, float]:
+    """Return the elements, their stiffness and mass, and the shift of the eigenvalues, 1/s2."""
+    solid.expect_connected()
+    mesh, shift = SecondOrder.of(solid), RELATIVE_SHIFT * material.young / (material.density * solid.size**2)
+    return mesh, stiffness(mesh, material, stiff), mass(mesh, material.density * light), shift
+
+
+def _at_surface(
+    mesh: SecondOrder, shapes: Float64[np.ndarray, "dofs modes"]
+) -> Float64[np.ndarray, "outer_dofs modes"]:
+    """Return the shapes at the surface's nodes alone."""
+    return shapes.reshape(len(mesh.nodes), 3, -1)[mesh.surface[0]].reshape(-1, shapes.shape[1])
+
+
+def _modes(
+    mesh: SecondOrder,
+    squares: Float64[np.ndarray, " modes"],
+    shapes: Float64[np.ndarray, "outer_dofs modes"],
+    material: Material,
+    total: float,
+) -> ElasticModes:
+    """Return modes of squared angular frequencies and of shapes at the surface's nodes; `total` is the mass, kg."""
     outer, triangles = mesh.surface
     return ElasticModes(
-        frequency=torch.from_numpy(np.sqrt(found.squares) / (2.0 * math.pi)),
+        frequency=torch.from_numpy(np.sqrt(squares) / (2.0 * math.pi)),
         nodes=torch.from_numpy(mesh.nodes[outer]),
         triangles=torch.from_numpy(triangles),
-        shapes=torch.from_numpy(np.ascontiguousarray(whole[outer].transpose(0, 2, 1))),
+        shapes=torch.from_numpy(np.ascontiguousarray(shapes.reshape(len(outer), 3, -1).transpose(0, 2, 1))),
         material=material,
-        mass=mass,
-        perturbations=perturbations(mesh, whole, material) if perturbed else None,
+        mass=total,
     )
 
 

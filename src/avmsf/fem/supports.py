@@ -1,11 +1,12 @@
 """Bodies that are held: elastic foundations under patches of their surface, on the basis of the free body's modes.
 
-A hand, a clamp or a table holds a patch by springs that are spread over it evenly. A patch is small, so springs act on
-the rigid motion of each of its cells alone: on every node for itself they would stiffen the patch too. With F the
-mass-independent load vectors of those motions, of unit mean square over the cell's nodes, and k a patch's stiffness,
-a body's stiffness matrix becomes K + sum k F F'. Held at few patches, it vibrates in combinations of its free modes,
-its rigid motions and its static responses to the loads F, the attachment modes of component mode synthesis (Craig and
-Chang, AIAA Journal 14, 1976). On this basis every support is a dense eigenproblem of some hundred unknowns.
+A hand, a clamp or a table holds a patch by springs that are spread evenly over its nodes. They act on the rigid motions
+of each of its cells alone: on every node for itself they would stiffen the patch too. The load vectors F are these
+motions, orthonormal over the nodes of a cell and divided by the root of the number of nodes of the patch, so that k is
+the stiffness of the whole patch against a shift, and a body's stiffness matrix becomes K + sum k F F'. Held at few
+patches, it vibrates in combinations of its free modes, its rigid motions and its static responses to the loads, the
+attachment modes of component mode synthesis (Craig and Chang, AIAA Journal 14, 1976). On this basis every support is a
+dense eigenproblem of 100 to 400 unknowns.
 """
 
 import math
@@ -13,34 +14,35 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 from jaxtyping import Float64, Int
 
 from avmsf.errors import SimulationError
-from avmsf.fem.eigen import Vibrations, factorize, orthonormal
+from avmsf.fem.eigen import PENDULUM, Vibrations, factorize, orthonormal
 from avmsf.fem.elements import SecondOrder
 
 FREE = "free"
 FREE_PRIOR = 0.7
 """Probability that an object is free; recordings are meant to be made so. The supports share the rest."""
 STIFFNESS_RATIOS = (0.03, 0.003, 0.3, 1000.0)
-"""Stiffness of a patch over the body's mass times its mean squared angular frequency: that of a clamp on a measured
-strip, which supports are compared at first, a softer one, a stiffer one, and one that is rigid."""
-_HELD_DISTANCE = 0.01
-"""Distance from the extreme plane, over the body's size, within which nodes belong to a patch."""
-_MAX_HELD_RATIO = 0.3
-"""Part of the surface's nodes that a patch may hold: what is left would not ring."""
-_CELL_EXTENT = 0.08
-"""Extent of a cell over the body's size: a long patch moves as several rigid ones."""
-_MAX_CELLS = 12
-"""Cells of a patch at most."""
-_RANK = 1e-3
-"""Singular value of a cell's rigid motions over the largest, below which nodes on a line cannot tell one."""
-_INDEPENDENT = 1e-10
-"""Part of the largest attachment mode's mass below which another one adds nothing to the basis."""
+"""Stiffness of a patch over `SupportBasis.stiffness_scale`: about that of the clamps of a measured strip (strip30), at
+which supports are compared first, a softer one, a stiffer one, and one that is rigid."""
 
-_ROUNDING = 1e-14
-"""Eigenvalue over the largest below which it is rounding alone, as for a body that can turn about its patches."""
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What a patch and its cells are; lengths are over the body's size."""
+
+    held_distance: float = 0.01  # from the extreme plane, within which nodes belong to a patch
+    max_held_ratio: float = 0.3  # part of the surface's nodes that a patch may hold: what is left would not ring
+    cell_extent: float = 0.08  # of a cell: a long patch moves as several rigid ones
+    max_cells: int = 8  # of a patch
+    rank: float = 1e-3  # singular value of a cell's motions over the largest: nodes on a line cannot tell one
+    independent: float = 1e-5  # part of an attachment mode that the others and the free modes do not have
+
+
+TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True)
@@ -56,10 +58,10 @@ class Patch:
         """Return the rows of the surface's nodes within 1 % of the body's size of the extreme one."""
         outer = mesh.surface[0]
         along = mesh.nodes[outer] @ np.array(self.direction)
-        return outer[along >= along.max() - _HELD_DISTANCE * mesh.solid.size]
+        return outer[along >= along.max() - TOLERANCES.held_distance * mesh.solid.size]
 
     def loads(self, mesh: SecondOrder) -> scipy.sparse.csc_array:
-        """Return the rigid motions of its cells [3 nodes, loads], of unit mean square over all nodes of the patch."""
+        """Return the rigid motions of its cells [3 nodes, loads], as the head of this module scales them."""
         rows = self.nodes(mesh)
         columns = []
         for cell in _cells(mesh.nodes[rows], mesh.solid.size):
@@ -69,7 +71,7 @@ class Patch:
             extent = max(math.sqrt(np.square(arms).sum(1).mean()), np.finfo(float).tiny)
             motions = np.concatenate([shifts, turns / extent], axis=2).reshape(3 * len(cell), 6)
             left, values, _ = np.linalg.svd(motions, full_matrices=False)
-            left = left[:, values > _RANK * values[0]] / math.sqrt(len(rows))
+            left = left[:, values > TOLERANCES.rank * values[0]] / math.sqrt(len(rows))
             dofs = (3 * rows[cell][:, None] + np.arange(3)).ravel()
             place = np.repeat(dofs, left.shape[1]), np.tile(np.arange(left.shape[1]), len(dofs))
             columns.append(scipy.sparse.csc_array((left.ravel(), place), shape=(3 * len(mesh.nodes), left.shape[1])))
@@ -112,7 +114,7 @@ def patches_of(mesh: SecondOrder) -> list[Patch]:
         patch = Patch("", (float(direction[0]), float(direction[1]), float(direction[2])))
         nodes = set(patch.nodes(mesh).tolist())
         known = any(2 * len(nodes & other) > len(nodes | other) for other in seen)
-        if known or len(nodes) > _MAX_HELD_RATIO * len(outer):
+        if known or len(nodes) > TOLERANCES.max_held_ratio * len(outer):
             continue
         x, y, z = 1000.0 * mesh.nodes[sorted(nodes)].mean(axis=0) + 0.0
         name = "its lowest part" if row == 0 else f"its end at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
@@ -134,6 +136,8 @@ class SupportBasis:
         patches: Sequence[Patch],
     ) -> None:
         """Compute the attachment modes of patches; `free` are the body's lowest modes. Raises as `factorize`."""
+        if not patches:
+            raise SimulationError.expected("a part of the surface to hold it at", 0, got="none", name="patches")
         self.patches = tuple(patches)
         loads = [patch.loads(mesh) for patch in patches]
         self._ends = np.cumsum([0, *(each.shape[1] for each in loads)])
@@ -141,17 +145,20 @@ class SupportBasis:
         # About the static response: the mass takes away what a free body does as a whole.
         solve = factorize(stiffness, mass, shift=0.5 * float(free.squares[0]))
         known = np.concatenate([rigid, free.shapes], axis=1)
-        attached, _ = orthonormal(solve(forces.toarray()), mass, known, least=_INDEPENDENT**0.5)
-        self.basis = np.concatenate([known, attached], axis=1)
-        self._stiffness = self.basis.T @ (stiffness @ self.basis)
-        self._loads = forces.T @ self.basis
+        attached, _ = orthonormal(solve(forces.toarray()), mass, known, least=TOLERANCES.independent)
+        basis = np.concatenate([known, attached], axis=1)
+        self._surface = basis.reshape(len(mesh.nodes), 3, -1)[mesh.surface[0]].reshape(-1, basis.shape[1])
+        self._stiffness = basis.T @ (stiffness @ basis)
+        # A rigid motion takes no force: what is there is rounding.
+        still = rigid.shape[1]
+        self._stiffness[:still] = self._stiffness[:, :still] = 0.0
+        self._loads = forces.T @ basis
         self._count = free.shapes.shape[1]
-        weight = float(mass.sum())
-        self.unit = weight * math.exp(float(np.log(free.squares).mean()))
-        """The body's mass times its mean squared angular frequency, N/m."""
+        self.stiffness_scale = float(mass.sum()) * math.exp(float(np.log(free.squares).mean()))
+        """The body's mass times the geometric mean of its squared angular frequencies, N/m."""
 
     def held(self, support: Support) -> Vibrations:
-        """Return the lowest vibrations of the held body, as many as the free one had.
+        """Return the lowest vibrations of the held body, as many as the free one had, at the surface's nodes alone.
 
         Raises SimulationError for a patch that is not of the basis.
         """
@@ -162,15 +169,15 @@ class SupportBasis:
             row = self.patches.index(patch)
             loads = self._loads[self._ends[row] : self._ends[row + 1]]
             total += support.stiffness * loads.T @ loads
-        squares, vectors = np.linalg.eigh(total)
-        moving = np.flatnonzero(squares > _ROUNDING * squares[-1])[: self._count]
-        return Vibrations(squares[moving], self.basis @ vectors[:, moving])
+        squares, vectors = scipy.linalg.eigh(total, subset_by_index=(0, min(self._count + 5, len(total) - 1)))
+        moving = np.flatnonzero(squares > PENDULUM * squares[-1])[: self._count]
+        return Vibrations(squares[moving], self._surface @ vectors[:, moving])
 
 
 def _cells(places: Float64[np.ndarray, "nodes 3"], size: float) -> Iterable[Int[np.ndarray, " some"]]:
     """Return the rows of places in each cell: about the farthest points from one another."""
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
-    count = min(_MAX_CELLS, math.ceil(extent / (_CELL_EXTENT * size)), len(places))
+    count = min(TOLERANCES.max_cells, math.ceil(extent / (TOLERANCES.cell_extent * size)), len(places))
     if count < 2:
         return [np.arange(len(places))]
     apart = np.linalg.norm(places - places.mean(axis=0), axis=1)

@@ -116,7 +116,7 @@ class BodyConfig:
     supports: Literal["auto", "free", "try"] = "auto"
     """Whether the object may have been held at its lowest part (z is upwards) or its ends. auto: tried if the free body
     predicts little better than none by leave-one-out. free: it lay on foam or hung. try: always tried, which takes 10
-    to 30 s more."""
+    to 60 s more."""
 
     def __post_init__(self) -> None:
         if self.wall is not None and not 0 <= self.wall < float("inf"):

@@ -60,6 +60,7 @@ class Solution:
                 "body": body.name,
                 "wall_thickness": body.thickness,
                 "support": FREE if body.support is None else body.support.name,
+                "support_stiffness": None if body.support is None else body.support.stiffness,
                 "updating_nats": body.updated,
                 "refined": body.fine,
                 "weight": weight,
@@ -138,36 +139,33 @@ class Regression:
         that is more probable, then other stiffnesses. Where both bodies are far from the object, evidence between them
         means little: the held one also has to predict contacts left out better.
         """
-        patches, unit = modes.basis.patches, modes.basis.unit
-        typical, *ratios = STIFFNESS_RATIOS
+        patches, scale = modes.basis.patches, modes.basis.stiffness_scale
+        typical, *others = STIFFNESS_RATIOS
 
-        def best(held: Iterable[tuple[Patch, ...]], *ratios: float) -> tuple[float, CandidateBody]:
-            supports = [Support(each, ratio * unit) for each in held for ratio in ratios]
+        def most_probable(choices: Iterable[tuple[Patch, ...]], *ratios: float) -> tuple[float, Support, CandidateBody]:
+            supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
             bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
-            # Numbers of patches share the probability of being held alike.
-            ways = [math.comb(len(patches), len(each.patches)) for each in supports]
-            probable = [found - math.log(each) for found, each in zip(self.evidence(rows, bodies), ways, strict=True)]
-            row = max(range(len(bodies)), key=probable.__getitem__)
-            return probable[row], bodies[row]
+            # Numbers of patches share the probability of being held alike, and so do stiffnesses.
+            ways = [
+                math.comb(len(patches), len(each.patches)) * len(patches) * len(STIFFNESS_RATIOS) for each in supports
+            ]
+            logs = [evidence - math.log(each) for evidence, each in zip(self.evidence(rows, bodies), ways, strict=True)]
+            row = max(range(len(bodies)), key=logs.__getitem__)
+            return logs[row], supports[row], bodies[row]
 
-        def patches_of(found: tuple[float, CandidateBody]) -> tuple[Patch, ...]:
-            return () if found[1].support is None else found[1].support.patches
-
-        if not patches:
-            return None
-        found = best([each for count in (1, 2) for each in combinations(patches, count)], typical)
-        while left := [patch for patch in patches if patch not in patches_of(found)]:
-            more = best([(*patches_of(found), patch) for patch in left], typical)
-            if more[0] <= found[0]:
+        best = most_probable([each for count in (1, 2) for each in combinations(patches, count)], typical)
+        while len(best[1].patches) < len(patches):
+            chosen = best[1].patches
+            more = most_probable([(*chosen, patch) for patch in patches if patch not in chosen], typical)
+            if more[0] <= best[0]:
                 break
-            found = more
-        found = max(found, best([patches_of(found)], *ratios), key=itemgetter(0))
+            best = more
+        best = max(best, most_probable([best[1].patches], *others), key=itemgetter(0))
         free = CandidateBody(body.thickness, modes.free, fine=False)
-        odds = (1.0 - FREE_PRIOR) / FREE_PRIOR / (len(patches) * len(STIFFNESS_RATIOS))
-        if found[0] + math.log(odds) <= self.evidence(rows, [free])[0]:
+        if best[0] + math.log((1.0 - FREE_PRIOR) / FREE_PRIOR) <= self.evidence(rows, [free])[0]:
             return None
-        new, old = (self(rows, [each]).model.leave_one_out() for each in (found[1], free))
-        return found[1] if predicts_better(new, old, self.measured.take(rows)) else None
+        new, old = (self(rows, [each]).model.leave_one_out() for each in (best[2], free))
+        return best[2] if predicts_better(new, old, self.measured.take(rows)) else None
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
