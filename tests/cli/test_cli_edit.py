@@ -9,8 +9,9 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.cli import edit, main
+from avmsf.cli import main
 from avmsf.cli.edit import Options, run
+from avmsf.cli.edit_report import contact_of_sounds
 from avmsf.cli.paths import OutputError
 from avmsf.editing.material import RATIO_ONLY, change_material, infer_material, rayleigh_damping
 from avmsf.editing.modal_edit import EDITS, adjust_modes
@@ -232,7 +233,7 @@ def test_the_loudest_place_is_that_of_both_parts_of_the_gains(field: Path) -> No
     alike = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(3, 3)
     gains = replace(mixture(Sites(corners, alike), values, directional=False), points=corners.float())
     loud = replace(ceramic(), gain_field=gains)
-    assert edit._contact(loud, None).tolist() == pytest.approx([0.1, 0.0, 0.0])
+    assert contact_of_sounds(loud, None).tolist() == pytest.approx([0.1, 0.0, 0.0])
 
 
 class Echo:

@@ -38,7 +38,7 @@ def test_the_curve_is_stored_drawn_and_shown(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn: dict[str, Figure] = {}
-    monkeypatch.setattr("avmsf.plotting.pictures.save_picture", lambda figure, path: drawn.update({path.name: figure}))
+    monkeypatch.setattr("avmsf.cli.edit_report.save_picture", lambda figure, path: drawn.update({path.name: figure}))
     output, folder = tmp_path / "new.safetensors", tmp_path / "look"
     assert run(Options.parse([*words, "--output", str(output), "--plots", str(folder)])) == 0
     new, clap = load(output), Clap.load(tmp_path / "clap")

@@ -11,6 +11,8 @@ from typing import Any
 from avmsf._utils.text import printable
 from avmsf.pipeline.progress import ProgressDisplay
 
+MAX_LISTED_MODES = 20
+"""Modes in a table, those of most energy."""
 display = ProgressDisplay()
 """What a verb is doing, on the standard error: quiet or verbose by the options of the verb that runs."""
 say = display.say

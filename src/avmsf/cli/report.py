@@ -14,7 +14,7 @@ from torch import Tensor
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
-from avmsf.cli.printing import decimals, display, table
+from avmsf.cli.printing import MAX_LISTED_MODES, decimals, display, table
 from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.task import Renderer
@@ -27,8 +27,6 @@ from avmsf.modal.modes import ModalBank
 from avmsf.pipeline.record import RECORD, modes_words, recorded
 from avmsf.symmetry.symmetries import Symmetries
 
-MAX_LISTED_MODES = 20
-"""Modes in a table, those of most energy."""
 HEADINGS = {"relative_stft": "relative STFT error", "l1": "L1", "l1_log": "L1-log", "envelope": "ENV"}
 """Metrics in the order of the table, as its columns call them."""
 

@@ -1,8 +1,9 @@
-"""Settings of guided edits: importing this imports nothing that computes."""
+"""Settings of edits: importing this imports nothing that computes."""
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Final, Literal
 
 from avmsf.errors import EditError
 
@@ -76,6 +77,77 @@ class DistillationConfig:
             batch=(self.batch >= 1, "1 or more"),
             guidance=(self.guidance >= 0 and math.isfinite(self.guidance), "0 or more, such as 15"),
         )
+
+
+@dataclass(frozen=True)
+class MaterialSettings:
+    """Constants of the new material in place of the table's, or without --to of the present material's."""
+
+    young: float | None = None
+    """Young's modulus, Pa."""
+    density: float | None = None
+    """Density, kg/m3."""
+    poisson: float | None = None
+    """Poisson's ratio; only its expected effect is printed."""
+    alpha: float | None = None
+    """Mass-proportional Rayleigh damping, 1/s."""
+    beta: float | None = None
+    """Stiffness-proportional Rayleigh damping, s."""
+    law: Literal["displacement", "velocity", "acceleration", "ratio-only"] = "displacement"
+    """Quantity that the recordings are proportional to, which decides the level of each mode; ratio-only is the paper's
+    law, which leaves mass and size out."""
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """The constants that are given."""
+        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "law"}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class PromptSettings:
+    """Targets from a text-to-audio model."""
+
+    negative: str | None = None
+    """Text that describes what to move away from."""
+    model_seconds: float | None = None
+    """Length that the model works at; by default all that it was trained for, and time grows in proportion."""
+    device: str | None = None
+    """Device of the model, cpu or cuda; by default the GPU if there is one."""
+    generated: Path | None = None
+    """Also write the sound that the model makes from the prompt without the field to this wav file: the paper's
+    baseline."""
+    clap: str | None = None
+    """Also compute the CLAP score of the unedited field and of every preview with this network, a folder or a name on
+    the hub; needs the extra `eval`."""
+    distillation: DistillationConfig = field(default_factory=DistillationConfig)
+    """Targets from the model."""
+
+
+@dataclass(frozen=True)
+class EditSettings:
+    """Settings of an edit."""
+
+    material: MaterialSettings = field(default_factory=MaterialSettings)
+    """The new material."""
+    prompt: PromptSettings = field(default_factory=PromptSettings)
+    """Targets from a text-to-audio model."""
+    parameters: Literal["hierarchical", "published", "independent", "searched"] = "hierarchical"
+    """Parameters that are optimized. hierarchical: factors on all frequencies and all dampings, then single modes, with
+    a penalty. published: the paper's form, a factor on all frequencies and single modes without a penalty, gains times
+    f1/f2 at the end. independent: only single modes (Audio-SDS). searched: the same after a search for common
+    factors."""
+    guide: GuidedEditConfig = field(default_factory=GuidedEditConfig)
+    """How the modes are optimized."""
+
+    def check_prompt(self, prompt: str) -> None:
+        """Raise `EditError` for an empty prompt, and for settings that no prompt can be used with."""
+        check_prompt(prompt)
+        if self.prompt.clap is not None and self.guide.preview_every == 0:
+            raise EditError.expected("guide.preview_every of 1 or more with it, such as 50", 0, name="prompt.clap")
+        seconds = self.prompt.model_seconds
+        if seconds is not None and not 0 < seconds < math.inf:
+            raise EditError.expected("more than 0, such as 3", seconds, name="prompt.model_seconds")
 
 
 def _check(settings: object, **rules: tuple[bool, str]) -> None:

@@ -78,6 +78,21 @@ def remarks(entries: Sequence[Mapping[str, Any]], field: SoundField) -> list[str
     return words
 
 
+_MAX_FREQUENCY_ERROR = 0.02
+"""By which part a mode's frequency may be off the one that it is called by."""
+
+
+def mode_at(bank: ModalBank, frequency: float, *, option: str) -> int:
+    """Return the index of the mode at a frequency, Hz. Raises EditError, named `option`, where there is none."""
+    row = int((bank.frequency - frequency).abs().argmin())
+    nearest = float(bank.frequency[row])
+    if not abs(nearest - frequency) <= _MAX_FREQUENCY_ERROR * nearest:
+        advice = f"the nearest is at {nearest:.5g} Hz (`avmsf info` lists them)"
+        got = f"{frequency:g} Hz"
+        raise EditError.expected("the frequency of a mode", frequency, got=got, name=option, advice=advice)
+    return row
+
+
 Slider = float | Sequence[float] | Float[Tensor, " modes"]
 """One value for all modes, or one for each."""
 _POINTS = 256

@@ -11,7 +11,7 @@ long. Shorter sounds are repeated as the extractor's own settings have it, which
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,13 +20,19 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf._utils.files import model_folder
+from avmsf._utils.files import model_folder, write_whole
+from avmsf._utils.text import read_json
 from avmsf.editing.clips import resampled
-from avmsf.errors import EvaluationError, download_failure
+from avmsf.editing.guided import GuidedEditProgress
+from avmsf.editing.modal_edit import EDITS
+from avmsf.errors import EditError, EvaluationError, download_failure
 from avmsf.evaluation.metrics import PerContact, validate_sounds
+from avmsf.field.sound_field import SoundField
 
 DEFAULT: Final = "laion/clap-htsat-unfused"
 """The hub's name of the network that scores are taken with unless another is named."""
+CLAP = "clap"
+"""The key of the scores in the last edit of a field's report."""
 _BATCH = 8
 """Sounds embedded at a time: bounds the memory."""
 
@@ -159,3 +165,50 @@ def _how_to_download(name: str) -> str:
     return (
         f"on a computer with a network run hf download {name} --local-dir FOLDER, copy FOLDER here, and give its path"
     )
+
+
+class ClapCurve:
+    """The CLAP score of a field's sound at one contact over the steps of an edit; step 0 is the unedited field."""
+
+    def __init__(self, clap: Clap, prompt: str, field: SoundField, kept: Path, *, resumed: bool) -> None:
+        """Start a curve, or with `resumed` continue that of the file `kept`.
+
+        Raises EditError for a file that is damaged or has scores of another network.
+        """
+        self.clap, self.prompt, self.field, self.kept = clap, prompt, field, kept
+        self.scores = _read_scores(kept, clap) if resumed and kept.is_file() else {}
+
+    def add(self, progress: GuidedEditProgress) -> None:
+        """Score a preview, and the unedited field before the first one. Silent sounds have no score."""
+        if progress.preview is None or progress.place is None:
+            return
+        if not self.scores:
+            self._score(0, self.field.render(progress.place[None])[0])
+        self._score(progress.step, progress.preview)
+        text = json.dumps({"digest": self.clap.digest, "scores": list(self.scores.items())})
+        write_whole(self.kept, text, raising=EditError)
+
+    def recorded_in(self, edited: SoundField) -> SoundField:
+        """Return the edited field with the steps and scores in the record of its last edit."""
+        *others, last = edited.origin.report[EDITS]
+        record = {"model": self.clap.name, "steps": [*self.scores], "scores": [*self.scores.values()]}
+        report = {**edited.origin.report, EDITS: [*others, {**last, CLAP: record}]}
+        return replace(edited, origin=replace(edited.origin, report=report))
+
+    def _score(self, step: int, sound: Float[Tensor, " samples"]) -> None:
+        if bool(sound.any()):
+            self.scores[step] = float(self.clap.score(sound[None], [self.prompt], sample_rate=self.field.sample_rate))
+
+
+def _read_scores(path: Path, clap: Clap) -> dict[int, float]:
+    try:
+        read = read_json(path)
+        scores = {int(step): float(score) for step, score in read["scores"]}
+        digest = read["digest"]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        advice = "delete the file to continue"
+        raise EditError.expected("CLAP scores", got=str(error), file=path, advice=advice) from error
+    if digest != clap.digest:
+        got, advice = "those of another network", "give that network"
+        raise EditError.expected(f"scores of {clap.name}", digest, got=got, file=path, name="digest", advice=advice)
+    return scores

@@ -43,6 +43,16 @@ class ModeLevels:
         size = torch.where(field.audible, known.power.mean(0).sqrt(), 0.0)
         return cls(field.bank.frequency, np.log(1000.0) / field.bank.damping, size)
 
+    @property
+    def longest_t60(self) -> float:
+        """The longest T60 of the modes that sound, s; zero without one."""
+        return max([0.0, *self.t60[self.size > 0].tolist()])
+
+    @property
+    def total_db(self) -> float:
+        """The level of all modes together, dB; -inf without one that sounds."""
+        return float(20.0 * self.size.norm().log10())
+
     def level_db(self, reference: float) -> Float64[Tensor, " modes"]:
         """Return levels over an amplitude, dB; -inf for silent modes."""
         return 20.0 * torch.log10(self.size / max(reference, torch.finfo(torch.float64).tiny))

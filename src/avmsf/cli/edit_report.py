@@ -1,0 +1,121 @@
+"""What an edit did to a field: a table of its modes, notes, pictures and sounds."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from avmsf._utils.text import counted, format_number
+from avmsf.cli.contacts import contacts_at, refuse_far
+from avmsf.cli.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, Options
+from avmsf.cli.printing import MAX_LISTED_MODES, decimals, say, table
+from avmsf.cli.writing import Level, write_sound
+from avmsf.editing.modal_edit import remarks
+from avmsf.evaluation.clap import CLAP
+from avmsf.field.sound_field import SoundField
+from avmsf.plotting.edits import ModeLevels, draw_clap_curves, draw_edit
+from avmsf.plotting.pictures import save_picture
+from avmsf.plotting.spectrograms import draw_spectrograms
+
+_CANDIDATES = 64
+"""Points of the surface among which the loudest is looked for."""
+_LOUD_NOISE_DB = 6.0
+"""Decrease of the modes' level, dB, from which on the noise, whose level stays, may be too loud: half the amplitude."""
+_FieldAt = tuple[SoundField, Float64[Tensor, " 3"]]
+"""A field and a contact on it, meters."""
+
+
+def mode_changes(before: ModeLevels, after: ModeLevels) -> list[dict[str, Any]]:
+    """Return what became of each mode, in the field's order."""
+    change = 20.0 * (after.size / before.size).log10()
+    columns = (before.frequency, after.frequency, before.t60, after.t60, change)
+    names = ("frequency_before", "frequency_after", "t60_before", "t60_after", "level_change_db")
+    return [
+        {**dict(zip(names, row, strict=True)), "silent": size == 0.0}
+        for *row, size in zip(*(column.tolist() for column in columns), after.size.tolist(), strict=True)
+    ]
+
+
+def _change(row: dict[str, Any]) -> str:
+    if row["silent"]:
+        return "silent"
+    return decimals(row["level_change_db"], 1) if math.isfinite(row["level_change_db"]) else "back"
+
+
+def changes_table(rows: list[dict[str, Any]], before: ModeLevels, after: ModeLevels) -> str:
+    """Return the modes of most energy, before or after, as a table."""
+    energy = (before.size.square() * before.t60).maximum(after.size.square() * after.t60)
+    listed = energy.argsort(descending=True)[:MAX_LISTED_MODES].sort().values.tolist()
+    cells = []
+    for row in (rows[place] for place in listed):
+        frequencies = [format_number(row[f"frequency_{when}"], 5) for when in ("before", "after")]
+        cells.append([*frequencies, *(format_number(row[f"t60_{when}"]) for when in ("before", "after")), _change(row)])
+    title = f"the {MAX_LISTED_MODES} modes of most energy among {len(rows)}"
+    if len(rows) <= MAX_LISTED_MODES:
+        title = counted(len(rows), "mode")
+    columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level change (dB)"]
+    return table(f"{title}, before and after", columns, cells, words=0)
+
+
+def notes_on(
+    options: Options, edits: list[dict[str, Any]], new: SoundField, before: ModeLevels, after: ModeLevels
+) -> list[str]:
+    """Return what a user of an edited field should know."""
+    notes = [*remarks(edits, new)]
+    seconds, ringing = new.samples / new.sample_rate, after.longest_t60
+    if ringing > max(seconds, before.longest_t60):
+        notes.append(
+            f"the longest T60 is {format_number(ringing)} s and rendered sounds last {format_number(seconds)} s; "
+            f"render and export with --seconds {math.ceil(10 * ringing) / 10:g}"
+        )
+    if options.scale != 1.0:
+        notes.append(f"positions on the edited object are {options.scale:g} times as large")
+    softer = before.total_db - after.total_db
+    if _LOUD_NOISE_DB < softer < math.inf and bool(new.residual.magnitude.any()):
+        notes.append(
+            f"the modes are {softer:.0f} dB softer and the residual noise is as loud as before; `avmsf render "
+            "--no-noise` leaves it out"
+        )
+    return notes
+
+
+def contact_of_sounds(field: SoundField, at: tuple[float, float, float] | None) -> Float64[Tensor, " 3"]:
+    """Return the contact of the sounds: the requested one, or the loudest of some."""
+    if at is not None:
+        chosen = contacts_at([at], meters=1.0)
+        refuse_far(chosen, field, advice=", in meters")
+        return chosen.places[0].double()
+    points = field.gain_field.points
+    some = points[:: max(1, len(points) // _CANDIDATES)]
+    energy = (field.known(some).power * field.audible / field.bank.damping).sum(1)
+    return some[int(energy.argmax())].double()
+
+
+def draw(folder: Path, before: _FieldAt, after: _FieldAt, last: dict[str, Any]) -> None:
+    """Write pictures and sounds of both fields at a place each, by one factor, and the CLAP scores of the last edit."""
+    old, new = before[0], after[0]
+    name, rate = old.origin.capture or "field", old.sample_rate
+    sounds = torch.cat([field.render(place[None]) for field, place in (before, after)])
+    pictures = {
+        MODES: draw_edit(ModeLevels.of(old), ModeLevels.of(new), sample_rate=rate, title=f"modes of {name}, edited"),
+        SPECTROGRAMS: draw_spectrograms(
+            *sounds[:, None],
+            sample_rate=rate,
+            names=[""],
+            title=f"an impact at {name}, edited",
+            columns=("before", "after"),
+            shared_scale=False,
+        ),
+    }
+    if CLAP in last:
+        curve = list(zip(last[CLAP]["steps"], last[CLAP]["scores"], strict=True))
+        pictures[CURVE] = draw_clap_curves({last["parameters"]: [curve]}, title=f"CLAP score: {last['prompt']}")
+    for each, picture in pictures.items():
+        save_picture(picture, folder / each)
+    factor = Level("peak", -1.0).factor(sounds)
+    for each, sound in zip((BEFORE, AFTER), sounds, strict=True):
+        write_sound(folder / each, factor * sound, sample_rate=rate, coding="float32")
+    say(f"wrote {', '.join((*pictures, BEFORE, AFTER))} in {folder}")
