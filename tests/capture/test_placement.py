@@ -69,6 +69,14 @@ def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_i
     assert 'is the surface\'s unit "mm"?' in placement.describe()
 
 
+def test_contacts_close_together_on_the_surface_are_not_in_another_frame() -> None:
+    near = CLOUD[(CLOUD - CLOUD[0]).norm(dim=1).argsort()[:3]]
+    placement = check_placement(near, CLOUD)
+    assert placement.mismatch is None
+    assert placement.fault == "rows"
+    assert "different frames" not in placement.describe()
+
+
 EYE, HERE = torch.eye(3, dtype=torch.float64), (0.0, 0.0, 0.0)
 MISTAKES = {
     "mm": (1e-3, EYE, HERE, 'is their unit "mm"?', True),

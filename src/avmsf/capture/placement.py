@@ -168,6 +168,8 @@ class Placement:
         if few:
             shown = listed([names[row] if names else f"row {row}" for row in self.off])
             return f"{found}, the others on it; check {shown}"
+        if not self.off:
+            return f"{found}: in a spot too small for impacts all over it; check that both are in one unit and frame"
         return (
             f"{found}, and no change of unit, axes or origin explains it: the {what} and the contacts are in different "
             "frames; give both in one (structure from motion chooses its own: see docs/visual-inputs.md; nerfstudio "
