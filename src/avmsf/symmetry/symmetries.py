@@ -94,7 +94,7 @@ class Symmetries:
         if not math.isfinite(self.rejected):
             nearest = "there was no other candidate"
         if self.tolerance <= 0.0:
-            return "no symmetry found: the points are too few or too noisy to tell one"
+            return "no symmetry found: the points are too few or too noisy to tell one, or fill a volume"
         if not found:
             return f"no symmetry found: {nearest} ({measure})"
         lines = [f"{each}: error {each.error:.2f}, {self._confidence(each.error)}" for each in found]
