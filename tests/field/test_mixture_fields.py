@@ -1,5 +1,8 @@
 """The gain model on a plate: its symmetries, impacts too near to tell apart, and what mode shapes are worth."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 from torch import Tensor
 
@@ -29,6 +32,33 @@ def mean(model: MixtureGains, points: Tensor, directions: Tensor | None = None) 
 
 def expect_close(found: Tensor, expected: Tensor, *, within: float = 1e-6) -> None:
     torch.testing.assert_close(found, expected, rtol=0, atol=within * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("body", [None, plate()], ids=["positional", "elastic"])
+def test_an_object_that_is_moved_turned_and_enlarged_has_the_same_gains(body):
+    sites, values = struck(12)
+    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))).Q
+    turn = turn * torch.linalg.det(turn)
+
+    def moved(points: Tensor) -> Tensor:
+        return 4.0 * points @ turn.T + torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+
+    there = None if body is None else replace(body, nodes=moved(body.nodes), shapes=body.shapes @ turn.T)
+    here = fitted(sites, values, body)
+    elsewhere = fitted(Sites(moved(sites.points), sites.directions @ turn.T), values, there, size=4.0 * DIAGONAL)
+    # Mode shapes are held in float32.
+    found, expected = mean(elsewhere, moved(PLACES), BLOWS @ turn.T), mean(here, PLACES, BLOWS)
+    expect_close(found, expected, within=1e-4)
+    deviations = elsewhere.posterior(moved(PLACES), BLOWS @ turn.T).std, here.posterior(PLACES, BLOWS).std
+    expect_close(*deviations, within=1e-3)
+
+
+@pytest.mark.parametrize("body", [None, plate()], ids=["positional", "elastic"])
+def test_impacts_from_the_other_side_with_opposite_gains_say_the_same(body):
+    sites, values = struck(12)
+    side = torch.where(torch.arange(12) % 3 == 0, -1.0, 1.0).double()[:, None]
+    opposite = fitted(Sites(sites.points, side * sites.directions), side * values, body)
+    expect_close(mean(opposite, PLACES, BLOWS), mean(fitted(sites, values, body), PLACES, BLOWS))
 
 
 def test_mode_shapes_predict_what_positions_cannot_and_know_how_well():

@@ -1,52 +1,118 @@
-"""Progress of work that takes long, on the standard error."""
+"""The progress of the stages: what they report, and how it is shown on the standard error."""
 
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from avmsf._utils.progress import is_live
+from avmsf._utils.text import printable
+
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+
+def _ignore(*values: object) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class ProgressListener:
+    """Callbacks that receive the progress of the stages."""
+
+    log: Callable[[str], None] = _ignore
+    """Receives a sentence as each part of a stage begins."""
+    step: Callable[[str, int, int, str], None] = _ignore
+    """Receives a stage's name, its steps done and in all, and a message on the last one."""
+    ready: Callable[[str, float | None], None] = _ignore
+    """Receives the name of a stage whose output is there, and the seconds that it took; None where it was cached."""
+    note: Callable[[str], None] = _ignore
+    """Receives a sentence that a user should know: what is missing, and what is done without it."""
+
+
+class ProgressDisplay:
+    """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready."""
+
+    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+        """Show nothing but notes with `quiet`, and with `verbose` print each part of a stage as it begins."""
+        self.quiet, self.verbose = quiet, verbose
+        self._bar: Progress | None = None
+        self._shown: tuple[str, TaskID] | None = None
+
+    def __enter__(self) -> "ProgressDisplay":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    @property
+    def listener(self) -> ProgressListener:
+        """What the stages report to."""
+        return ProgressListener(self.doing, self.step, self.ready, lambda text: self.say(f"note: {text}"))
+
+    def say(self, text: str) -> None:
+        """Print a line, unless `quiet`; a note or a warning always."""
+        self.close()
+        if not self.quiet or text.startswith(("note: ", "avmsf ")):
+            print(printable(text), file=sys.stderr, flush=True)
+
+    def doing(self, text: str) -> None:
+        """Show what begins."""
+        if self.verbose:
+            self.say(text)
+        self._show(text, text, 0, None)
+
+    def step(self, stage: str, done: int, total: int, message: str) -> None:
+        """Show how many steps of a stage are done, and a message on the last one."""
+        self._show(stage, f"{stage}: {message}" if message else stage, done, total)
+
+    def ready(self, name: str, seconds: float | None) -> None:
+        """Print that a stage is ready, with its time on the right."""
+        self.say(f"{name:24}{'cached' if seconds is None else f'{seconds:.1f} s':>12}")
+
+    def objects(self, after_each: Callable[[], object] = _ignore) -> Callable[[str, int, int], None]:
+        """Return what receives which of several objects begins or ends, how many are done, and how many there are.
+
+        When one is done it calls `after_each` and prints a line.
+        """
+        finished, begun = 0, time.monotonic()
+
+        def show(message: str, done: int, total: int) -> None:
+            nonlocal finished
+            if done > finished:
+                after_each()
+                self.say(f"{message} ({done} of {total}, {time.monotonic() - begun:.0f} s)")
+            finished = done
+            self._show("objects", message, done, total)
+
+        return show
+
+    def close(self) -> None:
+        """Remove the line that moves, until something is shown again."""
+        if self._bar is not None:
+            self._bar.stop()
+
+    def _show(self, stage: str, text: str, done: int, total: int | None) -> None:
+        if self.quiet or not sys.stderr.isatty():
+            return
+        if self._bar is None:
+            self._bar = _new_bar()
+        self._bar.start()
+        if self._shown is None or self._shown[0] != stage:
+            if self._shown is not None:
+                self._bar.remove_task(self._shown[1])
+            self._shown = stage, self._bar.add_task("", total=total)
+        self._bar.update(self._shown[1], description=printable(text).replace("[", "\\["), completed=done)
+
+
+def _new_bar() -> "Progress":
+    # Only here: what is shown in a file or a pipe does without rich.
     from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-REPEAT_SECONDS = 5.0
-"""Interval of the lines that a file or a pipe gets."""
-
-
-@contextmanager
-def working(what: str, *, shown: bool) -> Iterator[None]:
-    """Show what is done until it ends: moving on a terminal, as a line every few seconds in a file or a pipe."""
-    if not shown:
-        yield
-        return
-    from rich.console import Console  # only here: verbs that show nothing are to begin at once
-
-    console = Console(stderr=True)
-    with console.status(what) if is_live(console) else _repeated(what):
-        yield
-
-
-def is_live(console: "Console") -> bool:
-    """Return whether a console can show what moves: a terminal or a notebook."""
-    return (console.is_terminal and not console.is_dumb_terminal) or console.is_jupyter
-
-
-@contextmanager
-def _repeated(what: str) -> Iterator[None]:
-    """Print what is done, and the seconds since its beginning, every few seconds while the block runs."""
-    ended, begun = threading.Event(), time.monotonic()
-
-    def repeat() -> None:
-        # A standard error that was closed costs the lines alone.
-        with suppress(OSError, ValueError):
-            while not ended.wait(REPEAT_SECONDS):
-                print(f"{what} ... {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
-
-    thread = threading.Thread(target=repeat, name="avmsf-progress", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+    console = Console(file=sys.stderr)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    # What goes to a file or a pipe is not for the terminal.
+    redirect = sys.stdout.isatty()
+    return Progress(*columns, console=console, transient=True, disable=not is_live(console), redirect_stdout=redirect)

@@ -147,6 +147,16 @@ def test_no_factor_above_the_largest_is_considered():
     assert float(weights[FACTORS > 1.28].sum()) == 0.0
 
 
+def test_a_fit_finds_the_factor_and_predicts_as_well_with_it():
+    sites = impacts(8, seed=1)
+    nominal, scaled = (fitted(sites, elastic=True, gains=measured(sites, factor=each)) for each in (1.0, 0.75))
+    assert torch.allclose(error_elsewhere(scaled), error_elsewhere(nominal), atol=0.03)
+    for each, factor in ((nominal, 1.0), (scaled, 0.75)):
+        body = each.families[-1]
+        assert isinstance(body, Elastic)
+        assert abs(math.log(body.factor / factor)) <= 0.05
+
+
 def test_gains_tell_the_factor_where_frequencies_do_not():
     """Of frequencies in geometric progression, each is another's as well; which shape a mode is says whose."""
     progression = 400.0 * 1.3 ** torch.arange(SHAPES, dtype=torch.float64)

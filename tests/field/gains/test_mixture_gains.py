@@ -117,6 +117,15 @@ def test_covariances_are_those_of_the_most_probable_hypothesis(make):
         assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * noise
 
 
+def test_without_noise_nothing_is_unknown_at_the_contacts():
+    sites = impacts(12, seed=1)
+    exact = replace(measured(sites), variance=torch.zeros(MODES).double())
+    given = fit_mixture(families(sites), exact, sites.points.float(), directional=True, noise_shares=(1e-9,))
+    for _, covariance, _ in given.covariances(sites.points, sites.directions):
+        assert float(covariance.diagonal().max()) < 1e-6 * float(given.values.abs().square().max())
+    assert torch.allclose(gains_at(given, sites), given.values, rtol=1e-3, atol=1e-4)
+
+
 def test_shares_are_of_the_families_that_modes_come_from():
     shares = model().shares()
     assert torch.allclose(shares.sum(0), torch.ones(MODES, dtype=torch.float64))
