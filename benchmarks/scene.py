@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from avmsf._utils.progress import ProgressListener
 from avmsf.capture import Capture, read_capture, write_capture
 from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.splits import split
@@ -20,7 +21,6 @@ from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.features import finish_features
 from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.progress import ProgressListener
 from avmsf.pipeline.stages import StageFolder
 from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.dino import measure_dino

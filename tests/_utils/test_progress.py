@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from avmsf.pipeline.progress import ProgressDisplay
+from avmsf._utils.progress import ProgressDisplay
 
 
 class Terminal(io.StringIO):

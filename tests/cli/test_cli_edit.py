@@ -9,6 +9,7 @@ import pytest
 import soundfile
 import torch
 
+from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.cli.edit import Options, run
 from avmsf.cli.edit_report import contact_of_sounds
@@ -24,7 +25,6 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.pipeline.progress import ProgressDisplay
 from factories.made_audio import save_audio
 from factories.made_fields import FIELDS, mixture, places
 from factories.raising import raises

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.field.store import load
-from avmsf.pipeline.progress import ProgressDisplay
 from factories.plate_capture import TINY, fill_plate
 
 NETWORK = ("--gain-model", "network", "--without-shape", *TINY)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.cli.report import describe
 from avmsf.features.store import load_features, read_report
@@ -16,7 +17,6 @@ from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
 from avmsf.photographs.folder import write_views
-from avmsf.pipeline.progress import ProgressDisplay
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.settings import sets
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file

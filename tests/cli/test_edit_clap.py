@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 from test_cli_edit import PLACES, RATE, Echo, ceramic
 
+from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.cli.edit import Options, run
 from avmsf.editing.modal_edit import EDITS, adjust_modes
@@ -14,7 +15,6 @@ from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError
 from avmsf.evaluation.clap import Clap
 from avmsf.field.store import load, save
-from avmsf.pipeline.progress import ProgressDisplay
 from factories.made_clap import save_clap
 from factories.raising import raises
 from factories.settings import sets

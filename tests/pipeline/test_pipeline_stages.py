@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from avmsf._utils.progress import ProgressListener
 from avmsf.errors import CaptureError
-from avmsf.pipeline.progress import ProgressListener
 from avmsf.pipeline.stages import Pipeline, Stage, StageFolder, digest_files
 from factories.raising import raises
 

@@ -1,4 +1,4 @@
-"""The progress of the stages: what they report, and how it is shown on the standard error."""
+"""The progress of work that takes long: what it reports, and how that is shown on the standard error."""
 
 import sys
 import time
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from avmsf._utils.progress import is_live
 from avmsf._utils.text import printable
 
 if TYPE_CHECKING:
@@ -32,7 +31,10 @@ class ProgressListener:
 
 
 class ProgressDisplay:
-    """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready."""
+    """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready.
+
+    A notebook counts as a terminal.
+    """
 
     def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
         """Show nothing but notes with `quiet`, and with `verbose` print each part of a stage as it begins."""
@@ -94,7 +96,7 @@ class ProgressDisplay:
             self._bar.stop()
 
     def _show(self, stage: str, text: str, done: int, total: int | None) -> None:
-        if self.quiet or not sys.stderr.isatty():
+        if self.quiet or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
             return
         if self._bar is None:
             self._bar = _new_bar()
@@ -112,7 +114,8 @@ def _new_bar() -> "Progress":
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(file=sys.stderr)
+    live = console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     # What goes to a file or a pipe is not for the terminal.
     redirect = sys.stdout.isatty()
-    return Progress(*columns, console=console, transient=True, disable=not is_live(console), redirect_stdout=redirect)
+    return Progress(*columns, console=console, transient=True, disable=not live, redirect_stdout=redirect)

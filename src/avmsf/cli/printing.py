@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from avmsf._utils.progress import ProgressDisplay
 from avmsf._utils.text import printable
-from avmsf.pipeline.progress import ProgressDisplay
 
 MAX_LISTED_MODES = 20
 """Modes in a table, those of most energy."""

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_count, as_vectors, short_repr
-from avmsf._utils.progress import working
+from avmsf._utils.progress import ProgressDisplay
 from avmsf.errors import FitError
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -72,7 +72,7 @@ def suggest(
     them they are points spread over the surface that a hammer can strike from outside (`hammer_access`). `directions`
     are the unit vectors along which candidates can be struck, straight into the surface where not given. A field made
     of photographs has points where they show the object; with `unseen`, error and candidates are those of all of the
-    surface of the field's body instead. With `progress`, the standard error says that it works.
+    surface of the field's body instead. With `progress`, a terminal shows that it works.
 
     Raises FitError for gains without a posterior, unfit arguments, fewer candidates than contacts asked for, places
     none of which a hammer gets to, and `unseen` without a body.
@@ -87,7 +87,8 @@ def suggest(
         wanted, advice = "a field with the object's surface", "leave unseen out, or give candidates"
         raise FitError.expected(wanted, True, got="one without", name="unseen", advice=advice)
     _expect_directions(directions, given)
-    with working("computing the expected error over the surface", shown=progress):
+    with ProgressDisplay(quiet=not progress) as display:
+        display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
         points = surface[farthest_points(surface, min(MAX_POINTS, len(surface)))].double()
         if given is None:

@@ -13,7 +13,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike
-from avmsf._utils.progress import working
+from avmsf._utils.progress import ProgressDisplay
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, check_not_silent
 from avmsf.capture.onset import find_onset, find_pulse
@@ -58,8 +58,8 @@ def locate(
     fitted to (see `preprocess_recording`), `points` and `directions` as for `Locator.of`. `force` is the peak force of
     the impact, a number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs.
     `locator` is one made of the field before, with points of its own. That of the last field and its own points is
-    cached, so that of several recordings only the first waits for it. With `progress`, the standard error says that it
-    works. The sound of another object has a `refusal` in place of a position, see `assess_match`. Raises LocationError
+    cached, so that of several recordings only the first waits for it. With `progress`, a terminal shows that it works.
+    The sound of another object has a `refusal` in place of a position, see `assess_match`. Raises LocationError
     as `preprocess_recording` and `Locator.locate`, and for a locator of another field or given with points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
@@ -67,7 +67,8 @@ def locate(
         wanted = "one of this field, without points and directions"
         raise LocationError.expected(wanted, what, got=f"one with {what}", name="locator", advice="leave it out")
     known = None if force is None else Force.of(force)
-    with working("locating the impact; the first of a field takes seconds to minutes", shown=progress):
+    with ProgressDisplay(quiet=not progress) as display:
+        display.doing("locating the impact; the first of a field takes seconds to minutes")
         impact = preprocess_recording(recording, field, sample_rate=sample_rate, settings=settings)
         if locator is None and points is None and directions is None:
             locator = _locator_of(field)

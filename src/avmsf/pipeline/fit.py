@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf._utils.caching import once
+from avmsf._utils.progress import ProgressDisplay, ProgressListener
 from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
 from avmsf.capture.checks import find_surface
@@ -30,7 +31,6 @@ from avmsf.modal.extraction.extract import Extraction, extract_once
 from avmsf.modal.extraction.finders import finder_named
 from avmsf.pipeline.bodies import candidate_bodies, expect_no_recordings, guess_field
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE, PipelineConfig
-from avmsf.pipeline.progress import ProgressDisplay, ProgressListener
 from avmsf.pipeline.record import modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.shape import FitShape, is_mesh, object_shape, pipeline_of, shape_of

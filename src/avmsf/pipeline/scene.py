@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from avmsf._utils.progress import ProgressListener
 from avmsf._utils.text import counted
 from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
@@ -28,7 +29,6 @@ from avmsf.photographs.cameras import View
 from avmsf.pipeline.cloud_shape import masks_suffice, shape_of_cloud, views_of_cloud
 from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.features import choose_encoder, finish_features, lift_features
-from avmsf.pipeline.progress import ProgressListener
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder, digest_of
 from avmsf.pipeline.views import MOTION, VIEWS, Source, find_source, find_splats, view_stages
 from avmsf.reconstruction import ObjectShape

@@ -12,6 +12,7 @@ import torch
 
 from avmsf._utils.caching import once
 from avmsf._utils.files import write_whole
+from avmsf._utils.progress import ProgressListener
 from avmsf.capture import Capture
 from avmsf.errors import SceneError
 from avmsf.features.feature_field import FeatureField
@@ -26,7 +27,6 @@ from avmsf.photographs import read_views
 from avmsf.photographs.nerf_json import stated_moves
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
 from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
-from avmsf.pipeline.progress import ProgressListener
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
 from avmsf.reconstruction import ObjectShape

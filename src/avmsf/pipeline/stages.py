@@ -18,9 +18,9 @@ import avmsf
 from avmsf._utils.caching import discard, source_digest
 from avmsf._utils.files import way_out, write_whole
 from avmsf._utils.processes import WAIT, write_lock
+from avmsf._utils.progress import ProgressListener
 from avmsf._utils.text import read_json
 from avmsf.errors import CaptureError
-from avmsf.pipeline.progress import ProgressListener
 
 _BLOCK = 1 << 20
 

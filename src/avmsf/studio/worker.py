@@ -19,6 +19,7 @@ from typing import Any, TextIO
 
 from avmsf._utils.files import copy_whole
 from avmsf._utils.processes import end_with_parent
+from avmsf._utils.progress import ProgressListener
 from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
 from avmsf.editing.config import GuidedEditConfig
@@ -30,7 +31,6 @@ from avmsf.errors import NO_MEMORY, AvmsfError, CaptureWarning, lacks_memory
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
 from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.progress import ProgressListener
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.capture import COMMAND
