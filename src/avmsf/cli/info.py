@@ -92,9 +92,7 @@ def _describe_field(options: Options) -> int:
 
     field = load(options.file)
     points = field.gain_field.points
-    points = points[:: max(1, len(points) // (_LISTED_POINTS if options.plots is None else _DRAWN_POINTS))]
-    gains = gains_at(field, points)
-    level = levels(gains)
+    level = levels(gains_at(field, points[:: max(1, len(points) // _LISTED_POINTS)]))
     every = list(zip(mode_rows(field.bank, level), field.is_mode.tolist(), strict=True))
     rows, supporting = ([row for row, is_mode in every if is_mode is part] for part in (True, False))
     values = describe(field)
@@ -111,7 +109,7 @@ def _describe_field(options: Options) -> int:
         values |= {"compared_with": {"recordings": list(compared.names), "which": what, "scores": score_values(scores)}}
     show("\n".join(lines), json=options.json)
     if options.plots is not None:
-        _draw_field(field, options.plots, points=points, gains=gains, level=level, recorded=compared)
+        _draw_field(field, options.plots, level=level, recorded=compared)
     if options.json:
         print_json(values | {"modes": rows, "supporting_poles": supporting})
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
@@ -129,8 +127,6 @@ def _draw_field(
     field: "SoundField",
     folder: Path,
     *,
-    points: "Tensor",
-    gains: "Tensor",
     level: "Tensor",
     recorded: "Impacts | None",
 ) -> None:
@@ -147,6 +143,9 @@ def _draw_field(
     modes = modes_words(len(field.bank), int((~field.is_mode).sum()))
     kept = field.is_mode
     bank = field.bank.take(kept)
+    points = field.gain_field.points
+    points = points[:: max(1, len(points) // _DRAWN_POINTS)]
+    gains = gains_at(field, points)
     pictures = {
         "modes": draw_modes(field.bank, level, is_mode=field.is_mode, title=f"{modes} of {name}"),
         "gains": draw_gains(points, gains[:, kept], bank, title=f"gains of the modes of most energy of {name}"),

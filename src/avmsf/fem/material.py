@@ -83,7 +83,8 @@ def material_named(name: str, *, option: str = "material") -> Material:
     Raises SimulationError with the names there are; `option` is the name of what was given.
     """
     if name.lower() not in MATERIALS:
-        near = get_close_matches(name.lower(), MATERIALS, n=1)
+        # Brass is not glass.
+        near = get_close_matches(name.lower(), MATERIALS, n=1, cutoff=0.7)
         advice = f"did you mean {near[0]}?" if near else ""
         raise SimulationError.expected(f"one of {', '.join(MATERIALS)}", name, name=option, advice=advice)
     return MATERIALS[name.lower()]

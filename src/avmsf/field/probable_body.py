@@ -52,8 +52,9 @@ class ProbableBody:
         if self.wall_interval is not None:
             low, high = (1000 * each for each in self.wall_interval)
             interval = f", 90 % interval of the wall {low:.2g} to {high:.2g} mm"
-        support = FREE if self.support == FREE else f"held: {self.support}"
-        return f"{self.name}{interval}, {support}, {self.specific_stiffness}"
+        # The name of a held body says where it is held.
+        free = f", {FREE}" if self.support == FREE else ""
+        return f"{self.name}{interval}{free}, {self.specific_stiffness}"
 
     @property
     def materials(self) -> tuple[Material, ...]:

@@ -95,9 +95,8 @@ class SoundField:
         )
         quality, body = self.quality, self.body
         if quality is not None:
-            text += (
-                f"\nleave-one-out error {quality.error:.2f}, mean of 3 nearest recordings {quality.nearest_mean:.2f}"
-            )
+            nearest = "" if quality.nearest is None else f", nearest recording {quality.nearest:.2f}"
+            text += f"\nleave-one-out error {quality.error:.2f}{nearest}, mean of 3 nearest {quality.nearest_mean:.2f}"
         return f"{text}\n{body.warning}" if body is not None and body.warning else text
 
     @property
