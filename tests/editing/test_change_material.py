@@ -51,8 +51,9 @@ def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor
     size, bank = float((contacts.amax(0) - contacts.amin(0)).norm()), ModalBank(frequency, damping)
     model = mixture_of(contacts, values, bank, contacts, families=[Smooth], size=size)
     # The mean at the contacts is linear in the gains measured there: these have it pass through the given ones.
-    passed = torch.linalg.solve(model.smoother(), torch.view_as_real(values).permute(1, 2, 0))
-    model = model.with_values(torch.view_as_complex(passed.permute(2, 0, 1).contiguous()))
+    series = torch.cat([values.real, values.imag], dim=1).double()
+    passed = torch.linalg.solve(model.mixture.smoother(), series.T[..., None])[..., 0].T
+    model = model.with_values(torch.complex(*passed.contiguous().chunk(2, dim=1)))
     phase, noise = torch.zeros_like(frequency), Residual(torch.full((9,), 1e-9))
     return SoundField(bank, model, phase, noise, RATE, 2000, Origin("plate"))
 
