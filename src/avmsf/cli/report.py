@@ -266,13 +266,13 @@ def mode_table(of: str, rows: Sequence[dict[str, Any]], supporting: int) -> str:
     most = most[:MAX_LISTED_MODES]
     which = "by energy" if len(most) == len(rows) else f"the {MAX_LISTED_MODES} of most energy"
     columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
-    judged = any("energy_share" in row for row in rows)
-    columns += ["energy", "phase", "orders", "left out"] if judged else []
+    scored = any("energy_share" in row for row in rows)
+    columns += ["energy", "phase", "orders", "left out"] if scored else []
     cells = []
     for row in most:
         cell = [str(row["number"]), decimals(row["frequency_hertz"], 2), format_number(row["damping_per_second"])]
         cell += [format_number(row["t60_seconds"]), decimals(row["level_db"], 1)]
-        if judged:
+        if scored:
             cell[1] += f" ± {format_number(row['frequency_spread_hertz'], 2)}"
             cell[2] += f" ± {format_number(row['damping_spread_per_second'], 2)}"
             cell += [f"{100 * row['energy_share']:.2f} %", decimals(row["phase_coherence"], 2)]

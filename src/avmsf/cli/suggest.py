@@ -124,8 +124,8 @@ def _lines(found: "Suggestions", rows: Sequence[dict[str, Any]]) -> list[str]:
     cells = [[_cell(value) for value in row.values()] for row in rows]
     lines = [
         table(title, columns, cells, words=1 + ("recording" in columns)),
-        "uncertainty: by the field's posterior, relative to the energy of the gains; 0 = certain, 1 = silence. How "
-        "sounds are off is measured by leave-one-out: believe that figure (avmsf info)",
+        "uncertainty: by the field's posterior, relative to the energy of the gains; 0 = certain, 1 = silence. The "
+        "error of sounds is measured by leave-one-out, and that value is the one to rely on (avmsf info)",
     ]
     if found.unreachable:
         lines.append(f"left out: {counted(found.unreachable, 'position')} that no hammer reaches from outside")

@@ -132,8 +132,8 @@ def wall_solids(surface: CheckedSurface, dofs: int) -> Callable[[float], Solid]:
         if TOLERANCES.min_dofs_ratio <= part <= 1.0:
             break
         length *= math.sqrt(part / 0.85)
-    skin, first = surface_of(mesh), length / mesh.scale
-    return lambda thickness: _near(lambda detail: shell(skin, thickness=thickness, detail=detail), dofs, first=first)
+    wall, first = surface_of(mesh), length / mesh.scale
+    return lambda thickness: _near(lambda detail: shell(wall, thickness=thickness, detail=detail), dofs, first=first)
 
 
 def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: float = TOLERANCES.max_dofs_ratio) -> Solid:

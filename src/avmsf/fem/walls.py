@@ -60,13 +60,13 @@ TOLERANCES = Tolerances()
 def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     """Return the wall of `thickness` meters that lies inwards of a surface, against its triangles' normals.
 
-    The surface is an open sheet, whose rims are closed straight through the wall, or the outer skin of a hollow body.
+    It is an open sheet, whose rims are closed straight through the wall, or the outer surface of a hollow body.
     It is remeshed to triangles with sides of about `detail` times its size, the diagonal of the box around it. Where it
     bends more tightly than the wall is thick the wall is thinner, on a tenth of the surface at most. Where even that
     folds prisms, as on scans with creases, both sides of the wall are filled as `fill` does, which is slower.
 
     Raises SimulationError for a surface without triangles or area, one whose triangles face different ways, a
-    thickness that is not positive or too large for how tightly the surface bends, and a closed skin that holds less
+    thickness that is not positive or too large for how tightly the surface bends, and a closed surface that holds less
     than the wall would.
     """
     if not 0 < thickness < np.inf:

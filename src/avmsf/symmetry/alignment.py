@@ -30,7 +30,7 @@ _MIN_QUERIES = 60
 """Least number of points by which one motion of a group is fitted."""
 _SMALL_STEP = 1e-3
 """Of a fit: radians or diagonals."""
-_SEEN_SHIFT, _SEEN_RATIO = 0.1, 3.0
+_TEST_SHIFT, _MIN_SHIFT_ERROR = 0.1, 3.0
 """A shift in diagonals, and the error that it must have for points to show a surface, in tolerances: 600 to 2000 points
 that fill a box have at most 1.2, 300 to 8000 of the benchmark's shapes 3.5 and more."""
 _MAX_PATCH = 1 / 80
@@ -73,8 +73,8 @@ class SymmetryTest:
         self.noise = float(unmoved.mean())
         self.noise_error = float(unmoved.std()) / math.sqrt(len(unmoved))
         # A shift is never a symmetry of what is bounded: where it is not seen, points fill a volume, or noise does.
-        shifts = Motions(np.tile(np.eye(3), (6, 1, 1)), _SEEN_SHIFT * np.concatenate([np.eye(3), -np.eye(3)]))
-        seen = self.squared_errors(shifts).mean() > (_SEEN_RATIO * TOLERANCE) ** 2
+        shifts = Motions(np.tile(np.eye(3), (6, 1, 1)), _TEST_SHIFT * np.concatenate([np.eye(3), -np.eye(3)]))
+        seen = self.squared_errors(shifts).mean() > (_MIN_SHIFT_ERROR * TOLERANCE) ** 2
         self.tolerance = TOLERANCE if seen and self.noise_error < TOLERANCE**2 else 0.0
 
     def squared_errors(self, motions: Motions) -> Float[np.ndarray, " motions"]:

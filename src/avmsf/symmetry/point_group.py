@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from avmsf.symmetry.motions import Matrices, Motions, Vector, axis_of, reflections, rotations
 
 MAX_ORDER = 12
-"""Largest order of an axis that is told from that of any turn."""
+"""Largest order of an axis that is distinguished from that of any turn."""
 GOLDEN_ANGLES = tuple(2 * math.pi * ((step * (math.sqrt(5) - 1) / 2) % 1.0) for step in range(1, 9))
 """Angles that have no small part of a turn in common, which stand for every angle: fractions of the golden section."""
 SAME_DISTANCE = 0.055

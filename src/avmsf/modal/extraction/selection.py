@@ -25,7 +25,7 @@ _MAX_NEIGHBORS = 30
 
 
 def merge(bank: ModalBank, *, duration: float) -> ModalBank:
-    """Return the candidates by frequency, without those that repeat another: nearer than they could be told apart.
+    """Return the candidates by frequency, without those that repeat another: nearer than they could be resolved.
 
     A mode's width is its damping over 2 pi, at least what `duration` seconds resolve.
     """
