@@ -15,6 +15,7 @@ from avmsf.field.header import FIELD
 from avmsf.gaussians.ply_header import read_header
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
     from torch import Tensor
 
     from avmsf.capture import Impacts
@@ -116,8 +117,8 @@ def _describe_field(options: Options) -> int:
     return 0
 
 
-def gains_at(field: "SoundField", points: "Tensor") -> "Tensor":
-    """Return the gains [points, modes] at many points, without a warning for one that is off the surface."""
+def gains_at(field: "SoundField", points: "Float[Tensor, 'points 3']") -> "Float[Tensor, 'points modes']":
+    """Return the gains at many points, without a warning for one that is off the surface."""
     import torch
 
     return torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])
@@ -127,7 +128,7 @@ def _draw_field(
     field: "SoundField",
     folder: Path,
     *,
-    level: "Tensor",
+    level: "Float[Tensor, ' modes']",
     recorded: "Impacts | None",
 ) -> None:
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
@@ -231,7 +232,7 @@ def _draw_features(features: "FeatureField", report: dict[str, Any], options: Op
     say(f"wrote {picture}")
 
 
-def _colors_of(path: Path, features: "FeatureField") -> "Tensor":
+def _colors_of(path: Path, features: "FeatureField") -> "Float[Tensor, 'points 3']":
     """Return the colors of the Gaussians that the features lie on."""
     import torch
     from scipy.spatial import cKDTree

@@ -18,6 +18,7 @@ from avmsf.cli.printing import doing, next_command, print_json, say, show
 from avmsf.errors import AvmsfError, LocationError
 
 if TYPE_CHECKING:
+    from jaxtyping import Float64
     from torch import Tensor
 
     from avmsf.cli.contacts import Contacts
@@ -174,7 +175,7 @@ def _true_contacts(options: Options, field: "SoundField") -> "Contacts | None":
     return contacts
 
 
-def _true_contact(contacts: "Contacts", recording: Path) -> "Tensor | None":
+def _true_contact(contacts: "Contacts", recording: Path) -> "Float64[Tensor, ' 3'] | None":
     """Return a recording's true contact; where a table does not have one row for it, note that."""
     from avmsf.cli.contacts import rows_of
 
@@ -186,7 +187,7 @@ def _true_contact(contacts: "Contacts", recording: Path) -> "Tensor | None":
     return contacts.places[rows[0]]
 
 
-def _error(contact: "ContactMap", truth: "Tensor", level: float) -> dict[str, Any]:
+def _error(contact: "ContactMap", truth: "Float64[Tensor, ' 3']", level: float) -> dict[str, Any]:
     """Return how far the most probable contact is from the true one, and both estimates relative to the diagonal.
 
     `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`; `in_region` says whether the
@@ -258,7 +259,7 @@ def _name(path: Path, taken: set[str]) -> str:
 
 
 def _draw(
-    contact: "ContactMap", folder: Path, name: str, values: dict[str, Any], truth: "Tensor | None"
+    contact: "ContactMap", folder: Path, name: str, values: dict[str, Any], truth: "Float64[Tensor, ' 3'] | None"
 ) -> dict[str, str]:
     import torch
 

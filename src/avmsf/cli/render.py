@@ -17,6 +17,7 @@ from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import MAX_CONTACT_SECONDS
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
     from torch import Tensor
 
     from avmsf.cli.contacts import Contacts
@@ -164,15 +165,15 @@ def _say_level(peak_dbfs: float, softer: float, options: Options) -> None:
 
 def render_sounds(
     field: "SoundField",
-    places: "Tensor",
-    directions: "Tensor | None" = None,
+    places: "Float[Tensor, 'contacts 3']",
+    directions: "Float[Tensor, 'contacts 3'] | None" = None,
     *,
     force: float,
     seconds: float | None,
     pulse: "ForcePulse | None" = None,
     noise: bool = True,
-) -> "Tensor":
-    """Render impacts of `force` for `seconds` at contacts [contacts, 3], as sounds [contacts, samples].
+) -> "Float[Tensor, 'contacts samples']":
+    """Render impacts of `force` for `seconds` at contacts.
 
     Raises `OutputError` for a time of less than a sample.
     """
