@@ -78,14 +78,13 @@ class EditServer:
         else:
             self._do(what, words)
             done = {"revision": self.revision, "remarks": [], **({"file": words["name"]} if what == "save" else {})}
-            send = lambda: answer(route, done)  # noqa: E731
             if self.then is not None:
                 self.then()
                 self.then = None
             if self.slow and what == "edit":
-                self._waiting.append(send)
+                self._waiting.append(lambda: answer(route, done))
             else:
-                send()
+                answer(route, done)
 
     def hear_lead(self, route: "Route", request: "Request") -> None:
         base = int(request.url.rsplit("=", 1)[1])

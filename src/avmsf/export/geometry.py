@@ -146,6 +146,8 @@ class DisplayGeometry:
     """Outward unit normals."""
     colors: Float[Tensor, "vertices 3"] | None = None
     """Red, green, blue as displayed (sRGB), 0 to 1; None for gray."""
+    gaussians: Path | None = None
+    """The file of the Gaussians whose centers these are."""
 
 
 def read_display_geometry(
@@ -165,7 +167,7 @@ def read_display_geometry(
         mesh = TexturedMesh.plain(source)
     elif (cloud := read_gaussians(source, sampled.points)) is not None:
         normals = sampled.normals[sampled.nearest(cloud.centers)]
-        return DisplayGeometry(cloud.centers, nowhere, normals, cloud.colors), ()
+        return DisplayGeometry(cloud.centers, nowhere, normals, cloud.colors, source), ()
     else:
         mesh = read_textured_mesh(source, meters=meters)
     _check_fits(mesh.vertices.double().numpy(), sampled.points, source)

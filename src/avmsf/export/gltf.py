@@ -22,7 +22,6 @@ from avmsf.export.geometry import DisplayGeometry, read_display_geometry
 from avmsf.export.one_phase import approximation_error, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import SUFFIXES, Axis, Written, check_suffix, generator, no_modes, pack, write_files
-from avmsf.gaussians.ply import holds_gaussians
 from avmsf.mesh.surface import Surface
 
 EXTENSION = "KHR_audio_rigid_bodies"
@@ -61,8 +60,8 @@ def write_gltf(
     damping, gains = shared_dampings(sampled), signed_amplitudes(sampled)
     geometry, remarks = read_display_geometry(object, sampled, meters=meters)
     contents = {path: _glb(*_document(sampled, geometry, up, gains, damping))}
-    if isinstance(object, Path) and holds_gaussians(object):
-        contents[path.with_suffix(".gaussians.ply")] = object.read_bytes()
+    if geometry.gaussians is not None:
+        contents[path.with_suffix(".gaussians.ply")] = geometry.gaussians.read_bytes()
     sizes = write_files(contents, overwrite=overwrite)
     error = approximation_error(sampled, torch.complex(gains, torch.zeros_like(gains)), damping)
     return Written(sizes, remarks + _remarks(sampled), *error)

@@ -102,11 +102,11 @@ def splat(
                 progress(
                     SplatProgress(run.step, config.steps, float(loss), likeness, time.monotonic() - began, run.cloud)
                 )
-            if last or kept.due:
+            if kept.due or (last and checkpoint is not None):
                 kept.save(run.state())
     except KeyboardInterrupt:
         # During a step's changes, only the state saved before it is consistent.
-        if run.whole:
+        if run.whole and checkpoint is not None:
             kept.save(run.state())
         raise
     return keep_object(run.cloud, views, rasterizer=rasterizer).to("cpu")

@@ -205,8 +205,7 @@ def _fit_shape(
         return {**recorded, **values, "surface": shape.surface_digest}
 
     found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
-    usable = lambda path: _is_final(path, config, bodies)  # noqa: E731
-    field = pipeline.add(Stage(FIELD, fit_gains, (MODES,), recipe, usable))
+    field = pipeline.add(Stage(FIELD, fit_gains, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
     surface = pipeline.made.get(SURFACE)
     modes = extract_once(train, method, found.path)
     return StagedFit(field.path, pipeline.made, shape.report, modes, None if surface is None else surface.path)

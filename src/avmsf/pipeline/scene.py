@@ -96,20 +96,16 @@ class SceneStages(Pipeline):
 
     def _stages(self) -> list[Stage]:
         """Return the list: names, what they depend on, functions."""
-        config, source, splats, meters = self.config, self.source, self.splats, self.settings.views_meters
+        config, source, splats = self.config, self.source, self.splats
         lifting = Stage(self.name, self._make_features, (VIEWS, CLOUD), self._features_recipe)
-        if splats is not None and source is None:
+        if source is None:
+            assert splats is not None
             size = config.views.rendered
-            return [
-                Stage(CLOUD, self._take_gaussians, recipe=lambda: {"given": digest_of(splats), "meters": meters}),
-                Stage(VIEWS, self._picture_gaussians, (CLOUD,), lambda: {"rendered": size}),
-                lifting,
-            ]
-        assert source is not None
+            pictures = Stage(VIEWS, self._picture_gaussians, (CLOUD,), lambda: {"rendered": size})
+            return [self._given_cloud(splats), pictures, lifting]
         views = view_stages(source, config.views, settings=self.settings, log=self.listener.log)
         if splats is not None:
-            recipe = lambda: {"given": digest_of(splats), "meters": meters}  # noqa: E731
-            return [*views, Stage(CLOUD, self._take_gaussians, (VIEWS,), recipe), lifting]
+            return [*views, self._given_cloud(splats, (VIEWS,)), lifting]
         if source.kind == "mesh" and config.lift.onto == "mesh":
             lifting = replace(lifting, inputs=(VIEWS,))
         # Structure from motion's points may be the start.
@@ -117,6 +113,10 @@ class SceneStages(Pipeline):
         inputs = tuple(stage.name for stage in views)
         fitting = Stage(CLOUD, self._fit_gaussians, inputs, lambda: {"splat": asdict(config.splat), **start})
         return [*views, fitting, lifting]
+
+    def _given_cloud(self, splats: Path, inputs: tuple[str, ...] = ()) -> Stage:
+        meters = self.settings.views_meters
+        return Stage(CLOUD, self._take_gaussians, inputs, lambda: {"given": digest_of(splats), "meters": meters})
 
     def _fit_gaussians(self, path: Path, *inputs: Path) -> None:
         views = read_views(inputs[-1])

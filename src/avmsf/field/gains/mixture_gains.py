@@ -354,12 +354,13 @@ class MixtureGains(GainModel):
     def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
         mean, first = self._mean(sites), 0
         second, scales = torch.zeros_like(mean), torch.split(self.mixture.scale, list(map(len, self.families)))
-        for family, forms, scale in zip(self.families, self._forms, scales, strict=True):
+        for family, form, scale in zip(self.families, self._forms, scales, strict=True):
             second += family.own(sites).mT @ scale
-            if forms is None or not isinstance(family, Elastic):
+            if form is None:
                 second += self.mixture.explained(family.between(sites, self.training), first)
             else:
-                factors = family.factors(sites, self.training)
+                elastic, forms = form
+                factors = elastic.factors(sites, self.training)
                 # Products of two factors, each pair once: half of what the matrices times the factors would take.
                 first_of, second_of = torch.triu_indices(factors.shape[1], factors.shape[1])
                 parts = torch.split(factors, _PRODUCTS)
@@ -368,22 +369,23 @@ class MixtureGains(GainModel):
         return (second - mean.square()).clamp_min(0.0).sqrt()
 
     @cached_property
-    def _forms(self) -> list[Float64[Tensor, "_pairs series"] | None]:
-        """`KernelMixture.explained_forms` of elastic families: by pairs of factors, those of two different ones twice.
+    def _forms(self) -> list[tuple[Elastic, Float64[Tensor, "_pairs series"]] | None]:
+        """`KernelMixture.explained_forms` by pairs of factors, those of two different ones twice, and their family.
 
         None for other families, and for one that has fewer kernels than factors or whose matrices would exceed
         `_FORM_ENTRIES`: its covariances with the training impacts, kernel by kernel, are cheaper.
         """
 
-        def form(family: KernelFamily, first: int) -> Tensor | None:
+        def form(family: KernelFamily, first: int) -> tuple[Elastic, Tensor] | None:
+            if not isinstance(family, Elastic):
+                return None
             count = family.shares.shape[1] - 1 + len(self.training)
-            cheap = count < len(family) and self.mixture.values.shape[1] * count**2 <= _FORM_ENTRIES
-            if not isinstance(family, Elastic) or not cheap:
+            if count >= len(family) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
                 return None
             kernels = range(first, first + len(family))
             forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, rows))
             row, column = torch.triu_indices(count, count)
-            return (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
+            return family, (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
 
         firsts = accumulate(map(len, self.families), initial=0)
         return [form(*each) for each in zip(self.families, firsts, strict=False)]
