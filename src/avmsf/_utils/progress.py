@@ -51,13 +51,17 @@ class ProgressDisplay:
     @property
     def listener(self) -> ProgressListener:
         """What the stages report to."""
-        return ProgressListener(self.doing, self.step, self.ready, lambda text: self.say(f"note: {text}"))
+        return ProgressListener(self.doing, self.step, self.ready, self.note)
 
-    def say(self, text: str) -> None:
-        """Print a line, unless `quiet`; a note or a warning always."""
+    def say(self, text: str, *, always: bool = False) -> None:
+        """Print a line on what is done, unless `quiet`; with `always`, which errors are, even then."""
         self.close()
-        if not self.quiet or text.startswith(("note: ", "avmsf ")):
+        if always or not self.quiet:
             print(printable(text), file=sys.stderr, flush=True)
+
+    def note(self, text: str) -> None:
+        """Print what a user should know, `quiet` or not."""
+        self.say(f"note: {text}", always=True)
 
     def doing(self, text: str) -> None:
         """Show what begins."""

@@ -118,7 +118,7 @@ def _run(words: list[str]) -> int:
             if not isinstance(error, AvmsfError) and not lacks_memory(error):
                 raise
             known = error if isinstance(error, AvmsfError) else AvmsfError(NO_MEMORY)
-            say(f"avmsf {words[0]}: {_sentence(known)}")
+            say(f"avmsf {words[0]}: {_sentence(known)}", always=True)
             return _report_error(known, words)
         except SystemExit as ending:
             if ending.code == BAD_INPUT:
@@ -129,7 +129,7 @@ def _run(words: list[str]) -> int:
                 )
             raise
         except KeyboardInterrupt:
-            say(f"avmsf {words[0]}: interrupted")
+            say(f"avmsf {words[0]}: interrupted", always=True)
             code = INTERRUPTED
         finally:
             display.close()

@@ -121,7 +121,7 @@ def run(options: Options) -> int:
             }
         )
     if not report.readable:
-        say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again")
+        say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again", always=True)
         return UNREADABLE
     lines = [*report.remarks, *(aligned.sentences() if aligned else ())]
     if modes is None:
@@ -210,7 +210,10 @@ def _check_dataset(options: Options) -> int:
         print_json(asdict(report))
     readable = sum(_readable(each) for each in report.objects)
     if not readable:
-        say(f"avmsf check: {options.capture}: expected a readable object, found none; fix the listed problems")
+        say(
+            f"avmsf check: {options.capture}: expected a readable object, found none; fix the listed problems",
+            always=True,
+        )
         return UNREADABLE
     objects = counted(len(report.objects), "object")
     recordings = counted(sum(each.recordings for each in report.objects), "recording")

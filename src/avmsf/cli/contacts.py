@@ -13,7 +13,7 @@ from avmsf.capture.settings import METRES
 from avmsf.capture.table import DIRECTION, REQUIRED, Row, is_inside, read_table
 from avmsf.cli.common import Unit
 from avmsf.cli.paths import OutputError
-from avmsf.cli.printing import say
+from avmsf.cli.printing import note
 from avmsf.errors import PositionError
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.sound_field import SoundField
@@ -56,7 +56,7 @@ def given_contacts(
         return contacts_at(places, meters=METRES[unit], directions=directions)
     contacts = read_contacts(table, meters=METRES[unit])
     if contacts.unused:
-        say(f"note: {table}: columns that are not used: {', '.join(contacts.unused)}")
+        note(f"{table}: columns that are not used: {', '.join(contacts.unused)}")
     return contacts
 
 
@@ -134,7 +134,7 @@ def note_off(contacts: Contacts, field: SoundField) -> None:
     """Print a note for each contact that is not on the object's surface, with its distance, see `off_surface`."""
     for row, distance in off_surface(contacts.places, field.gain_field):
         where = f"{1e3 * distance:.3g} mm off the object's surface"
-        say(f"note: {contacts.label(row)} is {where}; {off_surface_gains(field.gain_field)}")
+        note(f"{contacts.label(row)} is {where}; {off_surface_gains(field.gain_field)}")
 
 
 def _wav_name(row: Row, *, anywhere: bool) -> str:

@@ -158,7 +158,7 @@ def run(options: Options) -> int:
     except KeyboardInterrupt:
         kept = options.part("checkpoint")
         where = f"from {kept}, or delete it" if kept.exists() else "from the start"
-        say(f"avmsf edit: interrupted; run the same command again to continue {where}")
+        say(f"avmsf edit: interrupted; run the same command again to continue {where}", always=True)
         return INTERRUPTED
     save(new, options.output)
     for ending in ("checkpoint", "preview.wav", "clap.json") if options.guides else ():

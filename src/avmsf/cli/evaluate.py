@@ -13,7 +13,7 @@ from avmsf._utils.text import counted
 from avmsf.cli import INTERRUPTED
 from avmsf.cli.common import Configured, Flag, expect_device
 from avmsf.cli.paths import CacheFolder, Existing, OutputFolder
-from avmsf.cli.printing import display, next_command, next_step, print_json, say, show, table
+from avmsf.cli.printing import display, next_command, next_step, note, print_json, say, show, table
 from avmsf.cli.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
@@ -171,7 +171,7 @@ def run(options: Options) -> int:
             missing = write()["missing"]
             lacking = f", without all results of {counted(len(missing), 'object')}" if missing else ""
             say(f"wrote {SUMMARY} and {TABLES} in {folder}{lacking}")
-        say(f"avmsf evaluate: interrupted; run the same command again to continue from {folder}")
+        say(f"avmsf evaluate: interrupted; run the same command again to continue from {folder}", always=True)
         return INTERRUPTED
     _print_results(options, folder, summary, parts, figures)
     next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
@@ -220,7 +220,7 @@ def _protocol_of(options: Options) -> "Protocol":
     for owner, names in OPTIONS.items():
         unused = [f"--{name}" for name in names if getattr(options, name) != getattr(usual, name)]
         if unused and owner != protocol.name:
-            say(f"note: {', '.join(unused)}: not used by {protocol.name}, only by {owner}")
+            note(f"{', '.join(unused)}: not used by {protocol.name}, only by {owner}")
     if protocol.name == "shots":
         return replace(protocol, cases=Shots(options.counts, options.starts))
     return replace(protocol, cases=Predefined(words_of(options.test))) if protocol.name == "predefined" else protocol
@@ -232,8 +232,8 @@ def _note_subset(dataset: "Dataset", protocol: "Protocol", objects: Sequence[str
 
     total = len(dataset.objects())
     if protocol.subset is not None and len(objects) < total:
-        say(
-            f"note: {protocol.name} takes {len(objects)} of {total} objects, {SUBSETS[protocol.subset]}: "
+        note(
+            f"{protocol.name} takes {len(objects)} of {total} objects, {SUBSETS[protocol.subset]}: "
             f"{', '.join(objects)}; --objects NAME,NAME takes others"
         )
 
@@ -245,10 +245,10 @@ def _note_start(methods: "Sequence[Method]", time_zero: TimeZero | None) -> None
 
     for method in methods:
         if isinstance(method, RecordedMethod) and time_zero == "peak":
-            say(
-                f"note: the files of {method.name} are taken as they are; with --time-zero peak each has to start "
+            note(
+                f"the files of {method.name} are taken as they are; with --time-zero peak each has to start "
                 "at its largest sample, as the recordings do"
             )
         wanted = method.pipeline.time_zero if isinstance(method, FieldMethod) else None
         if wanted not in (None, time_zero):
-            say(f"note: {method.name} is published with sounds from their {wanted}s: --time-zero {wanted}")
+            note(f"{method.name} is published with sounds from their {wanted}s: --time-zero {wanted}")

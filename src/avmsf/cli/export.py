@@ -15,7 +15,7 @@ from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
 from avmsf.cli.common import Flag, Printing, Unit, option_of
 from avmsf.cli.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
-from avmsf.cli.printing import next_step, print_result, say
+from avmsf.cli.printing import next_step, note, print_result
 from avmsf.errors import ExportError
 from avmsf.export.writing import SUFFIXES, Axis, Format, Precision, check_free
 from avmsf.field.header import FIELD
@@ -159,15 +159,15 @@ def run(options: Options) -> int:
     from avmsf.field.store import load
 
     for sentence in unused_options(options):
-        say(f"note: {sentence}")
+        note(sentence)
     field = load(options.field)
     source, settings = _prepare(field, options)
     written: Written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
     for remark in written.remarks:
-        say(f"note: {remark}")
+        note(remark)
     if written.error:
-        say(
-            f"note: waveforms differ from the field's by up to {format_number(100 * written.error, 2)} % of its "
+        note(
+            f"waveforms differ from the field's by up to {format_number(100 * written.error, 2)} % of its "
             f"loudest sample, magnitude spectra by {format_number(written.spectrum_error_db, 2)} dB on average"
         )
     largest = max(written.sizes, key=lambda path: written.sizes[path])
@@ -254,7 +254,7 @@ def _sampled(field: "SoundField", options: Options) -> "SampledField":
     sampled = SampledField.of(field, points, limit=options.contacts or POINTS[options.to])
     if len(sampled) < len(points) and options.contacts is None:
         held = counted(len(points), "contact")
-        say(f"note: written: {len(sampled)} of the field's {held}; --contacts sets the number")
+        note(f"written: {len(sampled)} of the field's {held}; --contacts sets the number")
     return sampled
 
 
@@ -285,26 +285,26 @@ def _object(field: "SoundField", options: Options) -> "tuple[Path | Surface | No
         wanted, got = f"a mesh for a field edited to {length:g} times its size", "Gaussians, which are not scaled"
         advice = "name a mesh of that size by --object, or leave --capture out"
         raise ExportError.expected(wanted, length, got=got, file=path, name="--capture", advice=advice)
-    say(f"note: {path} is shown {length:g} times as large, as the field was edited")
+    note(f"{path} is shown {length:g} times as large, as the field was edited")
     return path, meters * length
 
 
 def _note_size(field: "SoundField", path: Path) -> None:
     if (length := field.gain_field.length) != 1.0:
-        say(f"note: the field was edited to {length:g} times its size; {path} is not scaled and has to have it")
+        note(f"the field was edited to {length:g} times its size; {path} is not scaled and has to have it")
 
 
 def _reconstructed(options: Options) -> Path | None:
     """Return the surface, in meters, that `fit` left in a cache or `demo` next to the field; print if none."""
     field, capture = options.field, options.capture
     if capture is None:
-        say("note: only the field's points are shown; --object or --capture adds the surface")
+        note("only the field's points are shown; --object or --capture adds the surface")
         return None
     caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
     made = next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
     if made is None:
         advice = f"make one by avmsf fit {capture} --until surface, or give --object"
-        say(f"note: {capture} has no surface: only the field's points are shown; {advice}")
+        note(f"{capture} has no surface: only the field's points are shown; {advice}")
     return made
 
 
@@ -317,7 +317,7 @@ def _web(field: "SoundField", options: Options) -> "_Prepared":
     source, meters = _object(field, options)
     recorded = options.capture
     if recorded is not None and field.origin.report.get(EDITS):
-        say("note: the field is edited, so the page has no recordings to compare it with")
+        note("the field is edited, so the page has no recordings to compare it with")
         recorded = None
     return field, {
         "object": source,
@@ -336,7 +336,7 @@ def _faust(field: "SoundField", options: Options) -> "_Prepared":
         asked = len(sampled)
         sampled, noise = fitted(sampled, noise=noise)
         if len(sampled) < asked:
-            say(f"note: {len(sampled)} of these are written, as many as Faust compiles in reasonable time")
+            note(f"{len(sampled)} of these are written, as many as Faust compiles in reasonable time")
     return sampled, {"noise": noise}
 
 
@@ -377,7 +377,7 @@ def _wavs(field: "SoundField", options: Options) -> "_Prepared":
         loud = (level >= level.max() - _DEAD_DB).nonzero().flatten()
         if len(loud) < len(sampled):
             left = counted(len(sampled) - len(loud), "contact")
-            say(f"note: {left} left out, {_DEAD_DB:g} dB or more below the loudest; --position writes any")
+            note(f"{left} left out, {_DEAD_DB:g} dB or more below the loudest; --position writes any")
         sampled = sampled.take(loud)
     settings = {"layers": layers or hertz_layers(forces, options.pulse), "seconds": options.seconds}
     return sampled, {**settings, "noise": not options.no_noise, "contacts": len(sampled)}

@@ -189,7 +189,7 @@ def run(options: Options) -> int:
         else:
             _fit(options, settings)
     except KeyboardInterrupt:
-        say("avmsf fit: interrupted; repeat the command to continue")
+        say("avmsf fit: interrupted; repeat the command to continue", always=True)
         return INTERRUPTED
     return 0
 

@@ -14,7 +14,7 @@ from avmsf._utils.text import format_number
 from avmsf.capture.settings import METRES, CaptureSettings
 from avmsf.cli.common import Flag, Printing, Unit
 from avmsf.cli.paths import ContactTable, Existing, FieldFile, OutputError, OutputFolder, SettingsFile
-from avmsf.cli.printing import doing, next_command, print_json, say, show
+from avmsf.cli.printing import doing, next_command, note, print_json, say, show
 from avmsf.errors import AvmsfError, LocationError
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def run(options: Options) -> int:
             if len(options.recordings) == 1:
                 raise
             failures.append({"recording": str(path), "error": " ".join(str(error).split())})
-            say(f"avmsf locate: {failures[-1]['error']}")
+            say(f"avmsf locate: {failures[-1]['error']}", always=True)
             continue
         truth = None if truths is None else _true_contact(truths, path)
         for values, contact in answers:
@@ -182,7 +182,7 @@ def _true_contact(contacts: "Contacts", recording: Path) -> "Float64[Tensor, ' 3
     rows = [0] if contacts.table is None else rows_of(contacts, recording)
     if len(rows) != 1:
         got = len(rows) or "none"
-        say(f"note: {contacts.table}: expected one row for {recording}, got {got}; its distance is not known")
+        note(f"{contacts.table}: expected one row for {recording}, got {got}; its distance is not known")
         return None
     return contacts.places[rows[0]]
 

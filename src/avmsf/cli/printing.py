@@ -16,6 +16,7 @@ MAX_LISTED_MODES = 20
 display = ProgressDisplay()
 """What a verb is doing, on the standard error: quiet or verbose by the options of the verb that runs."""
 say = display.say
+note = display.note
 doing = display.doing
 
 

@@ -11,7 +11,7 @@ import tyro
 
 from avmsf.cli.common import Flag, Printing, Unit
 from avmsf.cli.paths import ContactTable, FieldFile, NewFile, OutputError, PositionList, expect_writable
-from avmsf.cli.printing import doing, next_command, print_result, say
+from avmsf.cli.printing import doing, next_command, note, print_result
 from avmsf.errors import PositionWarning
 from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import MAX_CONTACT_SECONDS
@@ -114,9 +114,9 @@ def run(options: Options) -> int:
     refuse_far(contacts, field, advice=", see --unit")
     note_off(contacts, field)
     if options.force != 1 and not field.origin.per_newton:
-        say(f"note: the forces are not known: {options.force:g} is relative to an average recorded impact")
+        note(f"the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
-        say(f"note: the wav files have {round(field.sample_rate)} Hz for {field.sample_rate:g} Hz")
+        note(f"the wav files have {round(field.sample_rate)} Hz for {field.sample_rate:g} Hz")
     doing("rendering")
     pulse = ForcePulse(options.contact_time, options.pulse) if options.contact_time else None
     rendered = partial(render_sounds, field, force=options.force, seconds=options.seconds, noise=not options.no_noise)
@@ -150,17 +150,17 @@ def run(options: Options) -> int:
 def _say_level(peak_dbfs: float, softer: float, options: Options) -> None:
     """Print that the loudest sound clips, or that it is quiet, and why where it is the softer hammer."""
     if options.coding == "float32" and peak_dbfs > 0:
-        say(
-            f"note: the loudest sound peaks at {peak_dbfs:+.1f} dB over full scale and will clip; add --normalize "
+        note(
+            f"the loudest sound peaks at {peak_dbfs:+.1f} dB over full scale and will clip; add --normalize "
             "peak, or lower --level-db"
         )
     elif softer > _MUCH_SOFTER:
-        say(
-            f"note: a contact time of {1e3 * options.contact_time:.3g} ms lowers the peak by {softer:.0f} dB; add "
+        note(
+            f"a contact time of {1e3 * options.contact_time:.3g} ms lowers the peak by {softer:.0f} dB; add "
             "--normalize peak or --level-db, or a shorter --contact-time"
         )
     elif options.normalize == "none" and -math.inf < peak_dbfs < _LOW_LEVEL_DBFS:
-        say(f"note: the loudest sound peaks at {peak_dbfs:.1f} dBFS, which is quiet; add --normalize peak")
+        note(f"the loudest sound peaks at {peak_dbfs:.1f} dBFS, which is quiet; add --normalize peak")
 
 
 def render_sounds(

@@ -105,7 +105,7 @@ def run(options: Options) -> int:
     try:
         simulate_set(recipes, folder, cache=options.cache, progress=display.objects())
     except KeyboardInterrupt:
-        say("avmsf simulate: interrupted; repeat the command to continue")
+        say("avmsf simulate: interrupted; repeat the command to continue", always=True)
         return INTERRUPTED
     text = f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}"
     values = {"output": str(options.output), "objects": [str(folder / name) for name in recipes]}
