@@ -247,7 +247,7 @@ def _words(values: dict[str, Any]) -> str:
     if values["multimodal"]:
         lines.append("  ambiguous: there are other possible positions")
     lines += [f"  {other['message']}" for other in values["equivalent_points"]]
-    return "\n".join([*lines, *(f"  note: {note}" for note in values["notes"])])
+    return "\n".join([*lines, *(f"  note: {each}" for each in values["notes"])])
 
 
 def _name(path: Path, taken: set[str]) -> str:

@@ -91,7 +91,7 @@ class MeasuredPhases:
         energy = rate * -torch.expm1(-2 * bank.damping * samples / rate) / (4 * bank.damping)
         self.noise = background / energy / scale.square()
         """Variance across its phase that the background noise makes of an amplitude, each recording of unit energy in
-        the modes, so that loud ones count no more than faint ones."""
+        the modes, so that loud ones count no more than weak ones."""
         scaled = self.amplitude / scale
         self.phase, self.squares = scaled.angle(), scaled.abs().square()
         self.power = self.squares.mean(0) if power is None else power
