@@ -137,7 +137,7 @@ def run(options: Options) -> int:
     if not options.objects:
         _note_subset(dataset, protocol, objects)
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    settings, cdpam = options.all_settings, not options.no_cdpam and not protocol.locating
+    settings, cdpam = options.all_settings, not (options.no_cdpam or protocol.locating)
     evaluation = plan_evaluation(
         dataset,
         title,
@@ -155,16 +155,15 @@ def run(options: Options) -> int:
     if options.time_zero == "peak":
         evaluation = replace(evaluation, own_starts=opened())
     _note_start(methods, options.time_zero)
-    results, groups = ResultsFolder(folder), members(dataset)
+    results = ResultsFolder(folder)
     work = f"{counted(len(objects), 'object')}, {counted(len(methods), 'method')}"
     say(f"{protocol.name} on {title}: {work}, results in {folder}")
-    names = tuple(method.name for method in methods)
-    write = partial(write_summary, results, subsets=groups, wanted=dict.fromkeys(objects, names))
+    wanted = dict.fromkeys(objects, tuple(method.name for method in methods))
+    write = partial(write_summary, results, subsets=members(dataset), wanted=wanted)
     try:
         shown = display.objects(write)
         run_objects(evaluation, objects, results, workers=options.workers, address=options.ray, progress=shown)
-        summary = write()
-        parts = write_page(results)
+        summary, parts = write(), write_page(results)
         figures = write_figures(results) if options.figures else []
     except KeyboardInterrupt:
         if (folder / IDENTITY).exists():

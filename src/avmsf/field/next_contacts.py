@@ -94,13 +94,13 @@ def suggest(
         if given is None:
             pool, directions = _reachable(gains, points)
         else:
-            _expect_on_surface(given, gains.points.double())
             pool = given
+            _expect_on_surface(pool, gains.points.double())
         same = _SAME_POSITION_RATIO * float((points.amax(0) - points.amin(0)).norm())
         allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
-        if int(allowed.sum()) < count:
+        left = int(allowed.sum())
+        if left < count:
             wanted, advice = f"{count} or more without a recording", "ask for fewer, or give more candidates"
-            left = int(allowed.sum())
             raise FitError.expected(wanted, left, got=f"{left} of {len(pool)}", name="candidates", advice=advice)
         kept, most = torch.arange(len(pool)), max(MAX_CANDIDATES, count)
         if len(pool) > most:
@@ -108,8 +108,7 @@ def suggest(
             kept = kept[farthest_points(pool[kept], min(most, len(kept)))].sort().values
         sites = gains.sites(pool[kept], None if directions is None else directions[kept])
         error = _ExpectedError(field, gains, points, sites)
-        before = error.total()
-        rows, after = error.choose(allowed[kept], count, same=same)
+        before, (rows, after) = error.total(), error.choose(allowed[kept], count, same=same)
     return Suggestions(
         sites.points[rows],
         sites.directions[rows] if gains.directional else None,
