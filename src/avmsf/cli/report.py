@@ -79,6 +79,8 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
         rows += _settings_rows(values["pipeline"])
     if field.body is not None:
         rows.append(("body", f"{field.body} (the most probable one{_gained(report)})"))
+    elif report.get("supports_tried"):
+        rows.append(("body", "none, free or held, predicts contacts left out better than smooth kernels"))
     rows += [("warning", field.body.warning)] if field.body is not None and field.body.warning else []
     rows += [("quality", words) for words in quality_words(field, path)]
     rows += [("outlier", words) for words in outlier_words(field)]

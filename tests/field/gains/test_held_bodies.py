@@ -44,6 +44,7 @@ def test_the_support_of_a_plate_is_found(sides: tuple[Patch, ...], stiffness: fl
     true = elastic_modes(solid, STEEL, count=12, stiffness_factor=uneven, support=support)
     model, _ = MixtureEstimator(bodies=Plate()).solve(known_gains(true)[0])
     found = model.report["bodies"][0]
+    assert model.report["supports_tried"]
     assert set(found["support"].removeprefix("held at ").split(" and ")) == ({AT[each] for each in sides} or {"free"})
     # In the unit of the nominal material, whose plate is not the true one.
     assert found["support_stiffness"] is None or found["support_stiffness"] > 0.1 * min(stiffness, 1e6)
@@ -56,4 +57,5 @@ def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypat
     case = known_gains(elastic_modes(block(SIDES, (9, 6, 1)), NOMINAL, count=12))[0]
     model, _ = MixtureEstimator(bodies=Plate()).solve(case)
     assert model.report["credibility"]["credible"]
+    assert not model.report["supports_tried"]
     assert asked == []

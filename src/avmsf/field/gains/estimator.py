@@ -122,7 +122,8 @@ class MixtureEstimator(GainEstimator):
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.with_thickness)
         found = self._refined(fit, bodies)
         judgment = fit.assess(found)
-        if found.best is not None and self.bodies is not None and self._may_be_held(judgment):
+        tried = found.best is not None and self._may_be_held(judgment)
+        if tried and found.best is not None and self.bodies is not None:
             modes = self.bodies.held(found.best)
             held = None if modes is None else fit.held(others(fit.sites, judgment.rows), found.best, modes)
             if held is not None:
@@ -141,6 +142,7 @@ class MixtureEstimator(GainEstimator):
         kept, names = set(found.rows.tolist()), data.train.names
         report = found.report() | {"unavailable": missing} | judgment.report(data.train)
         report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
+        report["supports_tried"] = tried
         report["thickness"] = None if thickness is None else asdict(thickness)
         report["advice"] = None if judgment.informative else fit.advice(found.bodies)
         return replace(found.model, report=report), found.rows
