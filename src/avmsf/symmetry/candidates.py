@@ -28,7 +28,7 @@ _MIN_COSINE = math.cos(math.radians(25.0))
 _SAME_DISTANCE = 0.08
 """How far apart two candidates may carry an object that are one: a plane or axis is off by about 9 degrees."""
 
-Lines = tuple[Points, Points]
+Lines = tuple[Float[np.ndarray, "_lines 3"], Float[np.ndarray, "_lines 3"]]
 """Unit vectors, normals of planes or along axes, and a point of each plane or axis."""
 Pairs = tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]
 """Indices of the first and of the second points of pairs."""

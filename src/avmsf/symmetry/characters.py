@@ -95,6 +95,6 @@ def _pairs(lines: Points, signs: Float[np.ndarray, " points"]) -> list[Matrices]
     return found
 
 
-def _same(group: Matrices, other: Matrices) -> bool:
+def _same(group: Matrices, other: Float[np.ndarray, "others 3 3"]) -> bool:
     """Return whether two groups hold the same motions, up to how well their lines are known."""
     return all((np.linalg.norm(each - other, axis=(1, 2)) < 4.0 * _MAX_SINE).any() for each in group)

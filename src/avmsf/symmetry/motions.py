@@ -39,7 +39,7 @@ class Motions:
     def __len__(self) -> int:
         return len(self.linear)
 
-    def __getitem__(self, row: int) -> "Motions":
+    def __getitem__(self, row: int | np.integer) -> "Motions":
         """Return one of the motions, as a set of one."""
         return Motions(self.linear[row : row + 1], self.shifts[row : row + 1])
 

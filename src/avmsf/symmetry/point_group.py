@@ -37,7 +37,7 @@ class PointGroup:
     squares: Float[np.ndarray, " motions"] = field(default_factory=lambda: np.zeros(0))
     """Squared error of each motion where the group was fitted, in spacings squared."""
 
-    def rank(self) -> tuple[float, float]:
+    def rank(self) -> tuple[int | float, float]:
         """Return what is less the larger a fitted group is, and of equal ones the less its error."""
         return -math.inf if self.continuous else -len(self.motions), float(self.squares.mean())
 
@@ -94,7 +94,7 @@ def generate(motions: Motions, axis: Vector | None = None) -> PointGroup | None:
     return PointGroup(Motions.about(center, elements), 1 + sphere)
 
 
-def _closure(generators: Matrices) -> Matrices | None:
+def _closure(generators: Matrices) -> Float[np.ndarray, "elements 3 3"] | None:
     """Return the finite group that orthogonal matrices nearly generate, identity first; None if there is none."""
     # Two are one if half the least turn of the largest order leads from one to the other.
     same_trace = 1 + 2 * math.cos(math.pi / MAX_ORDER)
