@@ -10,17 +10,20 @@ dense eigenproblem of 100 to 400 unknowns.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+import torch
 from jaxtyping import Float64, Int
+from scipy.spatial import cKDTree
 
 from avmsf.errors import SimulationError
 from avmsf.fem.eigen import PENDULUM, Vibrations, factorize, orthonormal
 from avmsf.fem.elements import SecondOrder
+from avmsf.gaussians.points import farthest_points
 
 FREE = "free"
 FREE_PRIOR = 0.7
@@ -174,17 +177,13 @@ class SupportBasis:
         return Vibrations(squares[moving], self._surface @ vectors[:, moving])
 
 
-def _cells(places: Float64[np.ndarray, "nodes 3"], size: float) -> Iterable[Int[np.ndarray, " some"]]:
-    """Return the rows of places in each cell: about the farthest points from one another."""
+def _cells(places: Float64[np.ndarray, "nodes 3"], size: float) -> list[Int[np.ndarray, " some"]]:
+    """Return the rows of places in each cell: those nearest to one of a few points far from each other."""
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
     count = min(TOLERANCES.max_cells, math.ceil(extent / (TOLERANCES.cell_extent * size)), len(places))
     if count < 2:
         return [np.arange(len(places))]
-    apart = np.linalg.norm(places - places.mean(axis=0), axis=1)
-    centers = [int(apart.argmax())]
-    near = np.linalg.norm(places - places[centers[0]], axis=1)
-    for _ in range(count - 1):
-        centers.append(int(near.argmax()))
-        near = np.minimum(near, np.linalg.norm(places - places[centers[-1]], axis=1))
-    label = np.linalg.norm(places[:, None] - places[centers], axis=2).argmin(axis=1)
-    return [np.flatnonzero(label == row) for row in np.unique(label)]
+    outermost = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())
+    centers = places[farthest_points(torch.from_numpy(places), count, start=outermost).numpy()]
+    label = cKDTree(centers).query(places)[1]
+    return [np.flatnonzero(label == row) for row in range(count)]
