@@ -30,22 +30,26 @@ def fill(
     rows: Sequence[str] = ROWS,
     header: str = HEADER,
     settings: str | None = None,
-    replace: dict[str, np.ndarray] | None = None,
+    replace: dict[str, np.ndarray | bytes | None] | None = None,
     rate: int = RATE,
     subtype: str = "FLOAT",
 ) -> Path:
     """Write a folder of three good recordings; `replace` gives others, shape [frames] or [frames, channels].
 
-    With `sounds`, these are all, at contacts in a row.
+    Bytes are written as they are, and None leaves a file out. With `sounds`, these are all, at contacts in a row.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if sounds is not None:
         rows = [f"{name},{row / 10},0,0" for row, name in enumerate(sounds)]
     else:
         sounds = {name: ring(rate=rate, seed=seed) for seed, name in enumerate(("a.wav", "b.wav", "c.wav"))}
-    for name, samples in (sounds | (replace or {})).items():
-        soundfile.write(folder / name, samples, rate, subtype=subtype)
     (folder / "impacts.csv").write_bytes("\n".join([header, *rows, ""]).encode())
     if settings is not None:
         (folder / "capture.toml").write_text(settings)
+    for name, samples in (sounds | (replace or {})).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(samples, bytes):
+            (folder / name).write_bytes(samples)
+        elif samples is not None:
+            soundfile.write(folder / name, samples, rate, subtype=subtype)
     return folder

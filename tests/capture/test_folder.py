@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture, write_capture
-from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh import Surface, read_surface
+from avmsf.errors import CaptureError
+from avmsf.mesh import Surface
 from factories.capture_folder import fill, ring
-from factories.raising import raises, warns
+from factories.raising import raises
 
 
 def invented(*, names: tuple[str, ...] = ("takes/one.wav", "two.wav"), sample_rate: float = 48_000.0) -> Capture:
@@ -66,27 +65,17 @@ def test_settings_given_replace_those_of_the_folder(tmp_path: Path) -> None:
         assert (capture.impacts.sounds.shape[1], capture.name) == (samples, name)
 
 
-def test_one_short_recording_cuts_the_others_with_a_warning(tmp_path: Path) -> None:
-    folder = fill(tmp_path, replace={"b.wav": ring(0.2)})
-    with warns(CaptureWarning, file="b.wav", value=pytest.approx(0.2, abs=0.01)):
-        # The first samples lie before the onset.
-        assert 1590 <= read_capture(folder).impacts.sounds.shape[1] <= 1600
-
-
-def test_recordings_all_shorter_than_asked_are_kept_whole_in_silence(tmp_path: Path) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        # The first samples lie before the onset.
-        assert 3990 <= read_capture(fill(tmp_path)).impacts.sounds.shape[1] <= 4000
-
-
 @pytest.mark.parametrize("sample_rate", [48_000.0, 44_100.0, 512 * 1.3, 8000 / 3, 100.01, 7839.059834067738])
 def test_a_written_capture_reads_back_bit_for_bit(tmp_path: Path, sample_rate: float) -> None:
-    capture = invented(sample_rate=sample_rate)
-    write_capture(capture, tmp_path / "new/cup")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert_same(read_capture(tmp_path / "new/cup"), capture)
+    full = invented(sample_rate=sample_rate)
+    bare = replace(full, impacts=replace(full.impacts, directions=None, forces=None), surface=None)
+    cloud = replace(bare, surface=Surface(torch.randn(5, 3), torch.zeros(0, 3, dtype=torch.int64)))
+    for number, capture in enumerate((full, bare, cloud)):
+        with warnings.catch_warnings():
+            # These few random points make no shape about the contacts.
+            warnings.simplefilter("ignore" if capture is cloud else "error")
+            write_capture(capture, tmp_path / f"{number}/cup")
+            assert_same(read_capture(tmp_path / f"{number}/cup"), capture)
 
 
 def test_a_read_capture_writes_and_reads_back_bit_for_bit(tmp_path: Path) -> None:
@@ -95,17 +84,6 @@ def test_a_read_capture_writes_and_reads_back_bit_for_bit(tmp_path: Path) -> Non
     capture = read_capture(folder)
     write_capture(capture, tmp_path / "again")
     assert_same(read_capture(tmp_path / "again"), replace(capture))
-
-
-def test_a_capture_without_anything_optional_reads_back(tmp_path: Path) -> None:
-    full = invented()
-    cloud = Surface(torch.randn(5, 3), torch.zeros(0, 3, dtype=torch.int64))
-    for number, surface in enumerate((None, cloud)):
-        capture = Capture("bare", replace(full.impacts, directions=None, forces=None), surface)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # these few random points make no shape about the contacts
-            write_capture(capture, tmp_path / str(number))
-            assert_same(read_capture(tmp_path / str(number)), capture)
 
 
 @pytest.mark.parametrize("names", [("strike 1", "strike 2"), ("../a.wav", "b.wav"), ("a.wav", "A.WAV"), ("a.wav", " ")])
@@ -133,47 +111,3 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytes
         write_capture(invented(), tmp_path / "cup")
     assert isinstance(caught.value.__cause__, OSError)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("kind", ["obj", "ply", "glb", "stl"])
-def test_the_usual_surfaces_are_found_and_read(tmp_path: Path, kind: str) -> None:
-    folder = fill(tmp_path)
-    trimesh.creation.box((0.2, 0.4, 0.6)).export(folder / f"surface.{kind}")
-    surface = read_capture(folder).surface
-    assert surface is not None
-    assert surface.faces.shape == (12, 3)
-    assert surface.vertices.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.3], rel=1e-6)
-
-
-def test_a_scene_keeps_each_part_where_it_lies(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
-    for place in (0.0, 2.0):
-        scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([place, 0, 0]))
-    scene.export(tmp_path / "two.glb")
-    surface = read_surface(tmp_path / "two.glb", meters=0.1)
-    assert surface.faces.shape == (24, 3)
-    assert surface.faces.max() == len(surface.vertices) - 1
-    assert [surface.vertices[:, 0].min(), surface.vertices[:, 0].max()] == pytest.approx([-0.05, 0.25], rel=1e-6)
-
-
-def test_bad_surfaces_are_named(tmp_path: Path) -> None:
-    folder = fill(tmp_path)
-    with raises(CaptureError, file="shell.obj"):
-        read_capture(folder, CaptureSettings(surface="shell.obj"))
-    with raises(CaptureError, file=folder, name="surface", value="../shell.obj"):
-        read_capture(folder, CaptureSettings(surface="../shell.obj"))
-    (folder / "surface.ply").write_bytes(b"ply\nnonsense")
-    with raises(CaptureError, file="surface.ply"):
-        read_capture(folder)
-
-
-def test_errors_name_the_folder_and_its_file(tmp_path: Path) -> None:
-    with raises(CaptureError, file=tmp_path / "no") as nothing:
-        read_capture(tmp_path / "no")
-    assert str(nothing.value).count(";") == 1
-    folder = tmp_path / "bowl"
-    folder.mkdir()
-    (folder / "impacts.csv").write_text("file,x,y,z\n001.wav,left,0,0\n")
-    with raises(CaptureError, file=folder / "impacts.csv", row=2, name="x", value="left") as cell:
-        read_capture(folder)
-    assert str(cell.value).startswith(str(folder / "impacts.csv"))

@@ -1,0 +1,149 @@
+"""What `check` measures, that it goes on past every broken thing, and what it remarks on."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from avmsf.capture import CaptureSettings, check, read_capture
+from avmsf.capture.issues import shared_problems
+from factories.capture_folder import HEADER, RATE, ROWS, fill, ring
+
+
+def test_a_good_folder_has_no_problem_and_true_figures(tmp_path: Path) -> None:
+    sound = ring(1.0, before=0.25, noise=1e-3)
+    folder = fill(tmp_path, replace={"a.wav": sound}, settings="seconds = 0.4")
+    report = check(folder)
+    assert report.readable
+    assert report.problems == ()
+    first = report.recordings[0]
+    assert (first.file, first.line, first.readable, first.problems) == ("a.wav", 2, True, ())
+    assert (first.seconds, first.sample_rate, first.channels, first.coding) == (1.0, RATE, 1, "FLOAT")
+    assert first.peak_db == pytest.approx(20 * np.log10(np.abs(sound).max()), abs=1e-3)
+    # The level of 1840 samples of noise is known to 20 / ln 10 / sqrt(2 x 1840) = .14 dB.
+    assert first.noise_db == pytest.approx(20 * np.log10(1e-3 / np.abs(sound).max()), abs=0.5)
+    # The fourth of a period of the lowest mode, 20 samples long.
+    assert first.onset_seconds == pytest.approx(0.25, abs=5 / RATE)
+    assert first.clipped == 0
+    assert first.double_hit_seconds is None
+
+
+def test_noise_is_found_in_the_quietest_part_where_nothing_comes_before(tmp_path: Path) -> None:
+    sound = ring(1.0, noise=1e-3)
+    noise = check(fill(tmp_path, replace={"a.wav": sound})).recordings[0].noise_db
+    # The quietest tenth of blocks of 80 samples lies 1.3 x 20 / ln 10 / sqrt(160) = .9 dB under the mean one.
+    assert noise == pytest.approx(20 * np.log10(1e-3 / np.abs(sound).max()) - 0.9, abs=1)
+
+
+def test_noise_is_measured_in_what_the_settings_leave(tmp_path: Path) -> None:
+    time = np.arange(8000) / 8000
+    rumble = 0.05 * np.sin(2 * np.pi * 11 * time)
+    sounds = {name: ring(1.0, before=0.4, seed=seed) + rumble for seed, name in enumerate(("a.wav", "b.wav", "c.wav"))}
+    folder = fill(tmp_path, replace=sounds)
+    plain, filtered = (check(folder, CaptureSettings(highpass=each)).recordings[0] for each in (0.0, 60.0))
+    assert filtered.noise_db < plain.noise_db - 15
+
+
+def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
+    rows = (*ROWS, "gone.wav,0,0,0.1", "d.wav,0,0,0.1", "e.wav,0,0,0.2", "f.wav,0,left,0.1", "g.wav,0,0,0.15")
+    clipped = np.clip(10 * ring(), -1, 1)
+    double = ring(1.0) + np.concatenate([np.zeros(3200), ring(0.6, seed=9)])
+    folder = fill(
+        tmp_path,
+        rows=rows,
+        replace={"b.wav": clipped, "c.wav": double, "d.wav": np.zeros(4000), "f.wav": ring(), "stray.wav": ring()},
+    )
+    (folder / "e.wav").write_bytes(b"RIFF")
+    soundfile.write(folder / "g.wav", ring(), 2 * RATE)
+    report = check(folder)
+    assert not report.readable
+    assert [row.line for row in report.recordings] == [2, 3, 4, 5, 6, 7, 8, 9]
+    assert [row.readable for row in report.recordings] == [True, True, True, False, False, False, False, True]
+    assert [len(row.problems) for row in report.recordings] == [0, 1, 1, 1, 1, 1, 1, 0]
+    problems = {row.file: "; ".join(row.problems) for row in report.recordings}
+    assert str(report.recordings[1].clipped) in problems["b.wav"]
+    assert "0.39" in problems["c.wav"]
+    assert "'left'" in problems["f.wav"]
+    assert report.recordings[2].double_hit_seconds == pytest.approx(0.4, abs=0.01)
+    rates, repeated, unlisted = report.problems
+    assert problems["gone.wav"].startswith("gone.wav")
+    assert "8000 Hz" in rates
+    assert "5, 6" in repeated
+    assert "stray.wav" in unlisted
+    # What the command line prints as JSON.
+    assert json.loads(json.dumps(asdict(report), allow_nan=False))["recordings"][1]["clipped"] > 3
+
+
+def test_wav_files_in_hidden_folders_are_none_of_the_captures(tmp_path: Path) -> None:
+    folder = fill(tmp_path / ".work" / "cup")
+    for name in (".avmsf/removed/002-ac4f8f352f81.wav", "takes/.trash/001.wav", "._a.wav", "takes/1.wav", "more.wav"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(folder / name, ring(), RATE)
+    (unlisted,) = check(folder).problems
+    assert "more.wav, takes/1.wav" in unlisted
+    assert "002-ac4f8f352f81.wav" not in unlisted
+
+
+def test_measured_strikes_pass(shared: Path) -> None:
+    captures = Path(__file__).resolve().parents[2] / "benchmarks/captures"
+    for name in ("aircraft", "aircraft_response"):
+        report = check(shared / name, CaptureSettings.read(captures / f"{name}.toml"))
+        assert report.readable
+        # Two files of this measurement are the same, at contacts 112 mm apart.
+        (problem,) = report.problems
+        assert problem.split(", to")[0].replace("impacts/", "") == "017.wav: the same sound as 016.wav"
+        assert len(report.recordings) == 74
+        assert [row.problems for row in report.recordings] == [()] * 74
+
+
+def test_a_copy_is_named_with_its_source_and_what_differs_past_the_cut_is_none(tmp_path: Path) -> None:
+    sound = ring(1.0, seed=2)
+    later = sound + np.where(np.arange(len(sound)) == 6000, 1e-3, 0.0)
+    for other, problems in ((sound, ["c.wav: the same sound as b.wav"]), (later, [])):
+        folder = fill(tmp_path, replace={"b.wav": sound, "c.wav": other}, settings="seconds = 0.1")
+        assert [problem.partition(", to")[0] for problem in check(folder).problems] == problems
+
+
+@pytest.mark.parametrize("offset", [0.01, -0.1, 4.0])
+def test_a_constant_offset_of_the_recorder_changes_nothing(tmp_path: Path, offset: float) -> None:
+    sounds = {f"{seed}.wav": ring(before=0.1, seed=seed) for seed in range(6)}
+    clean = read_capture(fill(tmp_path / "clean", sounds=sounds)).impacts
+    moved = {name: sound + offset for name, sound in sounds.items()}
+    read = read_capture(fill(tmp_path / "moved", sounds=moved)).impacts
+    # The offset is estimated from the quietest 40 ms or more, whose noise is 1e-4, and samples are float32.
+    np.testing.assert_allclose(read.sounds, clean.sounds, atol=2e-5)
+
+
+def test_rows_in_the_order_of_text_and_not_of_numbers_are_remarked_on(tmp_path: Path) -> None:
+    names = [f"{number}.wav" for number in range(1, 11)]
+    sounds = {name: ring(1.0, before=0.25, seed=row) for row, name in enumerate(names)}
+    for way, remarked in ((sorted(names), True), (names, False), (names[::-1], False)):
+        report = check(fill(tmp_path / f"{way[1]}{way[2]}", sounds={name: sounds[name] for name in way}))
+        assert any("order of text" in each for each in report.remarks) is remarked
+
+
+def test_what_many_recordings_share_is_one_message_and_each_row_has_its_report(tmp_path: Path) -> None:
+    far = check(fill(tmp_path / "far", rows=(ROWS[0], "b.wav,0,200,0", "c.wav,0,0,-300"))).recordings
+    missing = [*ROWS, *(f"aa{number}.wav,0,0,0.1" for number in range(200))]
+    # Also one that names a file again.
+    gone = check(fill(tmp_path / "gone", rows=(*missing, missing[-1]))).recordings
+    for reports, good, message in ((far, 1, "of 2"), (gone[:-1], 3, "200 of 203")):
+        assert [row.line for row in reports] == list(range(2, 2 + len(reports)))
+        assert [row.readable for row in reports] == [True] * good + [False] * (len(reports) - good)
+        (line,) = shared_problems(reports)
+        assert message in line
+
+
+def test_recordings_in_a_subfolder_are_read_once_the_table_names_it(tmp_path: Path) -> None:
+    folder = fill(tmp_path)
+    (folder / "taps").mkdir()
+    for row in ROWS:
+        (folder / row[:5]).rename(folder / "taps" / row[:5])
+    report = check(folder)
+    messages = [*report.problems, *(problem for row in report.recordings for problem in row.problems)]
+    assert any("write taps/a.wav" in message for message in messages)
+    (folder / "impacts.csv").write_text("\n".join([HEADER, *(f"taps/{row}" for row in ROWS)]))
+    assert check(folder).readable
