@@ -6,7 +6,6 @@ import torch
 from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.initialize import StartPoints
 from avmsf.gaussians.visual_hull import visual_hull
-from avmsf.photographs.cameras import View
 from factories.ball_views import MIDDLE, RADIUS, ball_cameras, ball_view, ball_views
 from factories.raising import raises, warns
 
@@ -39,25 +38,18 @@ def test_what_lies_outside_an_image_is_left_to_other_views() -> None:
     # A quarter of the cameras look past the ball, so that a part of it is cut off by the image's edge.
     for place, camera in list(enumerate(ball_cameras(40, size=96, aim=(0.03, 0.02, 0.04))))[::4]:
         views[place] = ball_view(camera, name=f"aside {place}")
-        assert views[place].mask is not None
     edges = [view.mask for view in views[::4] if view.mask is not None]
     assert any(bool((torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]) > 0).any()) for mask in edges)
     _expect_ball(visual_hull(views, points=3000))
 
 
-def _with_mask(view: View, mask: torch.Tensor) -> View:
-    return replace(view, mask=mask)
-
-
 def test_a_few_wrong_masks_among_many_carve_nothing_away() -> None:
     views = ball_views(42, size=96)
     first, second = views[7].mask, views[20].mask
-    assert first is not None
-    assert second is not None
-    views[7] = _with_mask(views[7], torch.where(torch.arange(96)[:, None] < 48, first, 0))
-    views[20] = _with_mask(views[20], second.roll(25, dims=1))
+    views[7] = replace(views[7], mask=torch.where(torch.arange(96)[:, None] < 48, first, 0))
+    views[20] = replace(views[20], mask=second.roll(25, dims=1))
     _expect_ball(visual_hull(views, points=3000))
-    views[30] = _with_mask(views[30], torch.zeros(96, 96, dtype=torch.uint8))
+    views[30] = replace(views[30], mask=torch.zeros(96, 96, dtype=torch.uint8))
     with warns(CaptureWarning, name="masks", value=["30.png"]):
         hull = visual_hull(views, points=3000)
     _expect_ball(hull)
@@ -68,10 +60,10 @@ def test_views_that_leave_nothing_are_refused() -> None:
     # Each view has the object in a corner of its image that no other view shows.
     spot[2:5, 2:5] = 255
     for wrong, name, value in (
-        ([_with_mask(view, empty) for view in views], "masks", [view.name for view in views]),
+        ([replace(view, mask=empty) for view in views], "masks", [view.name for view in views]),
         (ball_views(5, masked=False), "views", 0),
         (ball_views(2), "views", 2),
-        ([_with_mask(view, spot) for view in views], "masks", 8),
+        ([replace(view, mask=spot) for view in views], "masks", 8),
     ):
         with raises(SceneError, name=name, value=value):
             visual_hull(wrong, points=500)

@@ -107,22 +107,6 @@ def test_a_file_that_was_cut_short_says_where(tmp_path: Path, order: str) -> Non
         read_splats(tmp_path / "cut.ply")
 
 
-def test_numbers_that_no_gaussian_has_are_refused(tmp_path: Path) -> None:
-    cloud = _cloud()
-    cloud.log_scales[4, 1] = torch.nan
-    write_splats(cloud, tmp_path / "nan.ply")
-    with raises(SceneError, file="nan.ply", row=4, name="scale_1"):
-        read_splats(tmp_path / "nan.ply")
-    cloud = _cloud()
-    cloud.rotations[2] = 0.0
-    write_splats(cloud, tmp_path / "zero.ply")
-    with raises(SceneError, file="zero.ply", row=2, name="rot_0"):
-        read_splats(tmp_path / "zero.ply")
-    (tmp_path / "words.ply").write_text(_header("ascii", 1, ORDER) + "0 " * 13 + "zero\n")
-    with raises(SceneError, file="words.ply", name="vertex"):
-        read_splats(tmp_path / "words.ply")
-
-
 @pytest.mark.parametrize(
     ("content", "name", "value"),
     [
@@ -139,20 +123,27 @@ def test_numbers_that_no_gaussian_has_are_refused(tmp_path: Path) -> None:
         (_header("ascii", 1, ["packed_position"], "uint").encode(), "compression", ["vertex"]),
         (trimesh.creation.box().export(file_type="ply"), "face", 12),
         (trimesh.PointCloud(np.eye(3)).export(file_type="ply"), "vertex", 3),
+        (_header("ascii", 1, ORDER).encode() + b"0 " * 13 + b"zero\n", "vertex", None),
     ],
 )
 def test_what_is_no_cloud_says_what_it_is(tmp_path: Path, content: bytes, name: str, value: Any) -> None:
     (tmp_path / "wrong.ply").write_bytes(content)
-    with raises(SceneError, file="wrong.ply", name=name, value=value):
+    value = {} if value is None else {"value": value}
+    with raises(SceneError, file="wrong.ply", name=name, **value):
         read_splats(tmp_path / "wrong.ply")
 
 
-def test_a_file_that_cannot_be_read_or_written_is_named(tmp_path: Path) -> None:
+def test_numbers_that_no_gaussian_has_and_places_that_no_file_has_are_refused(tmp_path: Path) -> None:
+    for change, row, name in (("log_scales", 4, "scale_1"), ("rotations", 2, "rot_0")):
+        cloud = _cloud()
+        getattr(cloud, change)[row, 1 if row == 4 else slice(None)] = torch.nan if row == 4 else 0.0
+        write_splats(cloud, tmp_path / "spoilt.ply")
+        with raises(SceneError, file="spoilt.ply", row=row, name=name):
+            read_splats(tmp_path / "spoilt.ply")
     with raises(SceneError, file="none.ply"):
         read_splats(tmp_path / "none.ply")
-    (tmp_path / "file").write_text("in the way")
-    with raises(SceneError, file="file/cloud.ply"):
-        write_splats(_cloud(), tmp_path / "file" / "cloud.ply")
+    with raises(SceneError, file="spoilt.ply/cloud.ply"):
+        write_splats(_cloud(), tmp_path / "spoilt.ply" / "cloud.ply")
 
 
 def test_gaussians_are_told_from_a_mesh_by_the_header(tmp_path: Path) -> None:

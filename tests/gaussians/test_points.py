@@ -19,6 +19,8 @@ from avmsf.gaussians.points import (
 )
 from factories.raising import raises
 
+CHOOSE = (farthest_points, closest_points)
+
 
 def cloud(count: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -36,12 +38,9 @@ def test_farthest_points_are_the_farthest():
     for number in range(1, 12):
         distance = between[:, rows[:number]].amin(dim=1)
         assert float(distance[rows[number]]) == float(distance.max())
-
-
-def test_farthest_points_of_a_square_are_its_corners_then_its_middle():
-    rows = farthest_points(grid(5), 5, start=0)
-    # Ties between the two remaining corners go to the first row.
-    assert grid(5)[rows].tolist() == [[0, 0, 0], [4, 4, 0], [0, 4, 0], [4, 0, 0], [2, 2, 0]]
+    # Ties between the two remaining corners of a square go to the first row.
+    corners = grid(5)[farthest_points(grid(5), 5, start=0)].tolist()
+    assert corners == [[0, 0, 0], [4, 4, 0], [0, 4, 0], [4, 0, 0], [2, 2, 0]]
 
 
 def test_no_row_is_chosen_twice_even_where_points_coincide():
@@ -87,13 +86,6 @@ def test_clusters_are_a_minimum_of_lloyds():
     assert torch.equal(labels, torch.cdist(points, centers).argmin(dim=1))
 
 
-def test_more_clusters_than_positions_are_refused():
-    with raises(FitError, name="count", value=4):
-        cluster(cloud(3).repeat(4, 1), 4)
-    with raises(FitError, name="count", value=1):
-        cluster(cloud(0), 1)
-
-
 def test_samples_lie_on_the_surface_evenly():
     box = trimesh.creation.box(extents=(1.0, 2.0, 4.0))
     vertices, faces = torch.tensor(np.asarray(box.vertices)), torch.tensor(np.asarray(box.faces))
@@ -105,16 +97,6 @@ def test_samples_lie_on_the_surface_evenly():
     areas = torch.tensor([8.0, 4.0, 2.0], dtype=torch.float64) / 14.0
     # Four standard errors of a share of 6000.
     assert bool(((shares - areas).abs() < 4 * (areas * (1 - areas) / 6000).sqrt()).all())
-
-
-def test_triangles_without_area_are_passed_over_and_alone_refused():
-    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
-    faces = torch.tensor([[0, 1, 1], [0, 1, 2], [2, 2, 2]])
-    samples = sample_surface(vertices, faces, 50, generator=torch.Generator().manual_seed(0))
-    assert samples.shape == (50, 3)
-    assert float(samples[:, :2].sum(1).max()) <= 1.0
-    with raises(CaptureError, name="surface", value=0.0):
-        sample_surface(vertices, faces[[0, 2]], 5, generator=torch.Generator().manual_seed(0))
 
 
 def test_a_lattice_fills_the_box_to_its_corners_with_one_spacing():
@@ -140,15 +122,33 @@ def test_a_lattice_of_flat_contacts_is_flat():
     assert lattice(contacts, 100).tolist() == [[1.0, 2.0, 0.25]]
 
 
-def test_what_the_points_do_not_have_is_refused():
-    for choose in (farthest_points, closest_points):
-        with raises(EvaluationError, name="count", value=6):
-            choose(cloud(5), 6)
-        with raises(EvaluationError, name="start", value=5):
-            choose(cloud(5), 2, start=5)
-        with raises(EvaluationError, name="start", value=-1):
-            choose(cloud(5), 2, start=-1)
-    with raises(EvaluationError, name="count", value=6):
-        nearest_points(cloud(5), cloud(2), count=6)
-    with raises(EvaluationError, name="count", value=7):
-        lattice(cloud(5), 7)
+TRIANGLE = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+FLAT = torch.tensor([[0, 1, 1], [2, 2, 2]])
+
+
+def draw(faces: torch.Tensor) -> torch.Tensor:
+    return sample_surface(TRIANGLE, faces, 50, generator=torch.Generator().manual_seed(0))
+
+
+def test_triangles_without_area_are_passed_over():
+    samples = draw(torch.cat([FLAT, torch.tensor([[0, 1, 2]])]))
+    assert samples.shape == (50, 3)
+    assert float(samples[:, :2].sum(1).max()) <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "name", "value"),
+    [
+        *((lambda choose=choose: choose(cloud(5), 6), EvaluationError, "count", 6) for choose in CHOOSE),
+        *((lambda choose=choose: choose(cloud(5), 2, start=5), EvaluationError, "start", 5) for choose in CHOOSE),
+        *((lambda choose=choose: choose(cloud(5), 2, start=-1), EvaluationError, "start", -1) for choose in CHOOSE),
+        (lambda: nearest_points(cloud(5), cloud(2), count=6), EvaluationError, "count", 6),
+        (lambda: lattice(cloud(5), 7), EvaluationError, "count", 7),
+        (lambda: cluster(cloud(3).repeat(4, 1), 4), FitError, "count", 4),
+        (lambda: cluster(cloud(0), 1), FitError, "count", 1),
+        (lambda: draw(FLAT), CaptureError, "surface", 0.0),
+    ],
+)
+def test_what_the_points_do_not_have_is_refused(call, kind, name, value):
+    with raises(kind, name=name, value=value):
+        call()

@@ -1,7 +1,6 @@
 """What `load_mesh` returns has indices that exist and finite coordinates; what is beyond its bounds is refused."""
 
 import json
-import logging
 import struct
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import trimesh
 from avmsf._utils.text import MAX_TEXT_BYTES
 from avmsf.errors import CaptureError
 from avmsf.mesh import read_surface
-from avmsf.mesh.io import MAX_GLTF_BYTES, load_mesh
+from avmsf.mesh.io import MAX_GLTF_BYTES
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from factories.raising import raises
 
@@ -57,38 +56,6 @@ def test_every_format_gives_the_same_triangles(tmp_path: Path, suffix: str) -> N
     torch.testing.assert_close(corners, torch.tensor(np.array(ball.triangles)).float(), atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("row", [3, 99, -1])
-@pytest.mark.parametrize("read", [read_surface, read_textured_mesh])
-def test_faces_that_name_no_vertex_are_refused(tmp_path: Path, row: int, read) -> None:
-    path = tmp_path / "surface.ply"
-    path.write_text(PLY.format(x=0, row=row))
-    with raises(CaptureError, file="surface.ply", name="faces", value=row):
-        read(path)
-
-
-@pytest.mark.parametrize(("x", "name"), [("nan", "vertices"), ("inf", "vertices"), ("1e200", "coordinates")])
-def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path, x: str, name: str) -> None:
-    path = tmp_path / "surface.ply"
-    path.write_text(PLY.format(x=x, row=2))
-    with raises(CaptureError, file="surface.ply", name=name):
-        read_surface(path)
-
-
-def test_vertices_in_a_plane_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "surface.obj").write_text("v 0 0\nv 1 0\nv 0 1\n")
-    with raises(CaptureError, file="surface.obj", name="vertices", value=[3, 2]):
-        load_mesh(tmp_path / "surface.obj")
-
-
-def test_a_part_moved_out_of_the_world_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "surface.glb"
-    path.write_bytes(triangle())
-    assert len(read_surface(path).faces) == 1
-    path.write_bytes(triangle(matrix=[1e30, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]))
-    with raises(CaptureError, file="surface.glb", name="coordinates", value=pytest.approx(1e30)):
-        read_surface(path)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "counted", "found"),
     [
@@ -121,12 +88,6 @@ def test_buffers_within_a_text_gltf_may_be_larger_than_other_json(tmp_path: Path
         read_surface(tmp_path / "ball.gltf")
 
 
-def test_an_archive_is_no_mesh(tmp_path: Path) -> None:
-    (tmp_path / "surface.zip").write_bytes(b"PK\x03\x04")
-    with raises(CaptureError, file="surface.zip", name="suffix", value=".zip"):
-        read_surface(tmp_path / "surface.zip")
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [("v ", "v\t"), ("f ", "f\t"), ("v ", "  v "), ("v ", "\ufeffv "), (" 3\n", " 3 # -x -y\n")],
@@ -147,12 +108,6 @@ def test_negative_indices_count_back_from_where_they_stand(tmp_path: Path) -> No
     assert surface.vertices[surface.faces][:, :, 0].tolist() == [[row] * 3 for row in range(3)]
 
 
-def test_a_negative_index_before_the_first_vertex_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 -5\n")
-    with raises(CaptureError, file="a.obj", value=-5):
-        read_surface(tmp_path / "a.obj")
-
-
 def test_normalized_integers_are_from_minus_one_to_one(tmp_path: Path) -> None:
     record = {
         "scenes": [{"nodes": [0]}],
@@ -169,26 +124,54 @@ def test_normalized_integers_are_from_minus_one_to_one(tmp_path: Path) -> None:
     torch.testing.assert_close(vertices, 0.5 * torch.diag(torch.tensor([1.0, -1.0, 0.5])), atol=1e-4, rtol=0)
 
 
+def ply(x: object = 0, row: object = 2) -> bytes:
+    return PLY.format(x=x, row=row).encode()
+
+
+AWAY = [1e30, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+CLOUD = trimesh.PointCloud(np.eye(3)).export(file_type="ply")
+
+
 @pytest.mark.parametrize(
-    ("name", "content", "word"),
+    ("name", "content", "attributes"),
     [
-        ("a.glb", glb({"extensionsRequired": ["KHR_draco_mesh_compression"]}), "Draco"),
-        ("a.obj", b"v 0,5 0,1 0,2\nv 1,5 0,1 0,2\nv 0,5 1,1 0,2\nf 1 2 3\n", "decimal commas"),
-        ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
+        *(("a.ply", ply(row=row), {"name": "faces", "value": row}) for row in (3, 99, -1)),
+        *(("a.ply", ply(x=x), {"name": "vertices"}) for x in ("nan", "inf")),
+        ("a.ply", ply(x="1e200"), {"name": "coordinates"}),
+        ("a.ply", b"ply\nnonsense", {}),
+        ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", {}),
+        ("a.obj", b"v 0 0\nv 1 0\nv 0 1\n", {"name": "vertices", "value": [3, 2]}),
+        ("a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", {"row": 1, "name": "vertices"}),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 -5\n", {"value": -5}),
+        ("a.obj", b"v 0,5 0,1 0,2\nv 1,5 0,1 0,2\nv 0,5 1,1 0,2\nf 1 2 3\n", {}),
+        ("a.glb", triangle(matrix=AWAY), {"name": "coordinates", "value": pytest.approx(1e30)}),
+        ("a.glb", glb({"extensionsRequired": ["KHR_draco_mesh_compression"]}), {}),
+        ("a.glb", bytes(range(200)), {}),
+        ("a.zip", b"PK\x03\x04", {"name": "suffix", "value": ".zip"}),
+        ("none.obj", None, {"name": None}),
     ],
 )
-def test_why_a_mesh_cannot_be_read_is_named(tmp_path: Path, name: str, content: bytes, word: str) -> None:
-    (tmp_path / name).write_bytes(content)
-    with raises(CaptureError, file=name) as caught:
-        read_surface(tmp_path / name)
-    assert word in str(caught.value)
+@pytest.mark.parametrize("read", [read_surface, read_textured_mesh])
+def test_what_is_no_mesh_is_refused(tmp_path: Path, read, name: str, content: bytes | None, attributes: dict) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with raises(CaptureError, file=name, **attributes):
+        read(tmp_path / name)
 
 
-def test_a_missing_texture_of_a_ply_prints_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(logging.root, "handlers", [])
-    text = PLY.format(x=0, row=2).replace("ascii 1.0\n", "ascii 1.0\ncomment TextureFile lost.png\n")
-    (tmp_path / "a.ply").write_text(text)
-    assert len(read_surface(tmp_path / "a.ply").faces) == 1
-    assert capfd.readouterr() == ("", "")
+def test_points_alone_are_a_surface_and_no_mesh_with_colors(tmp_path: Path) -> None:
+    (tmp_path / "cloud.ply").write_bytes(CLOUD)
+    assert read_surface(tmp_path / "cloud.ply").vertices.shape == (3, 3)
+    with raises(CaptureError, file="cloud.ply", name="faces", value=0):
+        read_textured_mesh(tmp_path / "cloud.ply")
+
+
+def test_parts_of_a_scene_stay_where_they_lie(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for place in (0.0, 2.0):
+        scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([place, 0, 0]))
+    scene.export(tmp_path / "two.glb")
+    surface = read_surface(tmp_path / "two.glb", meters=0.1)
+    assert surface.faces.shape == (24, 3)
+    assert surface.faces.max() == len(surface.vertices) - 1
+    assert [surface.vertices[:, 0].min(), surface.vertices[:, 0].max()] == pytest.approx([-0.05, 0.25], rel=1e-6)

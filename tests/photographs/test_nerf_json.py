@@ -1,7 +1,9 @@
 """transforms.json: axes, intrinsics, poses, file names and masks as the tools that write it mean them."""
 
+import json
 import math
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import read_sparse_points, read_views
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.folder import write_views
+from avmsf.photographs.lenses import MAX_PHOTOGRAPHS
 from avmsf.photographs.nerf_json import read_transforms
 from factories.raising import raises, warns
 from factories.views_folder import HEIGHT, WIDTH, frames, opengl_pose, ring, write_image, write_transforms
@@ -78,6 +81,9 @@ def test_an_angle_of_view_stands_for_the_focal_length(tmp_path: Path) -> None:
     assert camera.principal == (WIDTH / 2, HEIGHT / 2)
     write_transforms(tmp_path, rows, images=False, **nothing, camera_angle_x=2 * math.atan(0.4), camera_angle_y=1.0)
     assert read_views(tmp_path)[0].camera.focal == pytest.approx((50.0, 15 / math.tan(0.5)))
+    write_transforms(tmp_path, rows, images=False, **nothing, camera_angle_x=50.0)
+    with raises(CaptureError, file="transforms.json", row=0, name="camera_angle_x", value=50.0):
+        read_views(tmp_path)
 
 
 def test_names_sort_and_lose_the_images_folder(tmp_path: Path) -> None:
@@ -97,25 +103,15 @@ def test_a_file_may_be_named_itself(tmp_path: Path) -> None:
         read_views(tmp_path)
 
 
-@pytest.mark.parametrize("settings", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_both_ways_to_say_fisheye(tmp_path: Path, settings: dict) -> None:
-    """Without coefficients a fisheye still bends: its principal point stays, its focal length changes."""
-    camera = read_views(write_transforms(tmp_path, frames(ring(3)), **settings))[0].camera
-    assert camera.principal == (19.0, 16.0)
-    assert camera.focal != (50.0, 52.0)
-
-
 def test_coefficients_go_where_opencv_has_them(tmp_path: Path) -> None:
     """The file names them k1 to k4, p1 and p2; OpenCV orders k1 k2 p1 p2 k3, or k1 to k4 of a fisheye."""
     rows = frames(ring(3))
-    rows[1]["camera_model"] = "OPENCV_FISHEYE"
-    rows[1]["k4"] = 0.4
+    rows[1] |= {"camera_model": "OPENCV_FISHEYE", "k4": 0.4}
+    rows[2] |= {"is_fisheye": True, "k4": 0.4}
     write_transforms(tmp_path, rows, k1=0.1, k2=0.2, k3=0.3, p1=0.01, p2=0.02)
-    photographs = read_transforms(tmp_path / "transforms.json").photographs
-    perspective, fisheye = (each.lens_of(1, 1) for each in photographs[:2])
-    assert perspective.distortion == (0.1, 0.2, 0.01, 0.02, 0.3)
-    assert fisheye.distortion == (0.1, 0.2, 0.3, 0.4)
-    assert (perspective.fisheye, fisheye.fisheye) == (False, True)
+    perspective, *fisheyes = (each.lens_of(1, 1) for each in read_transforms(tmp_path / "transforms.json").photographs)
+    assert (perspective.distortion, perspective.fisheye) == ((0.1, 0.2, 0.01, 0.02, 0.3), False)
+    assert [(each.distortion, each.fisheye) for each in fisheyes] == [((0.1, 0.2, 0.3, 0.4), True)] * 2
 
 
 def test_masks_by_name_and_by_path(tmp_path: Path) -> None:
@@ -152,22 +148,6 @@ def test_a_model_beside_the_file_is_in_another_frame_and_left_alone(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("text", "name", "value"),
-    [
-        ('{"frames": [', None, None),
-        ("[1, 2]", None, "list"),
-        ('{"frames": 3}', "frames", "int"),
-        ("[" * 100_000, None, None),
-    ],
-    ids=["cut", "list", "number", "deep"],
-)
-def test_what_is_no_json_object_with_frames_is_named(tmp_path: Path, text: str, name: str | None, value: Any) -> None:
-    (tmp_path / "transforms.json").write_text(text)
-    with raises(CaptureError, file="transforms.json", name=name, value=value):
-        read_views(tmp_path)
-
-
-@pytest.mark.parametrize(
     ("change", "name", "value"),
     [
         ({"transform_matrix": None}, "transform_matrix", None),
@@ -189,46 +169,48 @@ def test_what_is_no_json_object_with_frames_is_named(tmp_path: Path, text: str, 
         (pose(POSE * [0, 0, 0, 1]), "transform_matrix", [0.0, 0.0, 0.0]),
         (pose(POSE * [1, 1, 1, np.nan]), "transform_matrix", pytest.approx(np.nan, nan_ok=True)),
         (pose(POSE.T), "transform_matrix", pytest.approx([*POSE[:3, 3], 1.0])),
+        ({"file_path": "./images/a.png"}, "a.png", None),
+        ({"fl_x": None, "fl_y": None}, "fl_x", None),
     ],
 )
 def test_what_a_frame_lacks_is_named(tmp_path: Path, change: dict, name: str, value: Any) -> None:
-    rows = frames(ring(4))
+    rows = frames(ring(4), fl_x=50.0, fl_y=52.0)
     write_transforms(tmp_path, rows)
     rows[1] |= change
-    with raises(CaptureError, file="transforms.json", row=1, name=name, value=value):
-        read_views(write_transforms(tmp_path, rows, images=False))
+    with raises(CaptureError, file="transforms.json", name=name) as caught:
+        read_views(write_transforms(tmp_path, rows, images=False, fl_x=None, fl_y=None))
+    assert (caught.value.row, caught.value.value) == (1, value) or name == "a.png"
 
 
-@pytest.mark.parametrize(("angle", "name"), [(None, "fl_x"), (50.0, "camera_angle_x")])
-def test_without_any_focal_length_it_is_asked_for(tmp_path: Path, angle: float | None, name: str) -> None:
-    write_transforms(tmp_path, frames(ring(3)), fl_x=None, fl_y=None, camera_angle_x=angle)
-    with raises(CaptureError, file="transforms.json", row=0, name=name, value=angle):
-        read_views(tmp_path)
+FRAMES = [{"file_path": "0.png", "transform_matrix": "unread"}] * (MAX_PHOTOGRAPHS + 1)
 
 
-def test_an_image_with_two_cameras_is_refused(tmp_path: Path) -> None:
-    rows = frames(ring(4))
-    rows[2]["file_path"] = "./images/a.png"
-    write_transforms(tmp_path, rows)
-    with raises(CaptureError, file="transforms.json", name="a.png"):
-        read_views(tmp_path)
+@pytest.mark.parametrize(
+    ("text", "given", "name", "value"),
+    [
+        ('{"frames": [', {}, None, None),
+        ("[1, 2]", {}, None, "list"),
+        ('{"frames": 3}', {}, "frames", "int"),
+        ("[" * 100_000, {}, None, None),
+        (json.dumps({"frames": FRAMES}), {}, "photographs", MAX_PHOTOGRAPHS + 1),
+        (None, {"longest": 0}, "longest", 0),
+        (None, {"meters": -1.0}, "meters", -1.0),
+    ],
+    ids=["cut", "list", "number", "deep", "many", "longest", "meters"],
+)
+def test_what_is_no_json_object_with_frames_is_named(tmp_path: Path, text, given, name, value) -> None:
+    write_transforms(tmp_path, frames(ring(3)))
+    if text is not None:
+        (tmp_path / "transforms.json").write_text(text)
+    with raises(CaptureError, file=None if given else "transforms.json", name=name, value=value):
+        read_views(tmp_path, **given)
 
 
 def test_folders_without_cameras_say_what_is_missing(tmp_path: Path) -> None:
-    with raises(CaptureError, file="nowhere"):
-        read_views(tmp_path / "nowhere")
-    with raises(CaptureError, file="nowhere.json"):
-        read_views(tmp_path / "nowhere.json")
     write_image(tmp_path / "images" / "a.png")
-    with raises(CaptureError, file=tmp_path, value=[]):
-        read_views(tmp_path)
-
-
-@pytest.mark.parametrize("given", [{"longest": 0}, {"meters": -1.0}])
-def test_numbers_that_the_caller_gives_are_checked(tmp_path: Path, given: dict) -> None:
-    ((name, value),) = given.items()
-    with raises(CaptureError, name=name, value=value):
-        read_views(write_transforms(tmp_path, frames(ring(3))), **given)
+    for path in (tmp_path / "nowhere", tmp_path / "nowhere.json", tmp_path):
+        with raises(CaptureError, file=path):
+            read_views(path)
 
 
 def test_paths_outside_the_folder_are_read(tmp_path: Path) -> None:
@@ -296,36 +278,41 @@ def with_poses(folder: Path, change) -> Path:
     return write_transforms(folder, rows)
 
 
-def test_a_scaled_rotation_is_mended_where_it_stands(tmp_path: Path) -> None:
-    scaled = [f"{name}.png (0.25)" for name in "abcd"]
-    with warns(CaptureWarning, file="transforms.json", name="transform_matrix", value=scaled):
-        views = read_views(with_poses(tmp_path, lambda pose: pose * [0.25, 0.25, 0.25, 1]))
+SCALED = [f"{name}.png (0.25)" for name in "abcd"]
+
+
+@pytest.mark.parametrize(
+    ("change", "tolerance", "scaled"),
+    [
+        (lambda pose: pose[:3], 1e-12, None),
+        # Four digits leave half a ten-thousandth in each number.
+        (lambda pose: pose.round(4), 4e-4, None),
+        (lambda pose: pose * [0.25, 0.25, 0.25, 1], 1e-12, SCALED),
+    ],
+    ids=["three rows", "rounded", "scaled"],
+)
+def test_poses_become_rigid_where_they_stand(tmp_path: Path, change, tolerance: float, scaled: list | None) -> None:
+    folder = with_poses(tmp_path, change)
+    name = {"name": "transform_matrix", "value": scaled}
+    with warns(CaptureWarning, file="transforms.json", **name) if scaled else nullcontext():
+        views = read_views(folder)
     for view, camera in zip(views, ring(4), strict=True):
-        assert torch.allclose(view.camera.world_to_camera, camera.world_to_camera, atol=1e-12)
+        rotation = view.camera.world_to_camera[:3, :3]
+        assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-12)
+        assert torch.allclose(view.camera.world_to_camera, camera.world_to_camera, atol=tolerance)
 
 
-def test_rounded_poses_become_rigid_without_a_word(tmp_path: Path) -> None:
-    view = read_views(with_poses(tmp_path, lambda pose: pose.round(4)))[1]
-    rotation = view.camera.world_to_camera[:3, :3]
-    assert torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-12)
-    # Four digits leave half a ten-thousandth in each number.
-    assert torch.allclose(view.camera.world_to_camera, ring(4)[1].world_to_camera, atol=4e-4)
-
-
-def test_three_rows_are_enough(tmp_path: Path) -> None:
-    views = read_views(with_poses(tmp_path, lambda pose: pose[:3]))
-    assert torch.allclose(views[3].camera.world_to_camera, ring(4)[3].world_to_camera, atol=1e-12)
-
-
-def test_opencv_axes_in_the_file_make_cameras_look_away(tmp_path: Path) -> None:
-    with warns(CaptureWarning, file="transforms.json", name="axes", value=4):
-        read_views(with_poses(tmp_path, lambda pose: pose * [1, -1, -1, 1]))
-
-
-def test_cameras_at_one_position_are_warned_of(tmp_path: Path) -> None:
-    moved = with_poses(tmp_path, lambda pose: np.column_stack([pose[:, :3], [1, 2, 3, 1]]))
-    with warns(CaptureWarning, file="transforms.json", name="positions", value=[1.0, 2.0, 3.0]):
-        read_views(moved)
+@pytest.mark.parametrize(
+    ("change", "name", "value"),
+    [
+        # The axes of OpenCV, by which cameras look away from the object.
+        (lambda pose: pose * [1, -1, -1, 1], "axes", 4),
+        (lambda pose: np.column_stack([pose[:, :3], [1, 2, 3, 1]]), "positions", [1.0, 2.0, 3.0]),
+    ],
+)
+def test_cameras_that_look_away_or_share_one_position_are_warned_of(tmp_path: Path, change, name, value) -> None:
+    with warns(CaptureWarning, file="transforms.json", name=name, value=value):
+        read_views(with_poses(tmp_path, change))
 
 
 def test_cameras_side_by_side_are_right(tmp_path: Path) -> None:

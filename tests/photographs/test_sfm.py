@@ -257,34 +257,29 @@ def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path:
     assert not (tmp_path / "result.json").exists()
 
 
-def test_a_folder_and_a_process_that_the_system_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = pictures(tmp_path / "cup", "abc")
+    pictures(tmp_path / "few", "ab")
+    pictures(tmp_path / "sizes", "abc")
+    cv2.imwrite(str(tmp_path / "sizes/images/d.png"), np.zeros((8, 12, 3), dtype=np.uint8))
     (tmp_path / "file").write_text("")
-    with raises(CaptureError, file="sfm") as caught:
-        estimate_cameras(folder / "images", tmp_path / "file" / "sfm")
-    assert "writable" in str(caught.value)
+    for images, model, settings, attributes in (
+        ("few/images", "few", {}, {"file": "images", "name": "photographs", "value": 2}),
+        ("few/pictures", "few", {}, {"file": "pictures"}),
+        ("sizes/images", "sizes", {}, {"file": "images", "name": "sizes", "value": ["d.png"]}),
+        ("cup/images", "cup", {"timeout": 0.0}, {"name": "timeout", "value": 0.0}),
+        ("cup/images", "file/sfm", {}, {"file": "sfm"}),
+    ):
+        with raises(CaptureError, **attributes):
+            estimate_cameras(tmp_path / images, tmp_path / model, **settings)
 
     def full(*_: object, **__: object) -> None:
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr("avmsf.photographs.sfm.subprocess.Popen", full)
+    monkeypatch.setattr(subprocess, "Popen", full)
     with raises(CaptureError, name="starting"):
         estimate_cameras(folder / "images", folder)
-
-
-def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = pictures(tmp_path / "cup", "ab")
-    with raises(CaptureError, file="images", name="photographs", value=2):
-        estimate_cameras(folder / "images", folder)
-    with raises(CaptureError, file="pictures"):
-        estimate_cameras(folder / "pictures", folder)
-    cv2.imwrite(str(folder / "images/c.png"), np.zeros((8, 8, 3), dtype=np.uint8))
-    cv2.imwrite(str(folder / "images/d.png"), np.zeros((8, 12, 3), dtype=np.uint8))
-    with raises(CaptureError, file="images", name="sizes", value=["d.png"]):
-        estimate_cameras(folder / "images", folder)
-    with raises(CaptureError, name="timeout", value=0.0):
-        estimate_cameras(folder / "images", folder, timeout=0.0)
-    monkeypatch.setattr("avmsf.photographs.sfm.importlib.util.find_spec", lambda _: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with raises(CaptureError, name="pycolmap"):
         estimate_cameras(folder / "images", folder)
     assert sorted(path.name for path in folder.iterdir()) == ["images"]

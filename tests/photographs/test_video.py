@@ -54,11 +54,6 @@ def test_the_sharp_frame_of_each_span_is_kept(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.avi", "images"]
 
 
-def test_as_many_as_there_are_is_all_of_them(tmp_path: Path) -> None:
-    picked = pick(film(tmp_path / "a.avi", count=5), tmp_path / "images", 5)
-    assert [path.name for path in picked] == names(range(5))
-
-
 def test_blur_lowers_the_sharpness_at_any_size() -> None:
     for size in (64, 700):
         frame = picture(3, blurred=False, width=size, height=size)
