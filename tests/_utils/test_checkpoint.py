@@ -24,6 +24,9 @@ def test_a_state_comes_back(tmp_path: Path) -> None:
     assert state["step"] == 3
     assert state["values"][0].tolist() == [0, 1, 2]
     assert [each.name for each in path.parent.iterdir()] == ["state"]
+    # A state that cannot be written costs no work.
+    with warns(AvmsfWarning, file="new/state/below"):
+        of(path / "below").save({})
 
 
 def test_without_a_path_nothing_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,9 +60,3 @@ def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path: Path, kind: str) ->
     # Torch's own message advises to switch its safety off.
     assert "weights_only" not in str(caught.value)
     assert path.read_bytes() == before
-
-
-def test_a_state_that_cannot_be_written_costs_no_work(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with warns(AvmsfWarning, file="file/state"):
-        of(tmp_path / "file" / "state").save({})

@@ -1,35 +1,53 @@
-"""The message that errors compose from their attributes."""
+"""What errors hold, the message that they compose of it, and which of them are of missing memory."""
+
+import errno
+import os
 
 import pytest
+import torch
 
-from avmsf.errors import CaptureError, FitError
-
-
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (FitError.expected("1 or more", 0, name="count"), "count: expected 1 or more, got 0"),
-        (
-            FitError.expected("more than 0", 0.1 + 0.2, row=2, name="scale"),
-            "scale, row 2: expected more than 0, got 0.3",
-        ),
-        (FitError.expected("cpu or cuda", "", name="device", advice="x"), "device: expected cpu or cuda, got ''; x"),
-        (
-            CaptureError.expected("a file", got="a folder", file="a.wav", name="file"),
-            "a.wav: expected a file, got a folder",
-        ),
-    ],
-)
-def test_the_message_says_where_what_was_expected_and_what_was_found(error, message):
-    assert str(error) == message
+from avmsf.errors import CaptureError, lacks_memory
 
 
-def test_what_is_expected_and_found_is_an_attribute_too():
-    error = CaptureError.expected("a number", "left", file="impacts.csv", row=3, name="x", advice="correct it")
+def test_an_error_is_composed_of_its_attributes_and_keeps_them():
+    error = CaptureError.expected("a number", 0.1 + 0.2, file="impacts.csv", row=3, name="x", advice="correct it")
     assert type(error) is CaptureError
     assert {**error.attributes, "file": str(error.file)} == {
         "file": "impacts.csv",
         "row": 3,
         "name": "x",
-        "value": "left",
+        "value": 0.1 + 0.2,
     }
+    assert str(error) == "impacts.csv, row 3: expected a number, got 0.3; correct it"
+    error = CaptureError.expected("a file", got="a folder", file="a.wav", name="file")
+    assert str(error) == "a.wav: expected a file, got a folder"
+
+
+def test_a_tensor_that_cannot_be_allocated_lacks_memory() -> None:
+    with pytest.raises(RuntimeError) as caught:
+        torch.empty(1 << 60, dtype=torch.uint8)
+    assert lacks_memory(caught.value)
+
+
+def test_the_cause_counts_where_a_library_hides_it() -> None:
+    error = OSError("the library could not be found")
+    assert not lacks_memory(error)
+    error.__context__ = OSError("libllvmlite.so: failed to map segment from shared object")
+    assert lacks_memory(error)
+
+
+@pytest.mark.parametrize(
+    ("error", "lacks"),
+    [
+        (MemoryError(), True),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), True),
+        (OSError("libllvmlite.so: cannot allocate memory in static TLS block"), True),
+        (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), True),
+        (ImportError("No module named 'torch'"), False),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), False),
+        (RuntimeError("shapes cannot be multiplied"), False),
+        (RecursionError("maximum recursion depth exceeded"), False),
+    ],
+)
+def test_other_errors_do_not(error: Exception, lacks: bool) -> None:
+    assert lacks_memory(error) is lacks

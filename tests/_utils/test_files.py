@@ -18,10 +18,6 @@ from factories.raising import raises
 NUMBERS = (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.ENAMETOOLONG, errno.EIO)
 
 
-def test_each_cause_has_its_own_advice() -> None:
-    assert len({way_out(OSError(number, "")) for number in NUMBERS}) == len(NUMBERS)
-
-
 @pytest.mark.parametrize("number", NUMBERS)
 def test_the_advice_fits_the_systems_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     def refuse(*arguments: object, **settings: object) -> None:
@@ -45,9 +41,10 @@ def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_pa
         with raises(ExportError, file=tmp_path / name, value=os.strerror(number)) as refused:
             write_whole(tmp_path / name, b"", raising=ExportError)
         assert str(refused.value).endswith(way_out(OSError(number, "")))
-    advice = [way_out(OSError(number, "")) for number in (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.EIO)]
-    assert advice[0] == advice[1]
-    assert len(set(advice)) == 3
+    # Each cause has its own advice, but these two.
+    assert way_out(OSError(errno.EEXIST, "")) == way_out(OSError(errno.ENOTDIR, ""))
+    numbers = (*NUMBERS, errno.EEXIST, errno.EISDIR)
+    assert len({way_out(OSError(number, "")) for number in numbers}) == len(numbers)
 
 
 def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(

@@ -17,8 +17,7 @@ class Gate(BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
         self.send_error(int(self.path.split("/")[1]))
 
-    def do_GET(self) -> None:
-        self.do_HEAD()
+    do_GET = do_HEAD
 
     def log_message(self, *_: object) -> None:
         return

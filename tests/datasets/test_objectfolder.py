@@ -71,10 +71,6 @@ def test_the_mesh_is_surface_and_look(folder: Path) -> None:
     assert dataset.capture("10").surface is None
 
 
-def test_objects_and_contacts_come_in_numeric_order(folder: Path) -> None:
-    assert ObjectFolderRaw(folder).objects() == ("2", "10")
-
-
 def test_the_deprecated_contact_is_passed_over(tmp_path: Path) -> None:
     write_raw(tmp_path, {"24": ("12", "13")})
     write_strike(tmp_path / "24" / "audio" / "13_deprecated", seed=99)
@@ -112,57 +108,15 @@ def test_contacts_beside_the_folder_are_found(tmp_path: Path) -> None:
     assert dataset.capture("3").impacts.contacts[0].tolist() == place("3", "1").tolist()
 
 
-@pytest.mark.parametrize(
-    ("record", "row", "name", "value"),
-    [
-        ({"location": "x/5.wav", "contact": [0, 0, 0]}, 1, "location", "x/5.wav"),
-        ({"location": "3_5_3sec.wav", "contact": [0, 0]}, 1, "contact", [0, 0]),
-        ({"location": "3_5_3sec.wav", "contact": [0, 0, "1"]}, 1, "contact", [0, 0, "1"]),
-        ([1, 2], 0, "location", None),
-    ],
-)
-def test_lists_that_cannot_be_meant_are_refused(
-    tmp_path: Path, record: object, row: int, name: str, value: object
-) -> None:
-    (tmp_path / "list.json").write_text(json.dumps(record) if isinstance(record, dict) else f"\n{json.dumps([record])}")
-    with raises(DatasetError, file="list.json", row=row, name=name, value=value):
-        read_contacts([tmp_path / "list.json"])
-
-
-def test_one_contact_in_two_places_is_refused(tmp_path: Path) -> None:
-    first, second = records("3", ("5", "6"))
-    (tmp_path / "list.json").write_text(json.dumps([first, {**second, "location": first["location"]}]))
-    with raises(DatasetError, file="list.json", row=1, name="5", value=tuple(second["contact"])):
-        read_contacts([tmp_path / "list.json"])
-
-
-def test_both_ways_to_write_the_notes(tmp_path: Path) -> None:
+def test_both_ways_to_write_the_notes(shared: Path, tmp_path: Path) -> None:
     (tmp_path / "block.yaml").write_bytes(b"gain:\r\n- 12\r\n- 18\r\npad:\r\n- 1\r\n- 0\r\n")
     (tmp_path / "flow.yaml").write_bytes(b"gain: [12, 18]\r\npad: [1, 0]\r\n")
     (tmp_path / "pad.yaml").write_bytes(b"gain: [12, 18]\r\npad: [1, 1]\r\n")
     assert [read_gain_db(tmp_path / f"{name}.yaml") for name in ("block", "flow", "pad")] == [18.0, 18.0, -2.0]
+    assert read_gain_db(shared / "bowl_clips" / "metadata.yaml") == -2.0
     for text in (b"- striking_force_newtons: 41.5\r\n", b"[{striking_force_newtons: 4.15e1}]"):
         (tmp_path / "force.yaml").write_bytes(text)
         assert read_newtons(tmp_path / "force.yaml") == 41.5
-
-
-@pytest.mark.parametrize(
-    ("text", "name", "value"),
-    [
-        ("gain: [12]\npad: [1, 1]", "gain", "gain: [12]\npad: [1, 1]"),
-        ("gain:\n- 12\n- 18\n- 3\npad: [1, 1]", "gain", "gain:\n- 12\n- 18\n- 3\npad: [1, 1]"),
-        ("gain: [12, 18]", "pad", "gain: [12, 18]"),
-        ("gain: [12, 18]\npad: [0.5, 1]", "pad", (0.5, 1.0)),
-    ],
-)
-def test_notes_that_cannot_be_meant_are_refused(tmp_path: Path, text: str, name: str, value: object) -> None:
-    (tmp_path / "metadata.yaml").write_text(f"{text}\n")
-    with raises(DatasetError, file="metadata.yaml", name=name, value=value):
-        read_gain_db(tmp_path / "metadata.yaml")
-
-
-def test_a_real_note_reads(shared: Path) -> None:
-    assert read_gain_db(shared / "bowl_clips" / "metadata.yaml") == -2.0
 
 
 def test_what_cannot_be_used_is_left_out_and_named(tmp_path: Path) -> None:
@@ -223,7 +177,9 @@ def test_check_names_archives_and_shared_objects(folder: Path) -> None:
 
 def test_check_reads_no_sound(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(soundfile.SoundFile, "read", None)
-    assert [each.recordings for each in ObjectFolderRaw(folder).check().objects] == [4, 2]
+    dataset = ObjectFolderRaw(folder)
+    assert dataset.objects() == ("2", "10")
+    assert [each.recordings for each in dataset.check().objects] == [4, 2]
 
 
 @pytest.mark.parametrize(("asked", "meant"), [("3", "2 or 10"), ("2_Bowl", "2")])
@@ -231,3 +187,29 @@ def test_an_unknown_object_lists_near_ones(folder: Path, asked: str, meant: str)
     with raises(DatasetError, name="object", value=asked) as caught:
         ObjectFolderRaw(folder).capture(asked)
     assert f" {meant}?" in str(caught.value)
+
+
+FIRST, SECOND = records("3", ("5", "6"))
+BLOCK = "gain:\n- 12\n- 18\n- 3\npad: [1, 1]"
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "row", "name", "value"),
+    [
+        ("list.json", json.dumps({"location": "x/5.wav", "contact": [0, 0, 0]}), 1, "location", "x/5.wav"),
+        ("list.json", json.dumps({"location": "3_5_3sec.wav", "contact": [0, 0]}), 1, "contact", [0, 0]),
+        ("list.json", json.dumps({"location": "3_5_3sec.wav", "contact": [0, 0, "1"]}), 1, "contact", [0, 0, "1"]),
+        ("list.json", "\n[[1, 2]]", 0, "location", None),
+        ("list.json", json.dumps([FIRST, SECOND | {"location": FIRST["location"]}]), 1, "5", tuple(SECOND["contact"])),
+        ("metadata.yaml", "gain: [12]\npad: [1, 1]", None, "gain", "gain: [12]\npad: [1, 1]"),
+        ("metadata.yaml", BLOCK, None, "gain", BLOCK),
+        ("metadata.yaml", "gain: [12, 18]", None, "pad", "gain: [12, 18]"),
+        ("metadata.yaml", "gain: [12, 18]\npad: [0.5, 1]", None, "pad", (0.5, 1.0)),
+    ],
+)
+def test_lists_and_notes_that_cannot_be_meant_are_refused(
+    tmp_path: Path, file: str, text: str, row: int | None, name: str, value: object
+) -> None:
+    (tmp_path / file).write_text(f"{text}\n" if file == "metadata.yaml" else text)
+    with raises(DatasetError, file=file, row=row, name=name, value=value):
+        read_contacts([tmp_path / file]) if file == "list.json" else read_gain_db(tmp_path / file)

@@ -63,27 +63,10 @@ def test_a_mesh_gives_points_on_it_and_points_alone_are_kept():
     assert float(z.abs().max()) == 0
     cloud = FeatureField.from_mesh(Surface(vertices, torch.zeros(0, 3, dtype=torch.long)), seed=generator)
     assert torch.equal(cloud.points, vertices)
-
-
-def test_points_that_stand_for_contacts_are_a_lattice_off_the_surface():
+    # Points that stand for contacts fill the space around them.
     field = FeatureField.from_contacts(box(40), count=300)
     assert torch.equal(field.points, lattice(box(40), 300))
     assert not field.on_surface
-
-
-@pytest.mark.parametrize(
-    ("points", "make", "name", "value"),
-    [
-        (torch.ones(5, 3), FeatureField.from_points, "points", 5),
-        (torch.ones(5, 3), FeatureField.from_contacts, "points", 5),
-        (torch.ones(0, 3), FeatureField.from_points, "points", 0),
-        (box(5).index_fill(0, torch.tensor([2]), math.nan), FeatureField.from_points, "points", 5),
-        (box(9), lambda points: FeatureField.from_points(points).clusters(10), "count", 10),
-    ],
-)
-def test_points_that_span_nothing_are_refused(points, make, name, value):
-    with raises(FitError, name=name, value=value):
-        make(points)
 
 
 def varied(count: int = 400) -> FeatureField:
@@ -113,20 +96,10 @@ def test_no_more_components_come_out_than_there_are():
     assert reduce(varied(), 2).features.shape == (400, 2)
 
 
-def test_features_that_tell_nothing_are_refused():
-    alike = FeatureField(torch.rand(9, 3), torch.full((9, 4), 2.5), "anyone")
-    with raises(SceneError, name="anyone", value=9):
-        reduce(alike, 2)
-    with raises(SceneError, name="dim", value=0):
-        reduce(varied(), 0)
-
-
 def test_a_size_is_the_root_mean_square_length():
     sized = resize(varied(), 0.3).features.double()
     assert float(sized.square().sum(1).mean().sqrt()) == pytest.approx(0.3, rel=1e-6)  # float32's rounding
     torch.testing.assert_close(sized / sized.norm(), varied().features.double() / varied().features.double().norm())
-    with raises(SceneError, name="anyone", value=0.0):
-        resize(FeatureField(torch.rand(9, 3), torch.zeros(9, 4), "anyone"), 1.0)
 
 
 def test_positions_come_before_the_features():
@@ -135,3 +108,25 @@ def test_positions_come_before_the_features():
     torch.testing.assert_close(joined.features[:, :3], geometry)
     assert torch.equal(joined.features[:, 3:], varied().features)
     assert joined.encoder == "geometry and anyone"
+
+
+def constant(value: float) -> FeatureField:
+    return FeatureField(torch.rand(9, 3), torch.full((9, 4), value), "anyone")
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "name", "value"),
+    [
+        (lambda: FeatureField.from_points(torch.ones(5, 3)), FitError, "points", 5),
+        (lambda: FeatureField.from_contacts(torch.ones(5, 3)), FitError, "points", 5),
+        (lambda: FeatureField.from_points(torch.ones(0, 3)), FitError, "points", 0),
+        (lambda: FeatureField.from_points(box(5).index_fill(0, torch.tensor([2]), math.nan)), FitError, "points", 5),
+        (lambda: FeatureField.from_points(box(9)).clusters(10), FitError, "count", 10),
+        (lambda: reduce(constant(2.5), 2), SceneError, "anyone", 9),
+        (lambda: reduce(varied(), 0), SceneError, "dim", 0),
+        (lambda: resize(constant(0.0), 1.0), SceneError, "anyone", 0.0),
+    ],
+)
+def test_points_that_span_nothing_and_features_that_tell_nothing_are_refused(call, kind, name, value):
+    with raises(kind, name=name, value=value):
+        call()

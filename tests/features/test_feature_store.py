@@ -65,24 +65,18 @@ def test_a_changed_record_is_refused(tmp_path, changes, name, value):
     path = tmp_path / "f"
     record = {"format": 1, "version": "0.1.0", "encoder": "x", "sizes": {"points": 20, "dim": 5}, "report": {}}
     save_file(TENSORS, path, {"avmsf_features": json.dumps(record | changes)})
-    with raises(SceneError, file=path, name=name, value=value) as caught:
+    with raises(SceneError, file=path, name=name, value=value):
         load_features(path)
-    assert str(path) in str(caught.value)
 
 
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "f"
-    with raises(SceneError, file=path, value=None):
-        load_features(path)
-    path.write_bytes(b"ply\n")
-    with raises(SceneError, file=path, name=None) as caught:
-        load_features(path)
-    assert "ply" in caught.value.value
-    save_file(TENSORS, path)
-    with raises(SceneError, file=path, name="avmsf_features", value=[]):
-        load_features(path)
     save_features(field(), path)
-    path.write_bytes(path.read_bytes()[:-10])
-    with raises(SceneError, file=path, name=None) as caught:
-        load_features(path)
-    assert "truncated" in caught.value.value
+    whole = path.read_bytes()
+    save_file(TENSORS, path)
+    for content, name in ((None, None), (b"ply\n", None), (whole[:-10], None), (path.read_bytes(), "avmsf_features")):
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.write_bytes(content)
+        with raises(SceneError, file=path, name=name):
+            load_features(path)

@@ -242,17 +242,10 @@ def test_gsplat_is_given_what_it_expects(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("avmsf.gaussians.rasterizer.devices._lies_on_card", lambda tensor: True)
     cloud = leaves(single((0.1, 0.2, 0.5), scale=0.02, logit=0.0))
     found = own(cloud, AHEAD, background=BACKGROUND)
-    shapes = {name: tuple(value.shape) for name, value in given.items() if isinstance(value, torch.Tensor)}
-    assert shapes == dict(
-        means=(1, 3),
-        quats=(1, 4),
-        scales=(1, 3),
-        opacities=(1,),
-        colors=(1, 1, 3),
-        viewmats=(1, 4, 4),
-        Ks=(1, 3, 3),
-        backgrounds=(1, 3),
-    )
+    assert [given[name].shape for name in ("means", "quats", "scales", "opacities", "colors")] == [
+        *((1, 3), (1, 4), (1, 3), (1,), (1, 1, 3))
+    ]
+    assert [given[name].shape for name in ("viewmats", "Ks", "backgrounds")] == [(1, 4, 4), (1, 3, 3), (1, 3)]
     assert (given["width"], given["height"], given["sh_degree"]) == (40, 27, 0)
     assert (given["render_mode"], given["packed"], given["near_plane"]) == ("RGB+ED", False, 0.01)
     torch.testing.assert_close(given["scales"], torch.full((1, 3), 0.02))
