@@ -11,7 +11,6 @@ import torch
 
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
-from avmsf.cli.edit import Options, run
 from avmsf.cli.edit_report import contact_of_sounds
 from avmsf.cli.paths import OutputError
 from avmsf.editing.material import RATIO_ONLY, change_material, infer_material, rayleigh_damping
@@ -29,6 +28,7 @@ from factories.made_audio import save_audio
 from factories.made_fields import FIELDS, mixture, places
 from factories.raising import raises
 from factories.settings import sets
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 RATE = 8000.0
@@ -53,9 +53,7 @@ def field(tmp_path: Path) -> Path:
 
 def edited(field: Path, *words: str, name: str = "new") -> SoundField:
     output = field.with_name(f"{name}.safetensors")
-    options = Options.parse([str(field), "--output", str(output), *words])
-    options.check_inputs()
-    assert run(options) == 0
+    assert run_verb("edit", str(field), "--output", str(output), *words) == 0
     return load(output)
 
 
@@ -187,9 +185,8 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(ProgressDisplay, "step", impatient)
-    command = [str(field), "--output", str(field.with_name("part.safetensors")), *words]
-    assert run(Options.parse(command)) == 130
-    assert f"from {field.with_name('part.safetensors.checkpoint')}" in capsys.readouterr().err
+    assert main(["edit", str(field), "--output", str(field.with_name("part.safetensors")), *words]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "avmsf edit: interrupted; repeat the command to continue"
     assert not field.with_name("part.safetensors").exists()
     preview, rate = soundfile.read(field.with_name("part.safetensors.preview.wav"))
     assert (len(preview), rate) == (2400, RATE)
@@ -351,7 +348,6 @@ def test_towards_words_by_a_saved_model_and_an_interrupted_edit_goes_on(
 
     monkeypatch.setattr(ProgressDisplay, "step", impatient)
     assert edit_to("part") == 130
-    assert "part.safetensors.checkpoint" in capsys.readouterr().err
     assert edit_to("part") == 0
     assert steps == [1, 2]
     expect_same(load(field.with_name("part.safetensors")), whole)

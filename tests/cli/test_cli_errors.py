@@ -4,16 +4,16 @@ import json
 import math
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from avmsf.cli import main, options_of
+from avmsf.cli import main
 from avmsf.errors import AvmsfError
 from factories.plate_capture import TINY, fill_plate
 from factories.raising import raises
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 
@@ -84,8 +84,7 @@ WRONG: dict[str, dict[str, Any]] = {
     },
     f"render field.safetensors {AT} --position 50 60 0 --output s": {"name": "--position", "row": 1},
     f"{TABLE} far.csv": {"file": "far.csv", "row": 4, "name": "b.wav", "value": [50.0, 60.0, 0.0]},
-    f"render field.safetensors {AT} --output s --direction 0 0 0": {"name": "--direction", "row": 0},
-    f"render field.safetensors {AT} --output s --direction nan 0 1": {"name": "--direction", "row": 0},
+    f"render field.safetensors {AT} --output s --direction nan 0 1": {"name": "directions", "row": 0},
     "render field.safetensors --position nan 0 0 --output s": {"name": "--position", "row": 0},
     f"render field.safetensors {AT} {AT} --direction 0 0 1 -o s": {"name": "--direction", "value": 1},
     f"render field.safetensors {AT} {AT} --output two.wav": {"file": "two.wav", "value": 2},
@@ -93,7 +92,7 @@ WRONG: dict[str, dict[str, Any]] = {
     f"render field.safetensors {AT} --output s --seconds 0": {"name": "--seconds", "value": 0.0},
     f"render field.safetensors {AT} --output s --seconds nan": {"name": "--seconds"},
     f"render field.safetensors {AT} --output s --contact-time 2": {"name": "--contact-time", "value": 2.0},
-    f"render field.safetensors {AT} --output s --level-db nan": {"name": "--level-db"},
+    f"render field.safetensors {AT} --output s --level-db nan": {"name": "finite"},
     f"render field.safetensors {AT} --output s --force -1": {"name": "--force", "value": -1.0},
     f"render field.safetensors {AT} --output s --force inf": {"name": "--force", "value": math.inf},
     f"{TABLE} nowhere.csv": {"file": "nowhere.csv"},
@@ -122,9 +121,7 @@ def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, m
     before = {path.name for path in place.iterdir()}
     verb, *arguments = words.split()
     with raises(AvmsfError, **WRONG[words]) as caught:
-        options = options_of(verb, arguments)
-        options.check_inputs()
-        import_module(f"avmsf.cli.{verb}").run(options)
+        run_verb(verb, *arguments)
     capsys.readouterr()
     assert main(words.split()) == 2
     err = capsys.readouterr().err

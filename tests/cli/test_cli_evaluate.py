@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli.evaluate import Options, run
+from avmsf.cli import main, options_of
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.field_methods import FieldMethod
@@ -16,6 +16,7 @@ from avmsf.modal.extraction.finders import ShortTime
 from factories.plate_set import fill_plates
 from factories.raising import raises
 from factories.settings import sets
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 CHEAP = ("--methods", "knn3,nearest", "white-noise", "--no-cdpam")
@@ -28,7 +29,7 @@ def plates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_dataset_becomes_tables_and_a_page(plates: Path, tmp_path: Path, capsys: Streams) -> None:
     words = [str(plates), *CHEAP, "--output", str(tmp_path / "results")]
-    assert run(Options.parse(["farthest", *words, "--json"])) == 0
+    assert run_verb("evaluate", "farthest", *words, "--json") == 0
     out, err = capsys.readouterr()
     printed = json.loads(out)
     kept = json.loads((tmp_path / "results" / "summary.json").read_text())
@@ -42,37 +43,37 @@ def test_a_dataset_becomes_tables_and_a_page(plates: Path, tmp_path: Path, capsy
     assert err.splitlines()[-1].startswith("next: avmsf evaluate ")
     assert "# farthest on plates" in (tmp_path / "results" / "report.md").read_text()
     before = (tmp_path / "results" / "objects" / "a.json").read_bytes()
-    assert run(Options.parse(["farthest", *words])) == 0
+    assert run_verb("evaluate", "farthest", *words) == 0
     assert (tmp_path / "results" / "objects" / "a.json").read_bytes() == before
     with raises(AvmsfError, file=tmp_path / "results", name="protocol", value="farthest"):
-        run(Options.parse(["closest", *words]))
+        run_verb("evaluate", "closest", *words)
 
 
 def test_one_capture_and_one_object_will_do(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(Options.parse(["shots", str(plates / "a"), *CHEAP])) == 0
+    assert run_verb("evaluate", "shots", str(plates / "a"), *CHEAP) == 0
     summary = json.loads((tmp_path / "evaluation" / "a" / "shots" / "summary.json").read_text())
     assert list(summary["cases"]) == ["8 shots", "4 shots", "2 shots", "1 shot"]
     assert (
-        run(Options.parse(["shots", str(plates / "a"), *CHEAP, "--counts", "3", "--starts", "2", "--output", "three"]))
+        run_verb("evaluate", "shots", str(plates / "a"), *CHEAP, "--counts", "3", "--starts", "2", "--output", "three")
         == 0
     )
     assert list(json.loads((tmp_path / "three" / "summary.json").read_text())["cases"]) == ["3 shots"]
-    assert run(Options.parse(["farthest", str(plates), "--objects", "b", *CHEAP])) == 0
+    assert run_verb("evaluate", "farthest", str(plates), "--objects", "b", *CHEAP) == 0
     summary = json.loads((tmp_path / "evaluation" / "plates" / "farthest" / "summary.json").read_text())
     assert summary["objects"] == 1
 
 
 def test_a_changed_setting_is_named(plates: Path, tmp_path: Path) -> None:
     words = ["farthest", str(plates), *CHEAP, "--objects", "a", "--output", str(tmp_path / "results")]
-    assert run(Options.parse([*words, "--cdpam-contacts", "3"])) == 0
+    assert run_verb("evaluate", *words, "--cdpam-contacts", "3") == 0
     with raises(EvaluationError, file=tmp_path / "results", name="metrics.cdpam_contacts", value=3) as caught:
-        run(Options.parse(words))
+        run_verb("evaluate", *words)
     assert "cdpam_contacts 8, got 3" in str(caught.value)
     with raises(EvaluationError, file=tmp_path / "results", name="settings.body.wall", value=None):
-        run(Options.parse([*words, "--cdpam-contacts", "3", "--set", "body.wall=0.002"]))
+        run_verb("evaluate", *words, "--cdpam-contacts", "3", "--set", "body.wall=0.002")
     # Neither is a result of other methods, objects or workers another one.
-    assert run(Options.parse([*words, "--cdpam-contacts", "3", "--objects", "b"])) == 0
+    assert run_verb("evaluate", *words, "--cdpam-contacts", "3", "--objects", "b") == 0
 
 
 WRONG = {
@@ -88,12 +89,10 @@ WRONG = {
 
 def test_files_are_of_one_set_of_training_recordings(plates: Path, tmp_path: Path) -> None:
     method = f"recorded:{plates}"
-    options = Options.parse(
-        ["shots", str(plates), "--methods", f"knn3,{method}", "--output", str(tmp_path / "results")]
-    )
+    words = ["shots", str(plates), "--methods", f"knn3,{method}", "--output", str(tmp_path / "results")]
     with raises(EvaluationError, name="method", value=method):
-        options.check_inputs()
-    Options.parse(["closest", str(plates), "--methods", method]).check_inputs()
+        run_verb("evaluate", *words)
+    options_of("evaluate", ["closest", *words[1:]]).check_inputs()
 
 
 @pytest.mark.parametrize("words", WRONG)
@@ -104,18 +103,16 @@ def test_what_is_wrong_is_said_before_anything_is_written(
     before = sorted(path.name for path in plates.parent.iterdir())
     name, value = WRONG[words]
     with raises(AvmsfError, name=name, value=value):
-        options = Options.parse(words.split())
-        options.check_inputs()
-        run(options)
+        run_verb("evaluate", *words.split())
     with raises(AvmsfError, file="nowhere"):
-        run(Options.parse(["farthest", "nowhere"]))
+        run_verb("evaluate", "farthest", "nowhere")
     assert sorted(path.name for path in plates.parent.iterdir()) == before
 
 
 @pytest.mark.parametrize("device", ["nothing", "meta"])
 def test_a_device_that_no_field_trains_on_is_refused_before_anything(device: str, plates: Path, tmp_path: Path) -> None:
     with raises(EvaluationError, name="device", value=device):
-        run(Options.parse(["farthest", str(plates), *CHEAP, "--device", device, "--output", str(tmp_path / "results")]))
+        run_verb("evaluate", "farthest", str(plates), *CHEAP, "--device", device, "--output", str(tmp_path / "results"))
     assert not (tmp_path / "results").exists()
 
 
@@ -130,7 +127,7 @@ def test_methods_train_on_the_device_that_is_asked_for(
 
     monkeypatch.setattr("avmsf.evaluation.field_methods.fit", stop)
     words = ["farthest", str(plates), "--methods", "field-auto", "--no-cdpam", "--device", "cpu"]
-    assert run(Options.parse([*words, "--output", str(tmp_path / "results")])) == 130
+    assert main(["evaluate", *words, "--output", str(tmp_path / "results")]) == 130
     assert asked == ["cpu"]
 
 
@@ -147,7 +144,7 @@ def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked
         raise FitError("left out")
 
     monkeypatch.setattr(FieldMethod, "fit", stop)
-    assert run(Options.parse([*words, "--time-zero", "peak"])) == 0
+    assert run_verb("evaluate", *words, "--time-zero", "peak") == 0
     assert "--time-zero" not in capsys.readouterr().err
     assert bool((heard[0][:, 0].abs() == heard[0].abs().amax(1)).all())
     # What peaks do to phases, no truth tells.
@@ -156,8 +153,8 @@ def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked
     assert "gain_error" not in summary["methods"]["knn-gains"]
     assert ResultsFolder(results).identity()["modes"] == {"kind": "ShortTime", **asdict(ShortTime(128))}
     with raises(EvaluationError, name="time_zero", value="peak"):
-        run(Options.parse(words))
-    assert run(Options.parse([*words[:-1], str(tmp_path / "others"), "--time-zero", "onset"])) == 0
+        run_verb("evaluate", *words)
+    assert run_verb("evaluate", *words[:-1], str(tmp_path / "others"), "--time-zero", "onset") == 0
     assert "--time-zero peak" in capsys.readouterr().err
     summary = json.loads((tmp_path / "others" / "summary.json").read_text())
     assert "gain_error" in summary["methods"]["knn-gains"]
@@ -165,10 +162,8 @@ def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked
 
 def test_no_figure_at_all_is_an_error(plates: Path, tmp_path: Path) -> None:
     with raises(AvmsfError, file=tmp_path / "r", name="failures", value=2):
-        run(
-            Options.parse(
-                ["farthest", str(plates), "--methods", "field", "--no-cdpam", "--output", str(tmp_path / "r")]
-            )
+        run_verb(
+            "evaluate", "farthest", str(plates), "--methods", "field", "--no-cdpam", "--output", str(tmp_path / "r")
         )
 
 
@@ -183,7 +178,7 @@ def test_ctrl_c_keeps_what_is_there(
     words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results")]
     with monkeypatch.context() as patched:
         patched.setattr(NearestRecording, "render", stop)
-        assert run(Options.parse(words)) == 130
+        assert main(["evaluate", *words]) == 130
     assert capsys.readouterr().err.splitlines()[-1].startswith("avmsf evaluate: interrupted")
     kept = json.loads((tmp_path / "results" / "objects" / "a.json").read_text())
     assert [each["method"] for each in kept["outcomes"]] == ["knn3"]
@@ -191,7 +186,7 @@ def test_ctrl_c_keeps_what_is_there(
     assert list(summary["methods"]) == ["knn3"]
     assert summary["missing"] == {"a": ["nearest", "white-noise"], "b": ["knn3", "nearest", "white-noise"]}
     assert "a (nearest, white-noise), b." in (tmp_path / "results" / "report.md").read_text().splitlines()[2]
-    assert run(Options.parse(words)) == 0
+    assert run_verb("evaluate", *words) == 0
     assert json.loads((tmp_path / "results" / "summary.json").read_text())["missing"] == {}
 
 
@@ -204,7 +199,7 @@ def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr("avmsf.evaluation.runner.run_objects", stop)
     words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--set", "body.wall=0"]
-    assert run(Options.parse([*words, "--set", "geometry=noisy"])) == 130
+    assert main(["evaluate", *words, "--set", "geometry=noisy"]) == 130
     inputs = asked[0].inputs
     assert (inputs.body.wall, inputs.geometry) == (0.0, "noisy")
     # Figures of another wall are not these.

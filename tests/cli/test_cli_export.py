@@ -15,7 +15,6 @@ import torch
 import trimesh
 
 from avmsf.cli import main
-from avmsf.cli.export import Options, run
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import AvmsfError, CaptureWarning
@@ -33,6 +32,7 @@ from factories.capture_folder import fill
 from factories.clouds import random_cloud
 from factories.demo_layout import read_arrays
 from factories.made_fields import BANK, SIDES, directional, positional, saved
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000.0, 1200
@@ -215,9 +215,7 @@ def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys
 
 
 def export(words: list[str]) -> None:
-    options = Options.parse(words)
-    options.check_inputs()
-    run(options)
+    run_verb("export", *words)
 
 
 def refused(words: list[str]) -> AvmsfError:

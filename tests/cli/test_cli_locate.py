@@ -12,7 +12,6 @@ import trimesh
 from torch import Tensor
 
 from avmsf.cli import main
-from avmsf.cli.locate import Options, run
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
@@ -22,6 +21,7 @@ from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from factories.made_fields import BANK, positional
 from factories.raising import raises
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000, 4000
@@ -68,7 +68,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
 
 
 def located(words: list[str], capsys: Streams) -> tuple[dict, str]:
-    assert run(Options.parse([*words, "--json"])) == 0
+    assert run_verb("locate", *words, "--json") == 0
     out, err = capsys.readouterr()
     return json.loads(out), err
 
@@ -140,7 +140,7 @@ def test_a_known_force_counts(place: Place, capsys: Streams) -> None:
     assert shares[1] == pytest.approx(shares[2], abs=0.05)
     assert len({round(share, 3) for share in shares}) > 1
     with raises(LocationError, name="force.expected", value=0.0):
-        run(Options.parse([place.field, hit, "--force", "0"]))
+        run_verb("locate", place.field, hit, "--force", "0")
 
 
 def test_another_rate_and_clipping_are_said(place: Place, capsys: Streams) -> None:
@@ -166,7 +166,7 @@ def test_recordings_without_a_blow_on_the_object_have_no_place(place: Place, tmp
         place.wav("other.wav", place.blow(STRUCK, bank=other)): "a mismatch ratio of",
     }
     for path, reason in cases.items():
-        assert run(Options.parse([place.field, path, "--json", "--output", str(tmp_path)])) == 2
+        assert run_verb("locate", place.field, path, "--json", "--output", str(tmp_path)) == 2
         out, err = capsys.readouterr()
         (values,) = json.loads(out)["impacts"]
         assert values["status"] == "not located"
@@ -196,7 +196,7 @@ def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path:
     noise = torch.randn(len(blow), generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     path = place.folder / "stereo.wav"
     soundfile.write(path, torch.stack([0.1 * noise, blow / blow.abs().max()], dim=1).numpy(), RATE, subtype="FLOAT")
-    assert run(Options.parse([place.field, str(path)])) == 2
+    assert run_verb("locate", place.field, str(path)) == 2
     assert "response_channel" in capsys.readouterr().out
     (tmp_path / "capture.toml").write_text("response_channel = 2\n")
     printed, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)
@@ -224,10 +224,6 @@ def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, c
         (hit, hit): ("again.wav", "a sound field"),
     }
     for words, parts in wrong.items():
-        try:
-            code = main(["locate", *words])
-        except SystemExit as left:
-            code = int(left.code or 0)
-        assert code == 2
+        assert main(["locate", *words]) == 2
         err = capsys.readouterr().err
         assert all(part in err for part in parts), err

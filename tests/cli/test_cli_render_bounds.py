@@ -21,7 +21,7 @@ def test_no_sound_that_is_not_finite_is_written(tmp_path: Path) -> None:
         sound = torch.zeros(100)
         sound[7] = value
         with raises(OutputError, file="x.wav", name="finite", value=1):
-            write_sound(tmp_path / "x.wav", sound, sample_rate=8000.0, coding="float32")
+            write_sound(tmp_path / "x.wav", sound, sample_rate=8000.0)
     assert not list(tmp_path.iterdir())
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from avmsf.cli.paths import OutputError
-from avmsf.cli.suggest import Options, run
 from avmsf.errors import FitError
 from avmsf.field.store import save
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.raising import raises
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 
@@ -25,7 +25,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, capsys: Streams) -> None:
-    assert run(Options.parse([str(field), "--count", "3", "--output", str(tmp_path / "next"), "--json"])) == 0
+    assert run_verb("suggest", str(field), "--count", "3", "--output", str(tmp_path / "next"), "--json") == 0
     out, err = capsys.readouterr()
     printed = json.loads(out)
     assert "uncertainty of the gains" in err
@@ -42,14 +42,14 @@ def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, cap
 
 def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
     with raises(FitError, name="count", value=0):
-        run(Options.parse([str(field), "--count", "0"]))
+        run_verb("suggest", str(field), "--count", "0")
     settings = tmp_path / "capture.toml"
     settings.write_text("")
     with raises(FitError, name="--settings"):
-        Options.parse([str(field), "--settings", str(settings)]).check_inputs()
+        run_verb("suggest", str(field), "--settings", str(settings))
     blocked = tmp_path / "file"
     blocked.write_text("")
     with raises(OutputError, file=blocked, value="file"):
-        Options.parse([str(field), "--output", str(blocked)]).check_inputs()
+        run_verb("suggest", str(field), "--output", str(blocked))
     with raises(FitError, name="--unseen"):
-        Options.parse([str(field), "--unseen", "--candidates", str(tmp_path)]).check_inputs()
+        run_verb("suggest", str(field), "--unseen", "--candidates", str(tmp_path))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli.paths import ExistingField, InputError
+from avmsf.cli.paths import Existing, InputError
 from avmsf.errors import SimulationError
 from avmsf.fem.material import material_named
 from avmsf.gaussians.ply_header import NEEDED
@@ -122,7 +122,7 @@ def test_the_field_that_a_folder_keeps_is_named(tmp_path: Path) -> None:
     for _ in range(2):
         (tmp_path / "bowl" / CACHE).mkdir(parents=True, exist_ok=True)
         with raises(InputError, file=folder, value="a folder") as caught:
-            ExistingField().check(folder)
+            Existing("a field", ("a sound field",)).check(folder)
         advice.append(str(caught.value))
         kept.touch()
     assert [str(kept) in each for each in advice] == [False, True]

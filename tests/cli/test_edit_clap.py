@@ -9,7 +9,6 @@ from test_cli_edit import PLACES, RATE, Echo, ceramic
 
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
-from avmsf.cli.edit import Options, run
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError
@@ -18,6 +17,7 @@ from avmsf.field.store import load, save
 from factories.made_clap import save_clap
 from factories.raising import raises
 from factories.settings import sets
+from factories.verbs import run_verb
 
 PROMPT = "a bell"
 QUICK = ("--prompt", PROMPT, "--model", "here", *sets("guide.steps=5 guide.contacts_per_step=2 guide.preview_every=2"))
@@ -40,7 +40,7 @@ def test_the_curve_is_stored_drawn_and_shown(
     drawn: dict[str, Figure] = {}
     monkeypatch.setattr("avmsf.cli.edit_report.save_picture", lambda figure, path: drawn.update({path.name: figure}))
     output, folder = tmp_path / "new.safetensors", tmp_path / "look"
-    assert run(Options.parse([*words, "--output", str(output), "--plots", str(folder)])) == 0
+    assert run_verb("edit", *words, "--output", str(output), "--plots", str(folder)) == 0
     new, clap = load(output), Clap.load(tmp_path / "clap")
     curve = new.origin.report[EDITS][-1]["clap"]
     assert curve["steps"] == [0, 2, 4, 5]
@@ -64,7 +64,7 @@ def test_an_interrupted_edit_has_the_whole_curve(
         found: dict = load(tmp_path / name).origin.report[EDITS][-1]["clap"]
         return found
 
-    assert run(Options.parse([*words, "--output", str(tmp_path / "whole.safetensors")])) == 0
+    assert run_verb("edit", *words, "--output", str(tmp_path / "whole.safetensors")) == 0
     shown = ProgressDisplay.step
 
     def impatient(bar: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
@@ -75,22 +75,22 @@ def test_an_interrupted_edit_has_the_whole_curve(
     part = [*words, "--output", str(tmp_path / "part.safetensors")]
     with monkeypatch.context() as patched:
         patched.setattr(ProgressDisplay, "step", impatient)
-        assert run(Options.parse(part)) == 130
+        assert main(["edit", *part]) == 130
     kept = tmp_path / "part.safetensors.clap.json"
     save_clap(tmp_path / "other", seed=1)
     with raises(AvmsfError, file="part.safetensors.clap.json", name="digest"):
-        run(Options.parse([*part, "--set", f"prompt.clap={tmp_path / 'other'}"]))
+        run_verb("edit", *part, "--set", f"prompt.clap={tmp_path / 'other'}")
     text = kept.read_text(encoding="utf-8")
     kept.write_text("{}", encoding="utf-8")
     with raises(AvmsfError, file="part.safetensors.clap.json", name=None):
-        run(Options.parse(part))
+        run_verb("edit", *part)
     kept.write_text(text, encoding="utf-8")
-    assert run(Options.parse(part)) == 0
+    assert run_verb("edit", *part) == 0
     assert report("part.safetensors") == report("whole.safetensors")
     assert not kept.exists()
     # Without a state to go on from, old scores are of another edit.
     kept.write_text(text, encoding="utf-8")
-    assert run(Options.parse([*part, "--set", "guide.preview_every=3"])) == 0
+    assert run_verb("edit", *part, "--set", "guide.preview_every=3") == 0
     assert report("part.safetensors")["steps"] == [0, 3, 5]
 
 
@@ -99,4 +99,4 @@ def test_scores_need_a_prompt_and_previews(name: str, given: tuple[str, str], tm
     save(ceramic(), tmp_path / "plate.safetensors")
     words = [str(tmp_path / "plate.safetensors"), "--output", str(tmp_path / "new.safetensors"), *given]
     with raises(AvmsfError, name=name):
-        Options.parse([*words, *sets("prompt.clap=x guide.preview_every=0")]).check_inputs()
+        run_verb("edit", *words, *sets("prompt.clap=x guide.preview_every=0"))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from avmsf.cli.evaluate import Options, run
 from avmsf.evaluation import report
 from avmsf.evaluation.results import ResultsFolder
 from factories.plate_set import RATE, fill_plates
+from factories.verbs import run_verb
 
 CHEAP = ("--methods", "knn3,nearest", "--no-cdpam")
 
@@ -17,7 +17,7 @@ CHEAP = ("--methods", "knn3,nearest", "--no-cdpam")
 def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plates, results = fill_plates(tmp_path / "plates", ("a", "b")), tmp_path / "results"
     words = ["farthest", str(plates), *CHEAP, "--output", str(results)]
-    assert run(Options.parse(words)) == 0
+    assert run_verb("evaluate", *words) == 0
     assert not (results / "figures").exists()
     drawn: dict[str, Figure] = {}
     save = report.save_picture
@@ -30,7 +30,7 @@ def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch
     monkeypatch.setattr(
         "avmsf.evaluation.case_run.CaseRun.outcome", lambda *_, **__: pytest.fail("a method was run again")
     )
-    assert run(Options.parse([*words, "--figures"])) == 0
+    assert run_verb("evaluate", *words, "--figures") == 0
     assert list(drawn) == ["a.png", "b.png"]
     for name, figure in drawn.items():
         assert (results / "figures" / name).read_bytes().startswith(b"\x89PNG")
@@ -49,7 +49,7 @@ def test_cases_have_a_figure_each_of_their_own_sounds(tmp_path: Path, monkeypatc
     drawn: dict[str, Figure] = {}
     monkeypatch.setattr(report, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
     plates, results = fill_plates(tmp_path / "plates", ("a",)), tmp_path / "results"
-    assert run(Options.parse(["shots", str(plates), *CHEAP, "--output", str(results), "--figures"])) == 0
+    assert run_verb("evaluate", "shots", str(plates), *CHEAP, "--output", str(results), "--figures") == 0
     assert sorted(drawn) == ["a 1-shot.png", "a 2-shots.png", "a 4-shots.png", "a 8-shots.png"]
     one, eight = (
         [axes.collections[0].get_array() for axes in drawn[name].axes[:3]] for name in ("a 1-shot.png", "a 8-shots.png")

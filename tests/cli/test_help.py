@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from avmsf.cli import RENAMED, main
-from avmsf.cli.common import Configured
 from avmsf.cli.edit import Options as EditOptions
 from avmsf.cli.evaluate import Options as EvaluateOptions
 from avmsf.cli.fit import Options as FitOptions
+from avmsf.cli.options import Configured
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
 from avmsf.simulate.recipe import named_recipe

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from avmsf.cli import main
-from avmsf.cli.printing import display
+from avmsf.cli.output import display
 from avmsf.cli.report import field_lines, outlier_words, quality_words
 from avmsf.errors import FieldFileError
 from avmsf.field.sound_field import Origin, SoundField

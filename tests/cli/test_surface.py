@@ -10,7 +10,6 @@ import torch
 import trimesh
 
 from avmsf.cli import main
-from avmsf.cli.fit import Options
 from avmsf.cli.info import gains_at
 from avmsf.cli.paths import OutputError
 from avmsf.errors import EvaluationError
@@ -22,6 +21,7 @@ from factories.believing_field import bar_contacts, drawn_gains, elastic_field, 
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.raising import raises
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 FIT = TINY[:-2]
@@ -66,7 +66,7 @@ def test_a_fit_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams
 
 def test_what_cannot_be_written_is_refused_first(tmp_path: Path, capsys: Streams) -> None:
     with raises(OutputError, name="suffix", value=".stl"):
-        Options.parse([str(tmp_path), "--until", "surface", "-o", str(tmp_path / "surface.stl")]).check_inputs()
+        run_verb("fit", str(tmp_path), "--until", "surface", "-o", str(tmp_path / "surface.stl"))
     assert main(["fit", str(tmp_path), "--until", "surface", "--output", str(tmp_path / "surface.obj")]) == 2
     assert "surface.obj" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -12,7 +12,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from avmsf.cli.contacts import Contacts, rows_of
-from avmsf.cli.locate import Options, run
 from avmsf.cli.paths import OutputError
 from avmsf.errors import CaptureError
 from avmsf.field.sound_field import Origin, SoundField
@@ -24,6 +23,7 @@ from avmsf.plotting.clouds import ALL_SIDES, view_from
 from avmsf.plotting.style import FIRST, SECOND
 from factories.made_fields import BANK, positional
 from factories.raising import raises
+from factories.verbs import run_verb
 
 RATE, SAMPLES, STRUCK, OTHER = 8000, 4000, 68, 102
 
@@ -55,7 +55,7 @@ def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
     figures: list[Figure] = []
     monkeypatch.setattr("avmsf.plotting.pictures.save_picture", lambda figure, path: figures.append(figure))
     true = [f"{value:.9g}" for value in points[OTHER].tolist()]
-    assert run(Options.parse([field, recording, "--output", str(tmp_path), "--true-contact", *true, "--json"])) == 0
+    assert run_verb("locate", field, recording, "--output", str(tmp_path), "--true-contact", *true, "--json") == 0
     results = json.loads(capsys.readouterr().out)
     assert results["summary"] is None
     (blow,) = results["impacts"]
@@ -94,7 +94,7 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_them(
     lines = [",".join([name, *(f"{1000 * value:.9g}" for value in place.tolist())]) for name, place in rows]
     table.write_text("\n".join(["file,x,y,z", *lines]))
     words = [field, *map(str, paths), "--true-contact-table", str(table), "--unit", "mm", "--json"]
-    assert run(Options.parse(words)) == 0
+    assert run_verb("locate", *words) == 0
     results = json.loads(capsys.readouterr().out)
     first, second, third = results["impacts"]
     distance = float((points[STRUCK] - points[OTHER]).norm())
@@ -103,7 +103,7 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_them(
     assert "error" not in third
     diagonal = float((points.amax(0) - points.amin(0)).norm())
     relative = 0.5 * distance / diagonal
-    wanted = {"impacts": 2, "median_error": 0.5 * distance, "rmed": relative, "rmed_posterior": relative}
+    wanted = {"impacts": 2, "training": 0, "median_error": 0.5 * distance, "rmed": relative, "rmed_posterior": relative}
     assert results["summary"] == pytest.approx({**wanted, "in_region": 0.5}, abs=1e-6)
 
 
@@ -116,7 +116,7 @@ def test_a_table_may_have_absolute_paths_and_any_format(
     table = tmp_path / "places.csv"
     place = ",".join(f"{value:.9g}" for value in points[STRUCK].tolist())
     table.write_text(f"file,x,y,z\n{sound},{place}\n")
-    assert run(Options.parse([field, str(sound), "--true-contact-table", str(table), "--json"])) == 0
+    assert run_verb("locate", field, str(sound), "--true-contact-table", str(table), "--json") == 0
     (impact,) = json.loads(capsys.readouterr().out)["impacts"]
     assert impact["error"] == pytest.approx(0.0, abs=1e-6)
 
@@ -146,25 +146,23 @@ def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
     table = tmp_path / "places.csv"
     table.write_text("x,y,z\n0,0,0\n")
     with raises(CaptureError, file=table, name="file"):
-        run(Options.parse([field, recording, "--true-contact-table", str(table)]))
+        run_verb("locate", field, recording, "--true-contact-table", str(table))
     table.write_text("tap,x_mm\n1,2\n")
     with raises(CaptureError, file=table, name="file", value=["tap", "x_mm"]) as caught:
-        run(Options.parse([field, recording, "--true-contact-table", str(table)]))
+        run_verb("locate", field, recording, "--true-contact-table", str(table))
     assert "tap, x_mm" in str(caught.value)
     table.write_text("x,y,z,file\n0,0,0\n")
     with raises(CaptureError, file=table, row=2, name="file"):
-        run(Options.parse([field, recording, "--true-contact-table", str(table)]))
+        run_verb("locate", field, recording, "--true-contact-table", str(table))
     table.write_text("file,x,y,z\nhit.wav,120,40,0\n")
     with raises(OutputError, file=table, row=2):
-        run(Options.parse([field, recording, "--true-contact-table", str(table)]))
+        run_verb("locate", field, recording, "--true-contact-table", str(table))
     with raises(OutputError, name="--true-contact"):
-        Options.parse(
-            [field, recording, "--true-contact-table", str(table), "--true-contact", "0", "0", "0"]
-        ).check_inputs()
+        run_verb("locate", field, recording, "--true-contact-table", str(table), "--true-contact", "0", "0", "0")
 
 
 @pytest.mark.parametrize("wrong", [("120", "40", "0"), (str(math.nan), "0", "0")])
 def test_a_contact_in_another_unit_is_refused(hit: tuple[str, str, torch.Tensor], wrong: tuple[str, ...]) -> None:
     field, recording, _ = hit
     with raises(OutputError, name="--true-contact", row=0):
-        run(Options.parse([field, recording, "--true-contact", *wrong]))
+        run_verb("locate", field, recording, "--true-contact", *wrong)

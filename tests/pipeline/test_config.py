@@ -10,7 +10,7 @@ import avmsf
 from avmsf.capture import Capture, CaptureSettings
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.modes import Options as ModesOptions
-from avmsf.errors import FitError, SceneError
+from avmsf.errors import AvmsfError, FitError, SceneError
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
@@ -95,7 +95,7 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
 
 
 def test_a_preset_that_there_is_not_is_refused() -> None:
-    with pytest.raises(SystemExit):
+    with raises(AvmsfError, name="fit"):
         FitOptions.parse(["mug", "--preset", "quick"])
 
 

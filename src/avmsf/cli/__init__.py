@@ -1,4 +1,11 @@
-"""The command `avmsf`: one module for each subcommand, and what they have in common."""
+"""The command `avmsf`: one module for each subcommand, and what they have in common.
+
+What goes in are words; what comes out are files, text on the standard error and results on the standard output, as
+tables for people or with `--json` as one object. Each module of a verb has `Options`, a frozen dataclass of which tyro
+makes the command line, and `run(options)`, which imports what computes, calls the package and prints: start reading
+with `render`. `options` parses and checks before anything is loaded, `settings` reads `--set` and `--config`, `paths`
+says what files and folders have to be, `output` prints.
+"""
 
 import _thread
 import os
@@ -14,11 +21,11 @@ from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
 from types import FrameType
-from typing import Any, TextIO
+from typing import Any
 
 import avmsf
 from avmsf._utils.text import printable
-from avmsf.cli.printing import display, print_json, say
+from avmsf.cli.output import display, print_json, say
 from avmsf.errors import NO_MEMORY, AvmsfError, AvmsfWarning, lacks_memory
 
 VERBS = {
@@ -45,26 +52,22 @@ RENAMED = {
     "splat": "fit --until gaussians",
     "surface": "fit --until surface",
     "reconstruct": "fit",
+    "train": "fit",
     "view-cloud": "info",
     "show": "info",
     "efficiency": "evaluate shots",
+    "learning": "evaluate shots",
     "help": "--help",
     "version": "--version",
     "-V": "--version",
 }
 """What does the work of verbs of earlier versions, and of words that other programs know."""
-CLOSED = 141
-"""The exit code that shells give a command whose output nobody reads any more."""
-INTERRUPTED = 130
-"""The exit code that shells give a command ended by Ctrl-C."""
-TERMINATED = 143
-"""The exit code that shells give a command ended by SIGTERM."""
 BAD_INPUT = 2
 """The exit code of input that cannot be used."""
+INTERRUPTED, CLOSED, TERMINATED = 130, 141, 143
+"""The exit codes that shells give a command ended by Ctrl-C, by the end of who reads its output, and by SIGTERM."""
 _COMMON = frozenset({"--quiet", "--verbose", "--json"})
 """Options that may also stand before the verb."""
-_OUTPUTS = ("output", "plots")
-"""Options that name what a verb writes."""
 _WIDEST = 120
 """Columns of the list of verbs, at most."""
 _AGAIN = 0.05
@@ -74,16 +77,20 @@ _AGAIN = 0.05
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C, 143 after SIGTERM.
 
-    Raises SystemExit, as command lines do, for a verb's help (0) and for options that cannot be understood (2).
+    Raises SystemExit(0), as command lines do, for a verb's help.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             # Python has no stream where the descriptor is closed, as by `>&-`; the next file would take its place.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
+    words = _verb_first(sys.argv[1:] if arguments is None else arguments)
+    before = display.quiet, display.verbose, display.json
+    display.json = "--json" in words
     try:
         try:
-            return _run(_verb_first(sys.argv[1:] if arguments is None else arguments))
+            return _run(words)
         finally:
+            display.quiet, display.verbose, display.json = before
             # What is still buffered would otherwise fail after the end of this function.
             sys.stdout.flush()
     except BrokenPipeError:
@@ -101,67 +108,50 @@ def _run(words: list[str]) -> int:
         return _explain(words)
     # Threads that wait actively for each other make many small sums several times slower where other programs run.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    name, goes_on = f"avmsf {words[0]}: ", ""
     with warnings.catch_warnings(), _interrupting() as received:
         try:
             # A verb imports what computes when it runs: help and mistakes are answered before torch is loaded.
             options = options_of(words[0], words[1:])
             options.check_inputs()
+            goes_on = "; repeat the command to continue" if options.resumes else ""
             display.quiet, display.verbose = options.quiet, options.verbose
-            verb = import_module(f"avmsf.cli.{words[0]}")
             _show_plainly()
             display.doing("loading")
-            paths = [path for name in _OUTPUTS if (path := getattr(options, name, None)) is not None]
-            for folder in dict.fromkeys(path.parent for path in paths if not path.parent.exists()):
-                say(f"creating folder {folder}")
-            code: int = verb.run(options)
-        except Exception as error:
-            if not isinstance(error, AvmsfError) and not lacks_memory(error):
-                raise
-            known = error if isinstance(error, AvmsfError) else AvmsfError(NO_MEMORY)
-            say(f"avmsf {words[0]}: {_sentence(known)}", always=True)
-            return _report_error(known, words)
-        except SystemExit as ending:
-            if ending.code == BAD_INPUT:
-                # Of options that cannot be understood, which the standard error has explained.
-                advice = f"see `avmsf {words[0]} --help`"
-                _report_error(
-                    AvmsfError.expected("options that can be read", got="others", name=words[0], advice=advice), words
-                )
-            raise
+            code: int = import_module(f"avmsf.cli.{words[0]}").run(options)
+            return code
         except KeyboardInterrupt:
-            say(f"avmsf {words[0]}: interrupted", always=True)
-            code = INTERRUPTED
+            say(f"{name}interrupted{goes_on}", always=True)
+            return TERMINATED if signal.SIGTERM in received else INTERRUPTED
+        except Exception as error:
+            if isinstance(error, AvmsfError):
+                return _fail(error, name)
+            if not lacks_memory(error):
+                raise
+            return _fail(AvmsfError(NO_MEMORY), name)
         finally:
             display.close()
-            display.quiet = display.verbose = False
-        return TERMINATED if code == INTERRUPTED and signal.SIGTERM in received else code
 
 
 def options_of(verb: str, words: Sequence[str]) -> Any:
-    """Return a verb's options that the words spell. Raises SystemExit for help and for words that are no options."""
+    """Return a verb's options that the words spell. Raises SystemExit for help, InputError for other words."""
     return import_module(f"avmsf.cli.{verb}").Options.parse(words)
 
 
-def _report_error(error: AvmsfError, words: Sequence[str]) -> int:
-    """Return the exit code of an error; where the words ask for JSON, print it as an object to the standard output."""
-    if "--json" in words:
-        print_json({"error": {"message": _sentence(error), **error.attributes}})
+def _fail(error: AvmsfError, place: str = "") -> int:
+    """Print an error on one line, and with --json as an object; return its exit code."""
+    message = printable(" ".join(str(error).split()))
+    say(f"{place}{message}", always=True)
+    print_json({"error": {"message": message, **error.attributes}})
     return BAD_INPUT
-
-
-def _sentence(error: AvmsfError) -> str:
-    """Return the message of an error on one line."""
-    return printable(" ".join(str(error).split()))
 
 
 @contextmanager
 def _interrupting() -> Iterator[list[int]]:
     """Let SIGTERM interrupt a verb as Ctrl-C does, and let neither be lost; yields the signals that have come.
 
-    Python raises KeyboardInterrupt wherever the main thread is. In a finalizer, or in a function that compiled code
-    calls back, it reports the exception and drops it; then the verb would go on, so it is raised once more.
-    A SIGTERM that the parent process has told this one to ignore stays ignored, and one that is handled outside of
-    Python stays handled there.
+    Python drops a KeyboardInterrupt in a finalizer, or in a function that compiled code calls back: it is raised once
+    more. A SIGTERM that is ignored, or handled outside of Python, stays so.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -212,42 +202,28 @@ def _explain(words: list[str]) -> int:
         given = None if words[0] in _COMMON else words[0]
         near = [RENAMED[words[0]]] if words[0] in RENAMED else get_close_matches(words[0], VERBS, n=1)
         advice = f"did you mean {near[0]}? `avmsf --help` lists all" if near else "`avmsf --help` lists all"
-        error = AvmsfError.expected("a command", given, name="avmsf", advice=advice)
-        print(_sentence(error), file=sys.stderr)
-        return _report_error(error, words)
+        return _fail(AvmsfError.expected("a command", given, name="avmsf", advice=advice))
     indent = max(map(len, VERBS)) + 4
     width = min(shutil.get_terminal_size().columns, _WIDEST)
-    rows = {**VERBS, "--help": "Print this list.", "--version": "Print the version."}
     print("usage: avmsf COMMAND [OPTIONS]\n")
     print("The sound of an impact anywhere on an object, from a few recordings.")
     print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.")
-    print("--quiet, --verbose and, but for demo, --json may stand before or after the command.\n")
-    separator = "\n" + " " * indent
-    for name, sentence in rows.items():
-        lines = textwrap.wrap(sentence, max(30, width - indent))
-        print(f"  {name:{indent - 2}}{separator.join(lines)}")
+    print("--quiet, --verbose and --json may stand before or after the command.\n")
+    for name, sentence in {**VERBS, "--help": "Print this list.", "--version": "Print the version."}.items():
+        print(textwrap.fill(sentence, width, initial_indent=f"  {name:{indent - 2}}", subsequent_indent=" " * indent))
     return 0
 
 
 def _show_plainly() -> None:
-    """Let what a user should know appear as a sentence, without Python's file, line and category."""
+    """Let what a user should know appear once, as a sentence, without Python's file, line and category."""
     others, shown = warnings.showwarning, set[str]()
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        if issubclass(category, AvmsfWarning):
-            if str(message) in shown:
-                return
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, AvmsfWarning):
+            others(message, category, *where, **more)
+        elif str(message) not in shown:
             shown.add(str(message))
             print(f"note: {printable(str(message))}", file=sys.stderr)
-        else:
-            others(message, category, filename, lineno, file, line)
 
     warnings.simplefilter("always", AvmsfWarning)
     warnings.showwarning = show

@@ -40,76 +40,71 @@ class AlignmentReport:
             return None
         left = [name for name, likely in zip(found.names, found.agreement.tolist(), strict=True) if likely < 0.5]
         delays = dict(zip(found.names, found.delays.tolist(), strict=True))
-        inverted = list(inverted_recordings(modes, impacts))
-        faults = rate_factors(modes, modes.aligned(impacts)), uneven_decay(modes, modes.aligned(impacts))
+        aligned, inverted = modes.aligned(impacts), list(inverted_recordings(modes, impacts))
+        faults = rate_factors(modes, aligned), uneven_decay(modes, aligned)
         levels = noise_drop(modes, impacts), gain_changes(impacts)
         return cls(found.coherence_before, found.coherence_after, delays, left, inverted, *faults, *levels)
 
     @property
-    def _moved(self) -> list[float]:
-        """The delays of the recordings that are aligned, samples."""
-        return [delay for name, delay in self.delays.items() if name not in self.not_aligned]
+    def doubtful(self) -> set[str]:
+        """The recordings that something is wrong with."""
+        return {*self.not_aligned, *self.inverted, *self.rate_factors, *self.gain_changes_db}
 
     def sentences(self) -> list[str]:
         """Return the faults of recordings, and how coherent the modes' phases are."""
-        return [*self.faults(), self._coherence(), *self._exceptions()]
+        delays = self._moved
+        if not delays:
+            return self.warnings()
+        how, after = "no delays make the modes' phases agree better than they do as read", ""
+        if any(delays):
+            how = f"delays of {min(delays):.2f} to {max(delays):.2f} samples align the recordings"
+            after = f", {self.coherence_after:.2f} aligned"
+        coherence = f"coherence {self.coherence_before:.2f} as read{after} (1 is one phase for each mode)"
+        return [*self.warnings(), f"{how}: {coherence}"]
 
     def warnings(self) -> list[str]:
-        """Return what is wrong alone."""
-        return [*self.faults(), *([] if self._moved else [self._coherence()]), *self._exceptions()]
-
-    def faults(self) -> list[str]:
-        """Return a sentence for each fault that recorders and editors make."""
-        sentences = [
+        """Return a sentence for each fault that recorders and editors make, and for recordings that are not aligned."""
+        found = [
             f"{name}: all its modes are {factor:.4g} times the others': it was recorded at {1 / factor:.4g} times the "
             "sample rate that its file gives; convert it from that rate, or remove its row"
             for name, factor in self.rate_factors.items()
         ]
-        sentences += [
+        found += [
             f"{name}: its noise and its sound are both about {abs(change):.0f} dB {'above' if change > 0 else 'below'} "
             "the others': another gain or scale; export it as the others, or record it again"
             for name, change in self.gain_changes_db.items()
         ]
         if self.uneven_decay_db is not None:
-            sentences.append(
+            found.append(
                 f"the sounds fall by {self.uneven_decay_db:.0f} dB more, within a twelfth of their length, than "
                 "vibrations do: a fade-out or a noise gate; export them without it, or write fewer seconds in "
                 "capture.toml"
             )
         if self.noise_drop_db is not None:
-            sentences.append(
+            found.append(
                 f"the noise is {self.noise_drop_db:.0f} dB louder before the impacts than after: an automatic gain "
                 "changes levels and decays; turn it off and record again"
             )
-        return sentences
-
-    def _coherence(self) -> str:
-        """Return how coherent the modes' phases are."""
-        moved = self._moved
-        if not moved:
-            return (
+        if not self._moved:
+            found.append(
                 f"the modes have no common phase (coherence {self.coherence_before:.2f}, 1 is one phase for each "
                 "mode): the recordings are not aligned. Check whether the sensor or the object was moved, and the "
                 "response channel"
             )
-        how = "no delays make the modes' phases agree better than they do as read"
-        coherence = f"coherence {self.coherence_before:.2f} as read"
-        if any(moved):
-            how = f"delays of {min(moved):.2f} to {max(moved):.2f} samples align the recordings"
-            coherence += f", {self.coherence_after:.2f} aligned"
-        return f"{how}: {coherence} (1 is one phase for each mode)"
-
-    def _exceptions(self) -> list[str]:
-        """Return which recordings are not aligned or have the opposite sign."""
-        found = []
-        if self.not_aligned and self._moved:
+            return found
+        if self.not_aligned:
             found.append(
                 f"not aligned: {listed(self.not_aligned, most=_SHOWN)}; the phases of their modes agree with those of "
                 "no other recording"
             )
-        if self.inverted and self._moved:
+        if self.inverted:
             found.append(
                 f"inverted polarity: {listed(self.inverted, most=_SHOWN)} have the opposite sign of the recordings "
                 "near them; check the cable and the file, or the direction in impacts.csv"
             )
         return found
+
+    @property
+    def _moved(self) -> list[float]:
+        """The delays of the recordings that are aligned, samples."""
+        return [delay for name, delay in self.delays.items() if name not in self.not_aligned]

@@ -10,9 +10,9 @@ import tyro
 from avmsf._utils.text import counted
 from avmsf.capture.settings import SETTINGS, TABLE, CaptureSettings
 from avmsf.capture.table import read_rows
-from avmsf.cli.common import Flag, Printing, read_settings
-from avmsf.cli.paths import Existing, SettingsFile
-from avmsf.cli.printing import decimals, doing, next_command, print_json, say, show, table
+from avmsf.cli.options import Common, Flag, read_settings
+from avmsf.cli.output import decimals, doing, next_command, print_json, say, show, table
+from avmsf.cli.paths import ContactData, Existing, SettingsFile
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import CaptureError, ExtractionError
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from avmsf.capture import CaptureReport, Impacts
     from avmsf.capture.proposals import Proposal
     from avmsf.cli.alignment import AlignmentReport
-    from avmsf.datasets import DatasetReport, ObjectReport
     from avmsf.modal.extraction.extract import Extraction
 
 UNREADABLE = 2
@@ -31,7 +30,7 @@ MAX_PRINTED = 1000
 
 
 @dataclass(frozen=True)
-class Options(Printing):
+class Options(Common):
     """Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.
 
     Prints one row per recording and the problems below. The peak is relative to full scale, the noise (root mean
@@ -51,9 +50,7 @@ class Options(Printing):
     write_settings: Flag = False
     """Write the proposed settings, with the reasons, to the folder's capture.toml, and check with them. An existing
     capture.toml is not changed."""
-    contact_data: Annotated[
-        Path | None, tyro.conf.arg(metavar="FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))
-    ] = None
+    contact_data: ContactData = None
     """ObjectFolder Real's contacts: SonicGauss's lists in a folder, or one of them."""
 
     @property
@@ -95,7 +92,7 @@ def run(options: Options) -> int:
     factor = next((each.value for each in outside if each.name == "unit"), None)
     proposals = propose_settings(options.capture, settings, factor=factor)
     if proposals and options.write_settings:
-        _write(options, proposals)
+        _write(options.capture, proposals)
         if any(each.key == "unit" for each in proposals):
             outside = [each for each in outside if each.name != "unit"]
     report, impacts = check_and_read(options.capture, settings)
@@ -108,48 +105,36 @@ def run(options: Options) -> int:
     problems += map(str, outside)
     lines = [_table(report, str(options.capture), aligned)] if report.recordings else []
     lines += [] if visual is None else [visual.sentence]
-    lines += [*_first(problems), *_settings_lines(options, proposals, bool(problems))]
-    if lines:
-        show("\n".join(lines), json=options.json)
-    if options.json:
-        print_json(
-            {
-                **asdict(report),
-                "visual_inputs": None if visual is None else asdict(visual),
-                "proposals": [asdict(each) for each in proposals],
-                "alignment": None if aligned is None else asdict(aligned),
-            }
-        )
+    lines += problems[:MAX_PRINTED]
+    if len(problems) > MAX_PRINTED:
+        lines.append(f"and {len(problems) - MAX_PRINTED} more; --json prints all")
+    if not options.write_settings:
+        lines += [f"proposed: {each.line} (--write-settings writes it). {each.reason}" for each in proposals]
+    elif not proposals:
+        left = "; settings that the messages above name are yours to choose" if problems else ""
+        lines.append(f"the folder's files determine no further setting: nothing was written{left}")
+    show("\n".join(lines))
+    print_json(
+        {
+            **asdict(report),
+            "visual_inputs": None if visual is None else asdict(visual),
+            "proposals": [asdict(each) for each in proposals],
+            "alignment": None if aligned is None else asdict(aligned),
+        }
+    )
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again", always=True)
         return UNREADABLE
     lines = [*report.remarks, *(aligned.sentences() if aligned else ())]
     if modes is None:
         lines = ["no mode was found to align the recordings: noisy or too short (see avmsf modes)"]
-    wrong = len(problems) + (modes is None)
-    if aligned is not None:
-        wrong += bool(aligned.not_aligned) + bool(aligned.inverted) + len(aligned.faults())
-    verdict = f"readable, with {counted(wrong, 'warning')}" if wrong else "no problem found"
-    show("\n".join([*lines, verdict]), json=options.json)
+    wrong = len(problems) + (modes is None) + (0 if aligned is None else len(aligned.warnings()))
+    show("\n".join([*lines, f"readable, with {counted(wrong, 'warning')}" if wrong else "no problem found"]))
     if visual is not None and visual.reconstructs:
         next_command("avmsf fit", options.capture, "-o field.safetensors")
     else:
         next_command("avmsf modes", options.capture)
     return 0
-
-
-def _first(problems: Sequence[str]) -> list[str]:
-    """Return the problems that are printed, and how many more there are."""
-    hidden = len(problems) - MAX_PRINTED
-    return [*problems[:MAX_PRINTED], *([f"and {hidden} more; --json prints all"] if hidden > 0 else [])]
-
-
-def _settings_lines(options: Options, proposals: "Sequence[Proposal]", has_problems: bool) -> list[str]:
-    """Return the proposed settings; with --write-settings, that there are none."""
-    if not options.write_settings:
-        return [f"proposed: {each.line} (--write-settings writes it). {each.reason}" for each in proposals]
-    left = "; settings that the messages above name are yours to choose" if has_problems else ""
-    return [] if proposals else [f"the folder's files determine no further setting: nothing was written{left}"]
 
 
 def _modes(impacts: "Impacts") -> "Extraction | None":
@@ -163,24 +148,24 @@ def _modes(impacts: "Impacts") -> "Extraction | None":
         return None
 
 
-def _write(options: Options, proposals: "Sequence[Proposal]") -> None:
+def _write(folder: Path, proposals: "Sequence[Proposal]") -> None:
     """Write the proposals and print them; raise `CaptureError` where they cannot be written."""
     from avmsf.capture.proposals import settings_text, write_settings
 
     try:
-        path = write_settings(options.capture, proposals)
+        path = write_settings(folder, proposals)
     except CaptureError:
-        show(settings_text(proposals), json=options.json)
+        show(settings_text(proposals))
         raise
-    show(f"{path}: written, with {', '.join(each.line for each in proposals)}", json=options.json)
+    show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
 
 
 def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None") -> str:
-    delays = {} if aligned is None else aligned.delays
-    left = [] if aligned is None else aligned.not_aligned
-    doubtful = [] if aligned is None else [*left, *aligned.inverted, *aligned.rate_factors, *aligned.gain_changes_db]
-    levels = ["peak (dBFS)", "noise (dB)"]
-    columns = ["recording", "state", "length (s)", "rate (Hz)", *levels, "clipped", "onset (s)", "second impact (s)"]
+    delays, left, doubtful = dict[str, float](), list[str](), set[str]()
+    if aligned is not None:
+        delays, left, doubtful = aligned.delays, aligned.not_aligned, aligned.doubtful
+    columns = ["recording", "state", "length (s)", "rate (Hz)", "peak (dBFS)", "noise (dB)"]
+    columns += ["clipped", "onset (s)", "second impact (s)", *(["delay (samples)"] if delays else [])]
     rows = [
         (
             row.file,
@@ -196,7 +181,7 @@ def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None
         )
         for row in report.recordings[:MAX_PRINTED]
     ]
-    return table(title, [*columns, "delay (samples)"] if delays else columns, rows, words=2)
+    return table(title, columns, rows, words=2)
 
 
 def _check_dataset(options: Options) -> int:
@@ -204,46 +189,24 @@ def _check_dataset(options: Options) -> int:
     from avmsf.datasets import open_dataset
 
     report = open_dataset(options.capture, contacts=options.contact_data).check()
-    lines = [_objects(report, f"{report.dataset} in {options.capture}"), *_lines(report)]
-    show("\n".join(lines), json=options.json)
-    if options.json:
-        print_json(asdict(report))
-    readable = sum(_readable(each) for each in report.objects)
+    rows, readable = [], 0
+    for each in report.objects:
+        facts, usable = each.facts, each.recordings >= 2
+        inferred, readable = " (inferred)" * facts.inferred, readable + usable
+        state = "unreadable" if not usable else "incomplete" if each.problems else "good"
+        name = "–" if facts.name == facts.identifier else facts.name + inferred
+        material = "–" if facts.material is None else facts.material + inferred
+        rows.append((facts.identifier, state, name, material, str(each.recordings)))
+    columns = ("object", "state", "name", "material", "recordings")
+    problems = [f"{each.facts.identifier}: {problem}" for each in report.objects for problem in each.problems]
+    lines = [f"missing: {part}" for part in report.missing] + problems + [f"note: {each}" for each in report.remarks]
+    show("\n".join([table(f"{report.dataset} in {options.capture}", columns, rows, words=4), *lines]))
+    print_json(asdict(report))
     if not readable:
-        say(
-            f"avmsf check: {options.capture}: expected a readable object, found none; fix the listed problems",
-            always=True,
-        )
+        wanted = "expected a readable object, found none; fix the listed problems"
+        say(f"avmsf check: {options.capture}: {wanted}", always=True)
         return UNREADABLE
-    objects = counted(len(report.objects), "object")
     recordings = counted(sum(each.recordings for each in report.objects), "recording")
-    show(f"{readable} of {objects} can be read, with {recordings}", json=options.json)
+    show(f"{readable} of {counted(len(report.objects), 'object')} can be read, with {recordings}")
     next_command("avmsf evaluate farthest", options.capture)
     return 0
-
-
-def _readable(report: "ObjectReport") -> bool:
-    return report.recordings >= 2
-
-
-def _lines(report: "DatasetReport") -> list[str]:
-    """Return what is not in the table, a line each: missing parts, then problems, then remarks."""
-    problems = [f"{each.facts.identifier}: {problem}" for each in report.objects for problem in each.problems]
-    return [*(f"missing: {part}" for part in report.missing), *problems, *(f"note: {each}" for each in report.remarks)]
-
-
-def _objects(report: "DatasetReport", title: str) -> str:
-    rows = []
-    for each in report.objects:
-        facts = each.facts
-        inferred = " (inferred)" * facts.inferred
-        rows.append(
-            (
-                facts.identifier,
-                "unreadable" if not _readable(each) else "incomplete" if each.problems else "good",
-                "–" if facts.name == facts.identifier else facts.name + inferred,
-                "–" if facts.material is None else facts.material + inferred,
-                str(each.recordings),
-            )
-        )
-    return table(title, ("object", "state", "name", "material", "recordings"), rows, words=4)

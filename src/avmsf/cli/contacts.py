@@ -1,4 +1,4 @@
-"""Contacts to render, from the command line or from a table, each with the name of its sound."""
+"""Contacts from the command line or from a table, each with the name of its sound."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +11,14 @@ from torch import Tensor
 
 from avmsf.capture.settings import METRES
 from avmsf.capture.table import DIRECTION, REQUIRED, Row, is_inside, read_table
-from avmsf.cli.common import Unit
+from avmsf.cli.options import Unit
+from avmsf.cli.output import note
 from avmsf.cli.paths import OutputError
-from avmsf.cli.printing import note
 from avmsf.errors import PositionError
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.sound_field import SoundField
+
+_Vectors = Sequence[tuple[float, float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +36,6 @@ class Contacts:
     table: Path | None = None
     lines: tuple[int, ...] = ()
     """Line of the table of each."""
-    unused: tuple[str, ...] = ()
-    """Columns of the table that say nothing of a contact."""
 
     def label(self, row: int) -> str:
         """Return where a user wrote a contact: the option, with its number if there are several, or file and row."""
@@ -45,46 +45,32 @@ class Contacts:
 
 
 def given_contacts(
-    places: Sequence[tuple[float, float, float]],
-    table: Path | None,
-    *,
-    unit: Unit,
-    directions: Sequence[tuple[float, float, float]] = (),
+    places: _Vectors, table: Path | None, *, unit: Unit, directions: _Vectors = (), option: str = "--position"
 ) -> Contacts:
-    """Return the contacts of --position and --direction, or those of a table, whose unused columns are noted."""
-    if table is None:
-        return contacts_at(places, meters=METRES[unit], directions=directions)
-    contacts = read_contacts(table, meters=METRES[unit])
-    if contacts.unused:
-        note(f"{table}: columns that are not used: {', '.join(contacts.unused)}")
-    return contacts
-
-
-def contacts_at(
-    places: Sequence[tuple[float, float, float]],
-    *,
-    meters: float,
-    directions: Sequence[tuple[float, float, float]] = (),
-) -> Contacts:
-    """Number the contacts that the command line gives, whose coordinates count `meters` each."""
+    """Return the contacts that an option gives, numbered, or those of a table."""
+    if table is not None:
+        return read_contacts(table, unit=unit)
     return Contacts(
-        torch.tensor(places, dtype=torch.float64).reshape(-1, 3) * meters,
+        torch.tensor(places, dtype=torch.float64).reshape(-1, 3) * METRES[unit],
         tuple(f"{number:03d}.wav" for number in range(1, len(places) + 1)),
         torch.tensor(directions, dtype=torch.float64) if directions else None,
+        option,
     )
 
 
-def read_contacts(path: Path, *, meters: float, recordings: bool = False) -> Contacts:
+def read_contacts(path: Path, *, unit: Unit, recordings: bool = False) -> Contacts:
     """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
-    Other columns are listed as `unused`. Sounds are named by the column `file`, else by number. By default they are
-    files to write in an output folder. With `recordings` they are files to read, in any folder, and every row must name
-    one. Raises `CaptureError` with the line at fault as `row`, counted from 1 with the header, as in all tables.
+    Sounds are named by the column `file`, else by number. By default they are files to write in an output folder, and
+    columns that are not used are noted. With `recordings` they are files to read, in any folder, and every row must
+    name one. Raises `CaptureError` with the line at fault as `row`, counted from 1 with the header, as in all tables.
     """
     file, *axes = REQUIRED
     required = (file, *axes) if recordings else axes
     advice = f"give one row for each impact, below the header {','.join(required)}"
     rows, unused = read_table(path, required, (file, *DIRECTION), advice=advice)
+    if unused and not recordings:
+        note(f"{path}: columns that are not used: {', '.join(unused)}")
     places = [[row.number(name) for name in axes] for row in rows]
     # A direction that is not given is zero.
     normals = [[row.number(name) if row.cells.get(name) else 0.0 for name in DIRECTION] for row in rows]
@@ -95,12 +81,11 @@ def read_contacts(path: Path, *, meters: float, recordings: bool = False) -> Con
             raise row.error("a name that no other row has", name, name=file)
         names.append(name)
     return Contacts(
-        torch.tensor(places, dtype=torch.float64) * meters,
+        torch.tensor(places, dtype=torch.float64) * METRES[unit],
         tuple(names),
         torch.tensor(normals, dtype=torch.float64) if np.any(normals) else None,
         table=path,
         lines=tuple(row.line for row in rows),
-        unused=tuple(unused),
     )
 
 
@@ -116,8 +101,11 @@ def rows_of(contacts: Contacts, recording: Path) -> list[int]:
     return [max(ends, key=lambda row: len(contacts.names[row]))] if ends else rows
 
 
-def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> None:
-    """Raise `OutputError` for a contact that is not on the object, see `expect_near`; `advice` ends its message."""
+def expect_on_object(contacts: Contacts, field: SoundField, *, advice: str = ", see --unit") -> None:
+    """Raise `OutputError` for a contact that is not on the object, see `expect_near`; `advice` ends its message.
+
+    Note how far the contacts are that are near it and off its surface, see `off_surface`.
+    """
     try:
         expect_near(contacts.places, field.gain_field.points, contacts.label)
     except PositionError as error:
@@ -128,13 +116,9 @@ def refuse_far(contacts: Contacts, field: SoundField, *, advice: str = "") -> No
             else {"file": contacts.table, "name": contacts.names[row], "row": contacts.lines[row]}
         )
         raise OutputError(f"{error}{advice}", **{**error.attributes, **where}) from error
-
-
-def note_off(contacts: Contacts, field: SoundField) -> None:
-    """Print a note for each contact that is not on the object's surface, with its distance, see `off_surface`."""
     for row, distance in off_surface(contacts.places, field.gain_field):
-        where = f"{1e3 * distance:.3g} mm off the object's surface"
-        note(f"{contacts.label(row)} is {where}; {off_surface_gains(field.gain_field)}")
+        where_off = f"{1e3 * distance:.3g} mm off the object's surface"
+        note(f"{contacts.label(row)} is {where_off}; {off_surface_gains(field.gain_field)}")
 
 
 def _wav_name(row: Row, *, anywhere: bool) -> str:

@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 
 from avmsf._utils.files import way_out
-from avmsf._utils.text import printable
-from avmsf.cli.common import Common
+from avmsf.cli.options import Common
+from avmsf.cli.output import say, show
 from avmsf.cli.paths import NewFolder, OutputError
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 
@@ -35,22 +35,19 @@ class Options(Common):
 
     A ceramic mug, made by `avmsf simulate example`: 48 photographs and 16 impacts. Gaussians are fitted to the
     photographs, and the mug's shape is reconstructed from both. A field is fitted to 12 of the impacts, which also
-    determine the thickness of the mug's wall, and tested on the other 4.
+    determine the thickness of the mug's wall, and tested on the other 4. With --json each command prints its object.
     """
 
     folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), NewFolder()]] = Path("demo")
     """Folder for all results, new, empty, or of an earlier or interrupted demo, which goes on from where it was."""
+    resumes = True
 
     def check_inputs(self) -> None:
         """Raise the package's errors for a folder that cannot be written or holds files that are not of a demo."""
         super().check_inputs()
         if self.folder.is_dir() and any(self.folder.iterdir()) and not (self.folder / BEGUN).is_dir():
-            raise OutputError.expected(
-                "a new or empty folder, or an earlier demo's",
-                "one with files",
-                file=self.folder,
-                advice="choose another",
-            )
+            wanted, advice = "a new or empty folder, or an earlier demo's", "choose another"
+            raise OutputError.expected(wanted, "one with files", file=self.folder, advice=advice)
 
 
 def run(options: Options) -> int:
@@ -67,15 +64,14 @@ def run(options: Options) -> int:
     except OSError as error:
         path, reason = error.filename or folder, error.strerror or str(error)
         raise OutputError.expected("a writable path", reason, file=path, advice=way_out(error)) from error
-    common = [f"--{name}" for name in ("quiet", "verbose") if getattr(options, name)]
+    common = [f"--{name}" for name in ("quiet", "verbose", "json") if getattr(options, name)]
     for command in COMMANDS:
         words = shlex.split(command.format(shlex.quote(str(folder))))
-        if not options.quiet:
-            print(f"\n$ avmsf {printable(shlex.join(words))}", flush=True)
+        say(f"\n$ avmsf {shlex.join(words)}")
         code = main([*words, *common])
         if code:
             return code
-    print(printable(closing_words(folder)))
+    show(closing_words(folder))
     return 0
 
 

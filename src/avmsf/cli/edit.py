@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from avmsf.cli import INTERRUPTED
-from avmsf.cli.common import Configured, expect_device
-from avmsf.cli.paths import NEW_TENSORS, FieldFile, NewFile, OutputError, PlotsFolder, expect_writable
-from avmsf.cli.printing import next_command, print_json, say, show
+from avmsf.cli.options import Configured, expect_device
+from avmsf.cli.output import doing, next_command, print_json, say, show
+from avmsf.cli.paths import FieldFile, NewFile, OutputError, PlotsFolder, arg
 from avmsf.cli.settings import with_settings
 from avmsf.editing.config import STABLE_AUDIO, EditSettings, MaterialSettings
 from avmsf.errors import EditError
@@ -20,9 +19,7 @@ if TYPE_CHECKING:
     from avmsf.field.sound_field import SoundField
 
 _Pairs = tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]]
-MODES, SPECTROGRAMS, BEFORE, AFTER = "modes.png", "spectrograms.png", "before.wav", "after.wav"
-CURVE = "clap.png"
-"""What the folder of pictures holds."""
+_MaterialName = Annotated[str | None, arg("MATERIAL")]
 
 
 @dataclass(frozen=True)
@@ -30,45 +27,44 @@ class Options(Configured):
     """Change a field's material, size, pitch or decay, or optimize it towards a text prompt or recordings.
 
     Material and size first, by the laws of linear modal analysis; then the modes; then the optimization towards one of
-    a prompt, recordings and the sound of a material, of which a preview is written next to the output while it runs.
-    Repeat an interrupted command to continue it to the same result. The pattern of each mode over the object stays, so
-    the edited field can be rendered and used for localization like any other.
+    --prompt, --like and --like-material, whose preview is next to the output while it runs. The pattern of each mode
+    over the object stays, so the edited field can be rendered and used for localization like any other.
     """
 
     field: tyro.conf.Positional[FieldFile]
     """Field file, as `avmsf fit` writes it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), NEW_TENSORS]
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), NewFile((".safetensors",))]
     """File to write the edited field to."""
-    to: Annotated[str | None, tyro.conf.arg(metavar="MATERIAL")] = None
+    to: _MaterialName = None
     """New material: ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
-    old: Annotated[str | None, tyro.conf.arg(name="from", metavar="MATERIAL")] = None
+    old: Annotated[str | None, arg("MATERIAL", name="from")] = None
     """Present material, by default estimated from the dampings."""
     scale: float = 1.0
-    """Lengths of the new object relative to the old one."""
+    """New lengths over old ones."""
     pitch: float = 1.0
     """Factor on all frequencies."""
     decay: float = 1.0
     """Factor on all decay times."""
     brightness: float = 0.0
-    """Tilt of the spectrum about its middle, dB per octave."""
-    mode_db: Annotated[_Pairs, tyro.conf.arg(metavar="HZ DB")] = ()
-    """Raise the mode at this frequency of the field as it was by so many dB; -inf mutes it."""
-    mode_pitch: Annotated[_Pairs, tyro.conf.arg(metavar="HZ FACTOR")] = ()
-    """Factor on the frequency of the mode at this frequency, in addition to --pitch."""
-    mode_decay: Annotated[_Pairs, tyro.conf.arg(metavar="HZ FACTOR")] = ()
-    """Factor on its decay time, in addition to --decay."""
-    prompt: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
-    """Text that describes the sound, for a text-to-audio model; needs the extra `text`."""
-    model: Annotated[str, tyro.conf.arg(metavar="FOLDER|NAME")] = STABLE_AUDIO
+    """Tilt of the spectrum, dB per octave."""
+    mode_db: Annotated[_Pairs, arg("HZ DB")] = ()
+    """Raise the mode at this frequency of the field as it was; -inf mutes."""
+    mode_pitch: Annotated[_Pairs, arg("HZ FACTOR")] = ()
+    """Factor on the frequency of the mode at this frequency."""
+    mode_decay: Annotated[_Pairs, arg("HZ FACTOR")] = ()
+    """Factor on the decay time of the mode at this frequency."""
+    prompt: Annotated[str | None, arg("TEXT")] = None
+    """Text that describes the sound; needs the extra `text`."""
+    model: Annotated[str, arg("FOLDER|NAME")] = STABLE_AUDIO
     """Stable Audio pipeline: a folder, or its name on the hub."""
-    like: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="WAV|FOLDER ...")] = ()
+    like: Annotated[tuple[Path, ...], arg("WAV|FOLDER ...")] = ()
     """Recordings of another object to imitate: files or folders."""
-    like_material: Annotated[str | None, tyro.conf.arg(metavar="MATERIAL")] = None
-    """Material to imitate statistically; --to follows the laws of elasticity exactly."""
+    like_material: _MaterialName = None
+    """Material to imitate statistically; --to follows the laws exactly."""
     plots: PlotsFolder = None
-    """Write modes.png, spectrograms.png, before.wav, after.wav, with prompt.clap also clap.png, to this folder."""
-    position: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Contact of these sounds on the object as it was, meters; by default where it is loudest."""
+    """Draw modes and spectrograms and write the sounds before and after to this folder."""
+    position: Annotated[tuple[float, float, float] | None, arg("X Y Z")] = None
+    """Contact of these sounds, meters; by default the loudest."""
 
     usual = EditSettings()
 
@@ -122,8 +118,6 @@ class Options(Configured):
         if self.output.exists() and self.field.exists() and self.output.samefile(self.field):
             wanted, advice = "another file than the field to edit", "choose another --output"
             raise OutputError.expected(wanted, got="the same", file=self.output, name="--output", advice=advice)
-        for name in (MODES, SPECTROGRAMS, BEFORE, AFTER, CURVE):
-            expect_writable(None if self.plots is None else self.plots / name)
 
     def _check_guide(self, settings: EditSettings) -> None:
         """Raise EditError for more than one guide, an empty prompt, and settings of a guide that is not given."""
@@ -145,7 +139,7 @@ class Options(Configured):
 
 
 def run(options: Options) -> int:
-    """Edit, write, and print the result; return 130 where Ctrl-C stopped it."""
+    """Edit, write, and print the result."""
     from avmsf.cli.edit_report import changes_table, contact_of_sounds, draw, mode_changes, notes_on
     from avmsf.editing.modal_edit import EDITS, silenced
     from avmsf.field.store import load, save
@@ -153,35 +147,28 @@ def run(options: Options) -> int:
 
     old = load(options.field)
     contact = contact_of_sounds(old, options.position)
-    try:
-        new = _edited(options, old)
-    except KeyboardInterrupt:
-        kept = options.part("checkpoint")
-        where = f"from {kept}, or delete it" if kept.exists() else "from the start"
-        say(f"avmsf edit: interrupted; run the same command again to continue {where}", always=True)
-        return INTERRUPTED
+    new = _edited(options, old)
     save(new, options.output)
     for ending in ("checkpoint", "preview.wav", "clap.json") if options.guides else ():
         options.part(ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = ModeLevels.of(old), ModeLevels.of(new)
     rows = mode_changes(before, after)
-    notes = notes_on(options, edits, new, before, after)
-    show("\n".join([changes_table(rows, before, after), *(f"note: {each}" for each in notes)]), json=options.json)
+    notes = [f"note: {each}" for each in notes_on(edits, new, before, after, scale=options.scale)]
+    show("\n".join([changes_table(rows, before, after), *notes]))
     if options.plots is not None:
         draw(options.plots, (old, contact), (new, options.scale * contact), edits[-1])
-    show(f"wrote {options.output}", json=options.json)
-    if options.json:
-        print_json(
-            {
-                "field": str(options.field),
-                "output": str(options.output),
-                "capture": new.origin.capture,
-                "edits": edits,
-                "silent_modes": int(silenced(new).sum()),
-                "modes": rows,
-            }
-        )
+    show(f"wrote {options.output}")
+    print_json(
+        {
+            "field": str(options.field),
+            "output": str(options.output),
+            "capture": new.origin.capture,
+            "edits": edits,
+            "silent_modes": int(silenced(new).sum()),
+            "modes": rows,
+        }
+    )
     next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
     return 0
 
@@ -191,28 +178,23 @@ def _edited(options: Options, field: "SoundField") -> "SoundField":
     from avmsf.editing.material import LAWS, edit, infer_material
 
     settings = options.all_settings
+    new = None if options.to is None else material_named(options.to)
     old: Material | None = None
     target: Material | None = None
-    if options.changes_material or options.like_material is not None:
-        new = None if options.to is None else material_named(options.to)
-        if options.old is not None:
-            old = material_named(options.old)
-        else:
-            old, words = infer_material(field, option="--from", new=new)
-            say(words)
-    if options.changes_material and old is not None:
-        target = old if options.to is None else material_named(options.to)
-        if constants := settings.material.constants:
+    if options.old is not None:
+        old = material_named(options.old)
+    elif options.changes_material or options.like_material is not None:
+        old, words = infer_material(field, option="--from", new=new)
+        say(words)
+    if options.changes_material:
+        target = new or old
+        if target is not None and (constants := settings.material.constants):
             target = replace(target, name=f"{target.name} with {', '.join(constants)} changed", **constants)
     if options.changes_material or options.changes_modes:
         adjusted = _adjustments(options, field) if options.changes_modes else dict[str, Any]()
         law = LAWS[settings.material.law]
         field = edit(field, material=target, old_material=old, size=options.scale, law=law, **adjusted)
-    if not options.guides:
-        return field
-    from avmsf.cli.guided_edit import edit_by_guide
-
-    return edit_by_guide(options, field, target or old)
+    return _guided(options, field, target or old) if options.guides else field
 
 
 def _adjustments(options: Options, field: "SoundField") -> dict[str, Any]:
@@ -221,13 +203,77 @@ def _adjustments(options: Options, field: "SoundField") -> dict[str, Any]:
 
     from avmsf.editing.modal_edit import mode_at
 
-    bank = field.bank
-    levels = torch.zeros(len(bank), dtype=torch.float64)
+    levels = torch.zeros(len(field.bank), dtype=torch.float64)
     pitch, decay = torch.full_like(levels, options.pitch), torch.full_like(levels, options.decay)
     for frequency, level in options.mode_db:
-        levels[mode_at(bank, frequency, option="--mode-db")] += level
+        levels[mode_at(field.bank, frequency, option="--mode-db")] += level
     for frequency, factor in options.mode_pitch:
-        pitch[mode_at(bank, frequency, option="--mode-pitch")] *= factor
+        pitch[mode_at(field.bank, frequency, option="--mode-pitch")] *= factor
     for frequency, factor in options.mode_decay:
-        decay[mode_at(bank, frequency, option="--mode-decay")] *= factor
+        decay[mode_at(field.bank, frequency, option="--mode-decay")] *= factor
     return {"pitch": pitch, "decay": decay, "brightness_db": options.brightness, "gains_db": levels}
+
+
+def _guided(options: Options, field: "SoundField", old: Material | None) -> "SoundField":
+    """Return the field edited towards a prompt, recordings, or the sound of a material.
+
+    State and preview are written next to the output, so that the same command continues to the same result. `old` is
+    the field's material, needed only for `like_material`.
+    """
+    from avmsf._utils.text import format_number
+    from avmsf.cli.output import display
+    from avmsf.cli.writing import peak_factor, write_sound
+    from avmsf.editing.guided import PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
+    from avmsf.editing.reference import Reference
+    from avmsf.evaluation.clap import Clap, ClapCurve
+
+    settings, preview, checkpoint = options.all_settings, options.part("preview.wav"), options.part("checkpoint")
+    curve: ClapCurve | None = None
+    if settings.prompt.clap is not None and options.prompt is not None:
+        clap, kept = Clap.load(settings.prompt.clap), options.part("clap.json")
+        curve = ClapCurve(clap, options.prompt, field, kept, resumed=checkpoint.exists())
+    # After CLAP: a wrong name of its network is refused before the large model is loaded.
+    guide: Guide
+    if options.prompt is not None:
+        guide = _prompted(options.prompt, options, field.sample_rate)
+    elif options.like_material is not None:
+        assert old is not None
+        guide = Reference.of_material(field, old, material_named(options.like_material), seed=settings.guide.seed)
+    else:
+        guide = Reference.read(options.like, sample_rate=field.sample_rate)
+
+    def progress(reached: GuidedEditProgress) -> None:
+        if curve is not None:
+            curve.add(reached)
+        message = f"loss {format_number(reached.loss)}, pitch x {format_number(reached.pitch, 4)}"
+        if reached.preview is not None:
+            sound = peak_factor(reached.preview[None]) * reached.preview
+            write_sound(preview, sound, sample_rate=field.sample_rate)
+            say(f"edit: step {reached.step} of {reached.steps}, {message}; preview in {preview}")
+        display.step("edit", reached.step, reached.steps, message)
+
+    edited = edit_towards(
+        field, guide, config=settings.guide, parameters=PARAMETERIZATIONS[settings.parameters], progress=progress,
+        checkpoint=checkpoint,
+    )  # fmt: skip
+    return edited if curve is None else curve.recorded_in(edited)
+
+
+def _prompted(prompt: str, options: Options, sample_rate: float) -> Any:
+    """Return the guide by a text; write the sound of the text alone where that is asked for."""
+    from avmsf.cli.writing import write_sound
+    from avmsf.editing.distillation import DecoderDistillation
+    from avmsf.editing.stable_audio import StableAudio
+
+    settings = options.all_settings.prompt
+    doing(f"loading {options.model}")
+    model = StableAudio.load(options.model, seconds=settings.model_seconds, device=settings.device)
+    if settings.generated is not None:
+        # Seconds of a sound that is generated from a prompt only.
+        seconds = 3.0 if settings.model_seconds is None else settings.model_seconds
+        seed = options.all_settings.guide.seed
+        made = model.generate(prompt, seconds=seconds, seed=seed, negative=settings.negative)
+        write_sound(settings.generated, made, sample_rate=model.sample_rate)
+    return DecoderDistillation(
+        model, prompt, sample_rate=sample_rate, negative=settings.negative, config=settings.distillation
+    )

@@ -9,10 +9,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
-from avmsf.cli.contacts import contacts_at, refuse_far
-from avmsf.cli.edit import AFTER, BEFORE, CURVE, MODES, SPECTROGRAMS, Options
-from avmsf.cli.printing import MAX_LISTED_MODES, decimals, say, table
-from avmsf.cli.writing import Level, write_sound
+from avmsf.cli.contacts import expect_on_object, given_contacts
+from avmsf.cli.output import decimals, say, table
+from avmsf.cli.report import MAX_LISTED_MODES
+from avmsf.cli.writing import peak_factor, write_sound
 from avmsf.editing.modal_edit import remarks
 from avmsf.evaluation.clap import CLAP
 from avmsf.field.sound_field import SoundField
@@ -30,19 +30,16 @@ _FieldAt = tuple[SoundField, Float64[Tensor, " 3"]]
 
 def mode_changes(before: ModeLevels, after: ModeLevels) -> list[dict[str, Any]]:
     """Return what became of each mode, in the field's order."""
-    change = 20.0 * (after.size / before.size).log10()
-    columns = (before.frequency, after.frequency, before.t60, after.t60, change)
-    names = ("frequency_before", "frequency_after", "t60_before", "t60_after", "level_change_db")
-    return [
-        {**dict(zip(names, row, strict=True)), "silent": size == 0.0}
-        for *row, size in zip(*(column.tolist() for column in columns), after.size.tolist(), strict=True)
-    ]
-
-
-def _change(row: dict[str, Any]) -> str:
-    if row["silent"]:
-        return "silent"
-    return decimals(row["level_change_db"], 1) if math.isfinite(row["level_change_db"]) else "back"
+    columns = {
+        "frequency_before": before.frequency,
+        "frequency_after": after.frequency,
+        "t60_before": before.t60,
+        "t60_after": after.t60,
+        "level_change_db": 20.0 * (after.size / before.size).log10(),
+        "silent": after.size == 0.0,
+    }
+    cells = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in cells]
 
 
 def changes_table(rows: list[dict[str, Any]], before: ModeLevels, after: ModeLevels) -> str:
@@ -51,8 +48,10 @@ def changes_table(rows: list[dict[str, Any]], before: ModeLevels, after: ModeLev
     listed = energy.argsort(descending=True)[:MAX_LISTED_MODES].sort().values.tolist()
     cells = []
     for row in (rows[place] for place in listed):
+        change = row["level_change_db"]
+        level = "silent" if row["silent"] else decimals(change, 1) if math.isfinite(change) else "back"
         frequencies = [format_number(row[f"frequency_{when}"], 5) for when in ("before", "after")]
-        cells.append([*frequencies, *(format_number(row[f"t60_{when}"]) for when in ("before", "after")), _change(row)])
+        cells.append([*frequencies, *(format_number(row[f"t60_{when}"]) for when in ("before", "after")), level])
     title = f"the {MAX_LISTED_MODES} modes of most energy among {len(rows)}"
     if len(rows) <= MAX_LISTED_MODES:
         title = counted(len(rows), "mode")
@@ -61,7 +60,7 @@ def changes_table(rows: list[dict[str, Any]], before: ModeLevels, after: ModeLev
 
 
 def notes_on(
-    options: Options, edits: list[dict[str, Any]], new: SoundField, before: ModeLevels, after: ModeLevels
+    edits: list[dict[str, Any]], new: SoundField, before: ModeLevels, after: ModeLevels, *, scale: float
 ) -> list[str]:
     """Return what a user of an edited field should know."""
     notes = [*remarks(edits, new)]
@@ -71,8 +70,8 @@ def notes_on(
             f"the longest T60 is {format_number(ringing)} s and rendered sounds last {format_number(seconds)} s; "
             f"render and export with --seconds {math.ceil(10 * ringing) / 10:g}"
         )
-    if options.scale != 1.0:
-        notes.append(f"positions on the edited object are {options.scale:g} times as large")
+    if scale != 1.0:
+        notes.append(f"positions on the edited object are {scale:g} times as large")
     softer = before.total_db - after.total_db
     if _LOUD_NOISE_DB < softer < math.inf and bool(new.residual.magnitude.any()):
         notes.append(
@@ -85,9 +84,9 @@ def notes_on(
 def contact_of_sounds(field: SoundField, at: tuple[float, float, float] | None) -> Float64[Tensor, " 3"]:
     """Return the contact of the sounds: the requested one, or the loudest of some."""
     if at is not None:
-        chosen = contacts_at([at], meters=1.0)
-        refuse_far(chosen, field, advice=", in meters")
-        return chosen.places[0].double()
+        chosen = given_contacts([at], None, unit="m")
+        expect_on_object(chosen, field, advice=", in meters")
+        return chosen.places[0]
     points = field.gain_field.points
     some = points[:: max(1, len(points) // _CANDIDATES)]
     energy = (field.known(some).power * field.audible / field.bank.damping).sum(1)
@@ -99,9 +98,10 @@ def draw(folder: Path, before: _FieldAt, after: _FieldAt, last: dict[str, Any]) 
     old, new = before[0], after[0]
     name, rate = old.origin.capture or "field", old.sample_rate
     sounds = torch.cat([field.render(place[None]) for field, place in (before, after)])
+    levels = ModeLevels.of(old), ModeLevels.of(new)
     pictures = {
-        MODES: draw_edit(ModeLevels.of(old), ModeLevels.of(new), sample_rate=rate, title=f"modes of {name}, edited"),
-        SPECTROGRAMS: draw_spectrograms(
+        "modes.png": draw_edit(*levels, sample_rate=rate, title=f"modes of {name}, edited"),
+        "spectrograms.png": draw_spectrograms(
             *sounds[:, None],
             sample_rate=rate,
             names=[""],
@@ -112,10 +112,10 @@ def draw(folder: Path, before: _FieldAt, after: _FieldAt, last: dict[str, Any]) 
     }
     if CLAP in last:
         curve = list(zip(last[CLAP]["steps"], last[CLAP]["scores"], strict=True))
-        pictures[CURVE] = draw_clap_curves({last["parameters"]: [curve]}, title=f"CLAP score: {last['prompt']}")
+        pictures["clap.png"] = draw_clap_curves({last["parameters"]: [curve]}, title=f"CLAP score: {last['prompt']}")
     for each, picture in pictures.items():
         save_picture(picture, folder / each)
-    factor = Level("peak", -1.0).factor(sounds)
-    for each, sound in zip((BEFORE, AFTER), sounds, strict=True):
-        write_sound(folder / each, factor * sound, sample_rate=rate, coding="float32")
-    say(f"wrote {', '.join((*pictures, BEFORE, AFTER))} in {folder}")
+    wavs = dict(zip(("before.wav", "after.wav"), peak_factor(sounds) * sounds, strict=True))
+    for each, sound in wavs.items():
+        write_sound(folder / each, sound, sample_rate=rate)
+    say(f"wrote {', '.join((*pictures, *wavs))} in {folder}")

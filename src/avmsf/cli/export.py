@@ -1,6 +1,5 @@
 """`avmsf export`: a field in the formats of other tools."""
 
-import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -13,12 +12,11 @@ import tyro
 from avmsf._utils.text import counted, format_number
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
-from avmsf.cli.common import Flag, Printing, Unit, option_of
-from avmsf.cli.paths import ContactTable, Existing, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
-from avmsf.cli.printing import next_step, note, print_result
+from avmsf.cli.options import Common, Flag, Int, Number, Unit, option_of
+from avmsf.cli.output import next_step, note, print_result
+from avmsf.cli.paths import ContactTable, FieldFile, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
 from avmsf.errors import ExportError
-from avmsf.export.writing import SUFFIXES, Axis, Format, Precision, check_free
-from avmsf.field.header import FIELD
+from avmsf.export.writing import POINTS, SUFFIXES, Axis, Format, Precision, check_free
 from avmsf.modal.config import PulseShape
 from avmsf.pipeline.config import CACHE, SURFACE
 
@@ -41,96 +39,90 @@ _USED: dict[Format, tuple[str, ...]] = {
     "uff": ("functions", *_CONTACTS),
 }
 """Options that each format uses, in addition to those that all use."""
-CHOOSING = frozenset(name for name, used in _USED.items() if "position" in used)
-"""Formats whose contacts can be given."""
+_NEXT: dict[str, str] = {
+    **dict.fromkeys(SUFFIXES["web"], "open {0} in a browser"),
+    "web": "python -m http.server --directory {0}, then open http://localhost:8000 in a browser",
+    "gltf": "open {0} in a glTF viewer",
+    ".lib": 'in a Faust program beside it: library("{1}").strike(contact, force, contactTime, gate)',
+    "faust": "open {0} in the Faust IDE (https://faustide.grame.fr), or compile it: faust2jack {0}",
+    "wavs": "load {0}/instrument.sfz in a sampler that reads SFZ",
+    "uff": "open {0} in a program for modal analysis",
+    "avmsf-demo": "open {0} in the paper's web demo",
+}
+"""What to do with the files of a suffix or a format, of the quoted path and of the file's name."""
 _DEAD_DB = 40.0
 """Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""
-_OF_SOME = {name for used in _USED.values() for name in used}
 
 
 @dataclass(frozen=True)
-class Options(Printing):
+class Options(Common):
     """Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.
 
-    web: a page that plays impacts on the object, as a folder for any static host or as one .html file. gltf: a .glb
-    that any viewer shows, with the draft extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib
-    without. avmsf-demo: the layout of the paper's own demo. wavs: sounds with a table and an SFZ instrument, for
-    samplers. uff: the universal file format, for modal analysis. What a format cannot hold is printed.
+    web: a page that plays impacts, as a folder or one .html file. gltf: a .glb that any viewer shows, with the draft
+    extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib. wavs: sounds with a table and an SFZ
+    instrument. uff: the universal file format. avmsf-demo: the layout of the paper's demo.
     """
 
-    field: tyro.conf.Positional[
-        Annotated[
-            Path,
-            tyro.conf.arg(metavar="FIELD"),
-            Existing("a sound field, as avmsf fit writes it", ("a sound field",)),
-        ]
-    ]
+    field: tyro.conf.Positional[FieldFile]
     """Field file, as `avmsf fit` writes it."""
     to: Format
     """Format to write."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
-    """A folder, or a file for gltf (.glb), faust (.dsp, .lib), uff (.uff) or a page in one file (.html)."""
+    """A folder, or a file (.html, .glb, .dsp, .lib, .uff)."""
     object: ShapeFile = None
-    """Mesh, or Gaussians as a .ply, to show; by default the capture's, else the field's body, else points."""
+    """Mesh or Gaussians to show; by default the capture's or the body."""
     object_unit: Unit = "m"
-    """Unit of the coordinates of the object's mesh."""
+    """Unit of the object's mesh."""
     capture: OtherCapture = None
-    """Capture folder: its mesh is shown, and a page offers its recordings."""
-    contacts: int | None = None
-    """Maximum number of contacts, spread over the object; by default as many as the format's tools read easily."""
+    """Capture: its mesh is shown, and a page plays its recordings."""
+    contacts: Int = None
+    """Maximum number of contacts, spread over the object."""
     position: PositionList = ()
-    """faust, gltf, uff, wavs: a contact in the object's frame, in place of these; once per contact."""
+    """faust, gltf, uff, wavs: a contact in place of these; once for each."""
     contact_table: ContactTable = None
-    """Table of such contacts: x,y,z, and nx,ny,nz for directions, such as impacts.csv."""
+    """Table of such contacts: x,y,z and perhaps nx,ny,nz."""
     unit: Unit = "m"
     """Unit of --position and --contact-table."""
     overwrite: Flag = False
-    """Replace a file, or the folder of an earlier export, that exists."""
+    """Replace a file, or the folder of an earlier export."""
     forces: tuple[float, ...] = (1.0,)
-    """wavs: forces of the layers, newtons if the field knows forces, else relative."""
-    contact_times: tuple[float, ...] = ()
-    """wavs: contact time of each layer's hammer, seconds; 0 as recorded; by default by Hertz's law."""
-    seconds: float | None = None
-    """wavs: length of the sounds; by default that of the training sounds."""
+    """wavs: force of each layer, newtons if known, else relative."""
+    contact_times: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SECONDS ...", help_behavior_hint="")] = ()
+    """wavs: of each layer's hammer; 0 as recorded; by default by Hertz's law."""
+    seconds: Number = None
+    """wavs: length; by default that of the training sounds."""
     pulse: PulseShape = "half-sine"
-    """wavs: force over the contact time, as in `avmsf render`."""
+    """wavs: force over the contact time."""
     up: Axis = "z"
     """gltf: axis of the object's frame that points up."""
     no_noise: Flag = False
     """faust, wavs: write the modes without the residual noise."""
     functions: int = 16
-    """uff: points whose frequency response functions are written in addition to the mode shapes."""
+    """uff: points with frequency response functions."""
     variant: Annotated[str, tyro.conf.arg(metavar="NAME")] = "original"
-    """avmsf-demo: name of the sound among those of one object."""
+    """avmsf-demo: name of the sound of this object."""
     precision: Precision = "float32"
     """avmsf-demo: number format of the gains."""
 
     @property
     def contacts_given(self) -> bool:
         """Whether the contacts are given, and used by the format."""
-        return self.to in CHOOSING and bool(self.position or self.contact_table)
+        return "position" in _USED[self.to] and bool(self.position or self.contact_table)
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         given = sum((bool(self.position), self.contact_table is not None, self.contacts is not None))
         if self.contacts_given and given > 1:
-            raise ExportError.expected(
-                "contacts by one of --position, --contact-table and --contacts",
-                given,
-                name="--position" if self.position else "--contact-table",
-                advice="leave out the others",
-            )
-        for row, place in enumerate(self.position):
-            if not all(map(math.isfinite, place)):
-                raise ExportError.expected("finite coordinates", list(place), row=row, name="--position")
+            wanted, advice = "contacts by one of --position, --contact-table and --contacts", "leave out the others"
+            name = "--position" if self.position else "--contact-table"
+            raise ExportError.expected(wanted, given, name=name, advice=advice)
         if self.contacts is not None and self.contacts < 1:
             raise ExportError.expected("1 or more", self.contacts, name="--contacts")
         # A web page is a file or, by a name without its suffix, a folder.
         suffixes = SUFFIXES.get(self.to, ())
         (NewFile(suffixes, or_folder=self.to == "web") if suffixes else NewFolder()).check(self.output)
         check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
-        FIELD.read_record(self.field)
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> "Options":
@@ -140,17 +132,6 @@ class Options(Printing):
         return super().parse(words)
 
 
-def unused_options(options: Options) -> list[str]:
-    """Return a sentence for each given option that the format does not use."""
-    used = _USED[options.to]
-    sentences = []
-    for each in fields(options):
-        if each.name in _OF_SOME and each.name not in used and getattr(options, each.name) != each.default:
-            others = ", ".join(name for name, known in _USED.items() if each.name in known)
-            sentences.append(f"{option_of(each.name)} is not used by --to {options.to}, only by {others}")
-    return sentences
-
-
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
     from avmsf.export.faust import contacts_path
@@ -158,10 +139,11 @@ def run(options: Options) -> int:
     from avmsf.export.write import WRITERS
     from avmsf.field.store import load
 
-    for sentence in unused_options(options):
-        note(sentence)
-    field = load(options.field)
-    source, settings = _prepare(field, options)
+    for each in fields(options):
+        users = [name for name, used in _USED.items() if each.name in used]
+        if users and options.to not in users and getattr(options, each.name) != each.default:
+            note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
+    source, settings = _prepared(load(options.field), options)
     written: Written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
     for remark in written.remarks:
         note(remark)
@@ -185,46 +167,21 @@ def run(options: Options) -> int:
     if options.to == "wavs":
         values["instrument"] = str(options.output / INSTRUMENT)
     elif options.to == "faust":
-        contacts = contacts_path(options.output)
-        text += f"; {contacts} has the coordinates of each contact"
-        values["contacts"] = str(contacts)
-    print_result(text, values, json=options.json)
-    next_step(_following(options))
+        values["contacts"] = str(contacts_path(options.output))
+        text += f"; {values['contacts']} has the coordinates of each contact"
+    print_result(text, values)
+    following = _NEXT.get(options.output.suffix.lower(), _NEXT[options.to])
+    next_step(following.format(shlex.quote(str(options.output)), options.output.name))
     if options.to == "wavs" and len(options.forces) == 1:
         next_step("the same command with --overwrite --forces 0.3 1 3, for a layer at each force")
     return 0
 
 
-def _following(options: Options) -> str:
-    """Return what to do with the files of a format."""
-    from avmsf.export.samples import INSTRUMENT
-
-    output = shlex.quote(str(options.output))
-    match options.to:
-        case "web" if options.output.suffix.lower() in SUFFIXES["web"]:
-            return f"open {output} in a browser"
-        case "web":
-            return f"python -m http.server --directory {output}, then open http://localhost:8000 in a browser"
-        case "gltf":
-            return f"open {output} in a glTF viewer"
-        case "faust" if options.output.suffix.lower() == ".lib":
-            call = "strike(contact, force, contactTime, gate)"
-            return f'in a Faust program beside it: library("{options.output.name}").{call}'
-        case "faust":
-            return f"open {output} in the Faust IDE (https://faustide.grame.fr), or compile it: faust2jack {output}"
-        case "wavs":
-            return f"load {shlex.quote(str(options.output / INSTRUMENT))} in a sampler that reads SFZ"
-        case "uff":
-            return f"open {output} in a program for modal analysis"
-        case _:
-            return f"open {output} in the paper's web demo"
-
-
-def _prepare(field: "SoundField", options: Options) -> "_Prepared":
+def _prepared(field: "SoundField", options: Options) -> "_Prepared":
     """Return what a format's writer writes, and its settings."""
     match options.to:
         case "web":
-            return _web(field, options)
+            return field, _page_settings(field, options)
         case "gltf":
             shown, meters = _object(field, options)
             return _sampled(field, options), {"object": shown, "meters": meters, "up": options.up}
@@ -240,15 +197,13 @@ def _prepare(field: "SoundField", options: Options) -> "_Prepared":
 
 def _sampled(field: "SoundField", options: Options) -> "SampledField":
     """Return the field at the contacts of the options, or at its own points spread over the object."""
-    from avmsf.cli.contacts import given_contacts, note_off, refuse_far
+    from avmsf.cli.contacts import expect_on_object, given_contacts
     from avmsf.export.sampled_field import SampledField
-    from avmsf.export.writing import POINTS
     from avmsf.field.positions import points_on_object
 
     if options.contacts_given:
         contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
-        refuse_far(contacts, field, advice=", see --unit")
-        note_off(contacts, field)
+        expect_on_object(contacts, field)
         return SampledField.of(field, contacts.places, directions=contacts.directions)
     points = points_on_object(field.gain_field)
     sampled = SampledField.of(field, points, limit=options.contacts or POINTS[options.to])
@@ -308,10 +263,9 @@ def _reconstructed(options: Options) -> Path | None:
     return made
 
 
-def _web(field: "SoundField", options: Options) -> "_Prepared":
+def _page_settings(field: "SoundField", options: Options) -> dict[str, Any]:
     from avmsf.capture.folder import read_capture
     from avmsf.editing.modal_edit import EDITS
-    from avmsf.export.writing import POINTS
     from avmsf.mesh.surface import Surface
 
     source, meters = _object(field, options)
@@ -319,7 +273,7 @@ def _web(field: "SoundField", options: Options) -> "_Prepared":
     if recorded is not None and field.origin.report.get(EDITS):
         note("the field is edited, so the page has no recordings to compare it with")
         recorded = None
-    return field, {
+    return {
         "object": source,
         "meters": meters,
         "surface": None if isinstance(source, Surface) else field.gain_field.surface,
@@ -343,7 +297,6 @@ def _faust(field: "SoundField", options: Options) -> "_Prepared":
 def _demo(field: "SoundField", options: Options) -> "_Prepared":
     from avmsf.export.geometry import read_gaussians
     from avmsf.export.sampled_field import SampledField, spread_rows
-    from avmsf.export.writing import POINTS
     from avmsf.field.positions import points_on_object
 
     source, most = options.object, options.contacts or POINTS["avmsf-demo"]

@@ -1,9 +1,8 @@
 """`avmsf fit`: a capture folder in, a field file out, or what a stage before it makes."""
 
 import shlex
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,10 +11,20 @@ import tyro
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import CaptureSettings
-from avmsf.cli import INTERRUPTED
-from avmsf.cli.common import Configured, Flag, expect_device, expect_rows, option_of, read_settings
-from avmsf.cli.paths import CacheFolder, Existing, NewFile, OutputError, PlotsFolder, SettingsFile
-from avmsf.cli.printing import display, doing, next_command, next_step, print_json, print_result, say, show
+from avmsf.cli.options import (
+    Configured,
+    Device,
+    Flag,
+    Int,
+    Name,
+    Number,
+    expect_capture,
+    expect_device,
+    option_of,
+    read_settings,
+)
+from avmsf.cli.output import display, doing, next_command, next_step, print_json, print_result, show
+from avmsf.cli.paths import CacheFolder, Existing, NewFile, OutputError, PlotsFolder, SettingsFile, arg
 from avmsf.cli.settings import with_settings
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
@@ -24,11 +33,9 @@ from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset, TimeZero
 
 if TYPE_CHECKING:
-    from avmsf.capture import Impacts
     from avmsf.evaluation.scores import Scores
-    from avmsf.field.sound_field import SoundField
     from avmsf.mesh.surface import Surface
-    from avmsf.pipeline.fit import StagedFit
+    from avmsf.pipeline.stages import StageFolder
 
 _STAGES = {"field.safetensors": "fit", "points.safetensors": "features"}
 """Names of stages that are not those of their files."""
@@ -40,6 +47,8 @@ _SUFFIXES: dict[Stage | None, tuple[str, ...]] = {
     "surface": (".ply", ".obj", ".glb"),
 }
 """Endings of the output, by the stage that is the last."""
+_MESH_KINDS: dict[str, Literal["obj", "glb"]] = {".obj": "obj", ".glb": "glb"}
+_RENDER = "--position X Y Z -o impact.wav"
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,7 @@ class Options(Configured):
 
     CAPTURE holds impacts.csv, the recordings that it names, and what shows the object: a mesh, photographs, a video or
     Gaussians. A mesh is used before photographs. Without recordings, --material gives an approximate field. The output
-    of each stage is cached, only what changed is computed again, and repeating an interrupted command continues it.
+    of each stage is cached, and only what changed is computed again.
     """
 
     capture: tyro.conf.Positional[
@@ -58,47 +67,47 @@ class Options(Configured):
             Existing("a capture folder, or a mesh with --material", ("a folder", "a mesh or Gaussians")),
         ]
     ]
-    """Capture folder; with --material also a folder without recordings, or a mesh."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FIELD.safetensors")] = None
-    """File of the field, by default only in the cache; with --until what that stage makes (.ply, .obj, .glb ...)."""
+    """Capture folder; with --material also without recordings, or a mesh."""
+    output: Annotated[Path | None, arg("FIELD.safetensors", "-o")] = None
+    """File of the field, by default only in the cache; with --until of its stage (.ply, .obj, .glb)."""
     until: Stage | None = None
-    """Stop after a stage that needs no recordings: 3D Gaussians, image features, or the object's surface."""
+    """Stop after a stage that needs no recordings."""
     cache: CacheFolder = None
     """Cache of the stages' outputs, by default CAPTURE/.avmsf."""
     settings: SettingsFile = None
     """A capture.toml in place of the folder's own."""
     plots: PlotsFolder = None
-    """With --until surface: draw it with two cross-sections to surface.png in this folder."""
-    material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """With --until surface: draw it to surface.png in this folder."""
+    material: Name = None
     """Approximate field without recordings, of ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
-    train_fraction: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Fit to this fraction of the contacts (those within 1 % of the extent are one), and score the others."""
-    train_count: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Fit to this number of contacts, spread as far apart as possible, and score the others."""
+    train_fraction: Number = None
+    """Fit to this fraction of the contacts, and score the others."""
+    train_count: Int = None
+    """Fit to so many contacts, as far apart as possible, and score the others."""
     start: int = 0
     """Row of impacts.csv, from 0, whose contact this choice starts from."""
     features: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FEATURES.safetensors"),
+        arg("FEATURES.safetensors"),
         Existing("features, as avmsf fit --until features writes them", ("features",)),
     ] = None
     """Features by --until features, by default those of the folder's views where the gain model reads any."""
     without_shape: Flag = False
     """Fit to the positions of the contacts alone."""
-    gain_model: GainModelName | None = None
-    """By default auto: a Gaussian process over all families, by evidence. network: the paper's. Others: one family."""
-    extraction: ExtractionMethod | None = None
-    """How modes are extracted, see `avmsf modes --help`; by default high-resolution."""
-    modes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    gain_model: Annotated[GainModelName | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """By default auto, a Gaussian process over all families. network: the paper's."""
+    extraction: Annotated[ExtractionMethod | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """How modes are extracted, see `avmsf modes --help`."""
+    modes: Int = None
     """Modes at most, by default 128."""
-    time_zero: TimeZero | None = None
-    """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="cpu|cuda")] = None
-    """Device for Gaussians, DINOv2 and training, by default the GPU; all else runs on the CPU."""
-    seed: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    time_zero: Annotated[TimeZero | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """Start of the sounds; by default that of capture.toml."""
+    device: Device = None
+    """Device for Gaussians, DINOv2 and training, by default the GPU."""
+    seed: Int = None
     """Random seed of all stages, by default 0."""
     preset: Preset = "default"
-    """All settings: the default, or everything as published, the middle of each published list, which takes hours."""
+    """All settings; paper: everything as published, which takes hours."""
 
     usual = PRESETS["default"]
 
@@ -112,11 +121,12 @@ class Options(Configured):
         )
 
     @property
-    def kept(self) -> Path:
+    def stages(self) -> "StageFolder":
         """The folder that caches the stages' outputs."""
-        if self.cache is not None:
-            return self.cache
-        return self.capture / CACHE if self.capture.is_dir() else self.capture.parent / CACHE / self.capture.stem
+        from avmsf.pipeline.stages import StageFolder
+
+        own = self.capture / CACHE if self.capture.is_dir() else self.capture.parent / CACHE / self.capture.stem
+        return StageFolder(self.cache or own)
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
@@ -127,7 +137,6 @@ class Options(Configured):
             raise OutputError.expected("--until surface with it", self.until, name="--plots")
         config = self.all_settings
         expect_device(config.device, raising=FitError)
-        self._check_split()
         settings = read_settings(self.capture, self.settings)
         if self.material is not None:
             material_named(self.material, option="--material")
@@ -136,21 +145,20 @@ class Options(Configured):
             expect_views(self.capture, settings)
         elif self.material is None:
             if not self.capture.is_dir():
-                advice = "--material NAME computes a field of a mesh without recordings"
-                raise FitError.expected(
-                    "a capture folder", got="a file", file=self.capture, name="--material", advice=advice
-                )
-            expect_rows(self.capture, settings)
+                wanted, advice = "a capture folder", "--material NAME computes a field of a mesh without recordings"
+                raise FitError.expected(wanted, got="a file", file=self.capture, name="--material", advice=advice)
+            self._check_split(expect_capture(self.capture, settings))
 
-    def _check_split(self) -> None:
+    def _check_split(self, impacts: int) -> None:
+        """Raise for a split that leaves no contact to train on or to score, as far as the number of impacts says it."""
         if self.train_count is not None and self.train_fraction is not None:
             raise FitError.expected("it or --train-fraction", got="both", name="--train-count", advice="leave one out")
         if self.train_fraction is not None and not 0.0 < self.train_fraction < 1.0:
-            raise EvaluationError.expected(
-                "a fraction of training contacts between 0 and 1, such as 0.75",
-                self.train_fraction,
-                name="--train-fraction",
-            )
+            wanted = "a fraction of training contacts between 0 and 1, such as 0.75"
+            raise EvaluationError.expected(wanted, self.train_fraction, name="--train-fraction")
+        if self.train_count is not None and not 0 < self.train_count < impacts:
+            wanted = f"1 to {impacts - 1} training contacts, so that others are left to score"
+            raise EvaluationError.expected(wanted, self.train_count, name="--train-count")
 
     def _check_unused(self, config: PipelineConfig) -> None:
         """Raise FitError for options that nothing would read."""
@@ -165,32 +173,26 @@ class Options(Configured):
         fitted = ("train_fraction", "train_count", "start", "features", "without_shape")
         unread = {"until": fitted, "material": (*fitted, "until", "time_zero", "gain_model", "body.supports")}
         for other, names in unread.items():
-            for name in names if getattr(self, other) else ():
-                if name in given:
-                    chosen = getattr(self, other)
-                    raise FitError.expected(
-                        f"no --{other} with it", chosen, name=option_of(name), advice="leave one out"
-                    )
+            chosen = getattr(self, other)
+            for name in (each for each in names if chosen and each in given):
+                wanted, advice = f"no --{other} with it", "leave one out"
+                raise FitError.expected(wanted, chosen, name=option_of(name), advice=advice)
         if self.start and self.train_fraction is None and self.train_count is None:
             raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
 
 
 def run(options: Options) -> int:
-    """Fit, write, and print a summary; return 130 where Ctrl-C stopped it."""
+    """Fit, write, and print a summary."""
     from avmsf._utils.device import TRAINABLE, usable_device
 
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)
     settings = read_settings(options.capture, options.settings).starting(options.all_settings.time_zero)
-    try:
-        if options.until is not None:
-            _make_stage(options, settings)
-        elif options.material is not None:
-            _guess(options, options.material, settings)
-        else:
-            _fit(options, settings)
-    except KeyboardInterrupt:
-        say("avmsf fit: interrupted; repeat the command to continue", always=True)
-        return INTERRUPTED
+    if options.until is not None:
+        _make_stage(options, settings)
+    elif options.material is not None:
+        _guess(options, options.material, settings)
+    else:
+        _fit(options, settings)
     return 0
 
 
@@ -203,30 +205,24 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     from avmsf.features.store import load_features, read_report
     from avmsf.field.store import load
     from avmsf.pipeline.fit import fit_in_stages
-    from avmsf.pipeline.stages import StageFolder
     from avmsf.pipeline.visuals import expect_shape
 
     capture = read_capture(options.capture, settings)
+    size = options.train_count if options.train_fraction is None else options.train_fraction
+    train, test = (capture.impacts, None) if size is None else split(capture.impacts, size, start=options.start)
     if options.without_shape:
         capture = replace(capture, surface=None, folder=None)
     elif options.features is None:
         expect_shape(capture)
-    size = options.train_count if options.train_fraction is None else options.train_fraction
-    train, test = (capture.impacts, None) if size is None else split(capture.impacts, size, start=options.start)
     features, described = None, None
     if options.features is not None:
         features, described = load_features(options.features), read_report(options.features)
-    stages = StageFolder(options.kept)
+    stages, config = options.stages, options.all_settings
     with stages.lock("avmsf fit"):
         made = fit_in_stages(
-            capture,
-            options.all_settings,
-            stages,
-            train=train,
-            features=features,
-            features_report=described,
+            capture, config, stages, train=train, features=features, features_report=described,
             listener=display.listener,
-        )
+        )  # fmt: skip
         fitted = load(made.field)
         if options.output is not None:
             copy_whole(made.field, options.output)
@@ -243,48 +239,34 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
         lines += [f"not trained on: {listed(test.names, most=8)}"] if display.verbose else []
     lines += field_lines(fitted, path, settings=display.verbose)
     lines += [f"wrote {path}", *([] if made.surface is None else [f"the object's surface is {made.surface}"])]
-    show("\n".join(lines), json=options.json)
-    if options.json:
-        print_json(_values(options, path, fitted, made, train, test, scores))
+    show("\n".join(lines))
+    print_json(
+        {
+            "field": str(path),
+            "capture": fitted.origin.capture,
+            "modes": int(fitted.is_mode.sum()),
+            "supporting_poles": int((~fitted.is_mode).sum()),
+            "report": fitted.origin.report,
+            "body": None if fitted.body is None else fitted.body.record(),
+            "quality": None if fitted.quality is None else fitted.quality.level,
+            "surface": None if made.surface is None else str(made.surface),
+            "preset": options.preset,
+            "config": asdict(config.fit),
+            "features_report": made.report,
+            "stages": [
+                {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
+                for name, each in made.stages.items()
+            ],
+            "sample_rate": fitted.sample_rate,
+            "trained_on": list(train.names),
+            "tested_on": [] if test is None else list(test.names),
+            "scores": {method: each.mean() for method, each in scores.items()},
+        }
+    )
     if test is None:
-        next_command("avmsf render", path, "--position X Y Z -o impact.wav")
+        next_command("avmsf render", path, _RENDER)
     else:
         next_step("the same command without --train-fraction and --train-count fits all recordings")
-
-
-def _values(
-    options: Options,
-    path: Path,
-    fitted: "SoundField",
-    made: "StagedFit",
-    train: "Impacts",
-    test: "Impacts | None",
-    scores: Mapping[str, "Scores"],
-) -> dict[str, Any]:
-    """Return what a fit made, as plain values."""
-    from avmsf.cli.report import score_values
-
-    return {
-        "field": str(path),
-        "capture": fitted.origin.capture,
-        "modes": int(fitted.is_mode.sum()),
-        "supporting_poles": int((~fitted.is_mode).sum()),
-        "report": fitted.origin.report,
-        "body": None if fitted.body is None else fitted.body.record(),
-        "quality": None if fitted.quality is None else fitted.quality.level,
-        "surface": None if made.surface is None else str(made.surface),
-        "preset": options.preset,
-        "config": asdict(options.all_settings.fit),
-        "features_report": made.report,
-        "stages": [
-            {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
-            for name, each in made.stages.items()
-        ],
-        "sample_rate": fitted.sample_rate,
-        "trained_on": list(train.names),
-        "tested_on": [] if test is None else list(test.names),
-        "scores": score_values(scores),
-    }
 
 
 def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
@@ -293,48 +275,48 @@ def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
     from avmsf.cli.report import quality_words
     from avmsf.field.store import load
     from avmsf.pipeline.fit import guess_in_stages
-    from avmsf.pipeline.stages import StageFolder
 
-    stages = StageFolder(options.kept)
+    stages, config = options.stages, options.all_settings
     with stages.lock("avmsf fit"):
-        made = guess_in_stages(
-            options.capture, material, options.all_settings, stages, settings=settings, listener=display.listener
-        )
+        made = guess_in_stages(options.capture, material, config, stages, settings=settings, listener=display.listener)
         guessed, path = load(made), options.output or made
         if options.output is not None:
             copy_whole(made, options.output)
     values = {"field": str(path), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
     values |= {"sample_rate": guessed.sample_rate, "trained_on": [], "report": guessed.origin.report}
-    print_result("\n".join([*quality_words(guessed, path), f"wrote {path}"]), values, json=options.json)
-    next_command("avmsf render", path, "--position X Y Z -o impact.wav")
+    print_result("\n".join([*quality_words(guessed, path), f"wrote {path}"]), values)
+    next_command("avmsf render", path, _RENDER)
 
 
 def _make_stage(options: Options, settings: CaptureSettings) -> None:
     """Make Gaussians, features or a surface of the folder's views, and print what they are."""
+    from avmsf._utils.files import copy_whole, write_whole
     from avmsf.capture.checks import check_one_unit, find_surface
     from avmsf.cli.report import features_lines
     from avmsf.features.store import read_report
     from avmsf.gaussians.ply import read_splats
-    from avmsf.mesh.surface import read_surface
+    from avmsf.mesh.surface import read_surface, write_surface
     from avmsf.pipeline.scene import SceneStages
     from avmsf.pipeline.shape import keep_surface, object_shape
-    from avmsf.pipeline.stages import StageFolder
 
     check_one_unit(options.capture, settings)
-    stages, config = StageFolder(options.kept), options.all_settings.scene
+    stages, config = options.stages, options.all_settings.scene
     scene = SceneStages(
         options.capture, stages, config, settings=settings, listener=display.listener, device=options.device
     )
     scene.expect_any()
     values: dict[str, Any]
+    following, words = "avmsf fit", "-o field.safetensors"
     with stages.lock("avmsf fit"):
         match options.until:
             case "gaussians":
                 made, key, values = scene.cloud, "cloud", {"gaussians": len(read_splats(scene.cloud.path))}
-                lines = [counted(values["gaussians"], "Gaussian")]
+                lines, following, words = [counted(values["gaussians"], "Gaussian")], "avmsf info", "--plots plots"
             case "features":
                 made, key, values = scene.features, "features", read_report(scene.features.path)
                 lines = features_lines(values)
+                model = "--preset paper" if options.preset == "paper" else "--gain-model visual"
+                words = f"--features {shlex.quote(str(options.output or made.path))} {model} {words}"
             case _:
                 made = keep_surface(scene, *object_shape(find_surface(options.capture, settings), scene))
                 surface = read_surface(made.path)
@@ -342,33 +324,14 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
                 if options.plots is not None:
                     _draw(surface, options.capture, settings, options.plots / "surface.png")
                     lines.append(f"wrote {options.plots / 'surface.png'}")
-        if options.output is not None:
-            _write_stage(made.path, options.output)
-    path = options.output or made.path
-    print_result("\n".join([*lines, f"wrote {path}"]), {key: str(path), **values}, json=options.json)
-    match options.until:
-        case "gaussians":
-            next_command("avmsf info", path, "--plots plots")
-        case "features":
-            model = "--preset paper" if options.preset == "paper" else "--gain-model visual"
-            words = f"--features {shlex.quote(str(path))} {model} -o field.safetensors"
-            next_command("avmsf fit", options.capture, words)
-        case _:
-            next_command("avmsf fit", options.capture, "-o field.safetensors")
-
-
-def _write_stage(made: Path, output: Path) -> None:
-    """Copy what a stage made; a surface is written in the format of the output."""
-    from avmsf._utils.files import copy_whole, write_whole
-    from avmsf.mesh.surface import SurfaceKind, read_surface, write_surface
-
-    suffix = output.suffix.lower()
-    if suffix == ".obj" or suffix == ".glb":
-        kind: SurfaceKind = "obj" if suffix == ".obj" else "glb"
-        surface = read_surface(made)
-        write_whole(output, lambda place: write_surface(surface, place, kind=kind), raising=OutputError)
-    else:
-        copy_whole(made, output)
+        path = options.output or made.path
+        kind = _MESH_KINDS.get(path.suffix.lower())
+        if kind is not None:
+            write_whole(path, partial(write_surface, read_surface(made.path), kind=kind), raising=OutputError)
+        elif options.output is not None:
+            copy_whole(made.path, options.output)
+    print_result("\n".join([*lines, f"wrote {path}"]), {key: str(path), **values})
+    next_command(following, path if following == "avmsf info" else options.capture, words)
 
 
 def _draw(surface: "Surface", folder: Path, settings: CaptureSettings, picture: Path) -> None:
@@ -395,5 +358,4 @@ def surface_words(surface: "Surface") -> str:
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
     extent = " x ".join(f"{1000 * side:.3g}" for side in mesh.extents)
     words = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2"
-    closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
-    return f"{words}, {closed}"
+    return f"{words}, {f'closed, volume {1e6 * mesh.volume:.3g} cm3' if mesh.is_watertight else 'not closed'}"

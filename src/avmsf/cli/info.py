@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.common import Printing, expect_capture, read_settings
-from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
-from avmsf.cli.printing import doing, next_command, print_json, say, show
+from avmsf.cli.options import Common, Flag, expect_capture, read_settings
+from avmsf.cli.output import doing, next_command, print_json, print_result, say, show
+from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, arg, kind_of
 from avmsf.errors import SceneError
-from avmsf.field.header import FIELD
 from avmsf.gaussians.ply_header import read_header
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
-class Options(Printing):
+class Options(Common):
     """Describe a field, Gaussians or features, and draw them with --plots."""
 
     file: tyro.conf.Positional[
@@ -42,6 +41,8 @@ class Options(Printing):
         ]
     ]
     """A field (.safetensors), Gaussians (.ply) or features (.safetensors), as `avmsf fit` writes them."""
+    all: Flag = False
+    """Field: list all modes, not only those of most energy."""
     capture: OtherCapture = None
     """Field: compare it with a capture's recordings that it was not fitted to, or with all if there are none."""
     settings: SettingsFile = None
@@ -50,9 +51,9 @@ class Options(Printing):
     """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
     posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
     cloud.png. Features: features.png."""
-    cloud: Annotated[
-        Path | None, tyro.conf.arg(metavar="CLOUD.ply"), Existing("Gaussians, as a .ply file", ("a mesh or Gaussians",))
-    ] = None
+    cloud: Annotated[Path | None, arg("CLOUD.ply"), Existing("Gaussians, as a .ply file", ("a mesh or Gaussians",))] = (
+        None
+    )
     """Features: also draw the colors of the Gaussians that the features lie on."""
     up: Literal["x", "y", "z"] = "z"
     """Gaussians and features: axis that points up."""
@@ -60,61 +61,53 @@ class Options(Printing):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        suffix = self.file.suffix.lower()
-        for cloud in (self.file if suffix == ".ply" else None, self.cloud):
+        for cloud in (self.file if self.file.suffix.lower() == ".ply" else None, self.cloud):
             if cloud is not None:
                 read_header(cloud)
-        if suffix != ".ply" and kind_of(self.file) != "features":
-            FIELD.read_record(self.file)
-            if self.capture is not None:
-                expect_capture(self.capture, self.settings)
+        if self.capture is not None:
+            expect_capture(self.capture, read_settings(self.capture, self.settings))
 
 
 def run(options: Options) -> int:
     """Describe and draw a file, whose kind its content shows."""
     if options.file.suffix.lower() == ".ply":
-        values = _describe_gaussians(options)
+        _describe_gaussians(options)
     elif kind_of(options.file) == "features":
-        values = _describe_features(options)
+        _describe_features(options)
     else:
-        return _describe_field(options)
-    if options.json:
-        print_json(values)
-    elif options.plots is None:
-        next_command("avmsf info", options.file, "--plots plots")
+        _describe_field(options)
     return 0
 
 
-def _describe_field(options: Options) -> int:
+def _describe_field(options: Options) -> None:
     from avmsf.capture import read_capture
-    from avmsf.cli.report import describe, field_lines, levels, mode_rows, mode_table, score_table, score_values
+    from avmsf.cli.report import describe, field_lines, levels, mode_rows, mode_table, score_table
     from avmsf.evaluation.scores import evaluate
     from avmsf.field.store import load
 
     field = load(options.file)
     points = field.gain_field.points
     level = levels(gains_at(field, points[:: max(1, len(points) // _LISTED_POINTS)]))
-    every = list(zip(mode_rows(field.bank, level), field.is_mode.tolist(), strict=True))
-    rows, supporting = ([row for row, is_mode in every if is_mode is part] for part in (True, False))
-    values = describe(field)
-    lines = [*field_lines(field, options.file)]
-    lines.append(mode_table(", levels on average over the object", rows, len(supporting)))
+    rows, supporting = mode_rows(field.bank, level, field.is_mode)
+    values = {**describe(field), "modes": rows, "supporting_poles": supporting}
+    of = ", levels on average over the object"
+    lines = [*field_lines(field, options.file), mode_table(of, rows, len(supporting), every=options.all)]
     compared = None
     if options.capture is not None:
         doing("comparing the field with the capture's recordings")
         settings = read_settings(options.capture, options.settings)
         compared, what = _held_out(read_capture(options.capture, settings).impacts, field)
         compared = field.aligned(compared)
-        scores = {"field": evaluate(field, compared)}
-        lines.append(score_table(f"{counted(len(compared), 'contact')}, {what}; lower is better", scores))
-        values |= {"compared_with": {"recordings": list(compared.names), "which": what, "scores": score_values(scores)}}
-    show("\n".join(lines), json=options.json)
+        scores = evaluate(field, compared)
+        title = f"{counted(len(compared), 'contact')}, {what}; lower is better"
+        lines.append(score_table(title, {"field": scores}))
+        recordings = {"recordings": list(compared.names), "which": what}
+        values |= {"compared_with": {**recordings, "scores": {"field": scores.mean()}}}
+    show("\n".join(lines))
     if options.plots is not None:
         _draw_field(field, options.plots, level=level, recorded=compared)
-    if options.json:
-        print_json(values | {"modes": rows, "supporting_poles": supporting})
+    print_json(values)
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
-    return 0
 
 
 def gains_at(field: "SoundField", points: "Float[Tensor, 'points 3']") -> "Float[Tensor, 'points modes']":
@@ -125,11 +118,7 @@ def gains_at(field: "SoundField", points: "Float[Tensor, 'points 3']") -> "Float
 
 
 def _draw_field(
-    field: "SoundField",
-    folder: Path,
-    *,
-    level: "Float[Tensor, ' modes']",
-    recorded: "Impacts | None",
+    field: "SoundField", folder: Path, *, level: "Float[Tensor, ' modes']", recorded: "Impacts | None"
 ) -> None:
     """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
     from avmsf.field.posterior import has_posterior, relative_gain_std, spectrum_band
@@ -140,16 +129,14 @@ def _draw_field(
     from avmsf.plotting.surfaces import draw_surface
     from avmsf.plotting.uncertainty import draw_band, draw_uncertainty
 
-    name = field.origin.capture or "field"
-    modes = modes_words(len(field.bank), int((~field.is_mode).sum()))
-    kept = field.is_mode
-    bank = field.bank.take(kept)
+    name, kept = field.origin.capture or "field", field.is_mode
+    modes = modes_words(len(field.bank), int((~kept).sum()))
     points = field.gain_field.points
     points = points[:: max(1, len(points) // _DRAWN_POINTS)]
-    gains = gains_at(field, points)
+    gains, title = gains_at(field, points)[:, kept], f"gains of the modes of most energy of {name}"
     pictures = {
-        "modes": draw_modes(field.bank, level, is_mode=field.is_mode, title=f"{modes} of {name}"),
-        "gains": draw_gains(points, gains[:, kept], bank, title=f"gains of the modes of most energy of {name}"),
+        "modes": draw_modes(field.bank, level, is_mode=kept, title=f"{modes} of {name}"),
+        "gains": draw_gains(points, gains, field.bank.take(kept), title=title),
     }
     if recorded is not None:
         chosen = recorded.take(farthest_points(recorded.contacts, min(_DRAWN_CONTACTS, len(recorded))).tolist())
@@ -163,17 +150,13 @@ def _draw_field(
     if has_posterior(field):
         std, title = relative_gain_std(field, points), f"uncertainty of the gains of {name}"
         pictures["uncertainty"] = draw_uncertainty(points, std, title=title, contacts=field.gain_field.contacts)
-        pictures["spectrum"] = draw_band(
-            spectrum_band(field, points[0]), title=f"{name}: one impact, with its uncertainty"
-        )
-    surface = field.gain_field.surface
-    if surface is not None:
-        pictures["surface"] = draw_surface(surface, title=f"the body of {name}")
+        band, title = spectrum_band(field, points[0]), f"{name}: one impact, with its uncertainty"
+        pictures["spectrum"] = draw_band(band, title=title)
+    if field.gain_field.surface is not None:
+        pictures["surface"] = draw_surface(field.gain_field.surface, title=f"the body of {name}")
     for stem, picture in pictures.items():
-        path = folder / f"{stem}.png"
-        doing(f"drawing {path}")
-        save_picture(picture, path)
-        say(f"wrote {path}")
+        save_picture(picture, folder / f"{stem}.png")
+        say(f"wrote {folder / stem}.png")
 
 
 def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
@@ -184,52 +167,61 @@ def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
     return impacts.take(rows), "not training recordings" if len(rows) < len(impacts) else "none a training recording"
 
 
-def _describe_gaussians(options: Options) -> dict[str, Any]:
-    """Print a description of Gaussians, draw them with --plots, and return their values."""
+def _describe_gaussians(options: Options) -> None:
     from avmsf.gaussians.ply import read_splats
     from avmsf.plotting.clouds import draw_cloud
-    from avmsf.plotting.pictures import save_picture
 
     cloud = read_splats(options.file)
     extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
     count = counted(len(cloud), "Gaussian")
-    show(f"{options.file}: {count}, {' x '.join(f'{side:.3g}' for side in extent)} m", json=options.json)
-    if options.plots is not None:
-        title, picture = f"{options.file.name}: {count}", options.plots / "cloud.png"
-        save_picture(draw_cloud(cloud.centers, {"color": cloud.colors}, title=title, up=_UP[options.up]), picture)
-        say(f"wrote {picture}")
-    return {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_meters": extent}
+    text = f"{options.file}: {count}, {' x '.join(f'{side:.3g}' for side in extent)} m"
+    values = {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_meters": extent}
+    print_result(text, values)
+    if _draws(options):
+        title = f"{options.file.name}: {count}"
+        _save(draw_cloud(cloud.centers, {"color": cloud.colors}, title=title, up=_UP[options.up]), "cloud", options)
 
 
-def _describe_features(options: Options) -> dict[str, Any]:
-    """Print a description of features, draw them with --plots, and return their values."""
+def _describe_features(options: Options) -> None:
     from avmsf.cli.report import features_lines
+    from avmsf.features.feature_field import GEOMETRY
     from avmsf.features.store import load_features, read_report
+    from avmsf.plotting.clouds import component_colors, draw_cloud
+    from avmsf.symmetry.symmetries import Symmetries
 
     features, report = load_features(options.file), read_report(options.file)
     count, dim = features.features.shape
-    lines = [f"{options.file}: {dim} features of {features.encoder} on {count} points"]
-    show("\n".join(lines + (features_lines(report) if "encoder" in report else [])), json=options.json)
-    if options.plots is not None:
-        _draw_features(features, report, options, options.plots / "features.png")
+    text = f"{options.file}: {dim} features of {features.encoder} on {count} points"
     values = {"kind": "features", "file": str(options.file), "encoder": features.encoder, "points": count, "dim": dim}
-    return {**values, "report": report}
-
-
-def _draw_features(features: "FeatureField", report: dict[str, Any], options: Options, picture: Path) -> None:
-    from avmsf.features.feature_field import GEOMETRY
-    from avmsf.plotting.clouds import component_colors, draw_cloud
-    from avmsf.plotting.pictures import save_picture
-    from avmsf.symmetry.symmetries import Symmetries
-
+    print_result(
+        "\n".join([text, *(features_lines(report) if "encoder" in report else [])]), {**values, "report": report}
+    )
+    if not _draws(options):
+        return
     symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
     rows = {} if options.cloud is None else {"color": _colors_of(options.cloud, features)}
     # The positions would outweigh the other features.
     positions = 3 if features.encoder.startswith(f"{GEOMETRY} and ") else 0
     rows["features"] = component_colors(features.features[:, positions:])
-    title = f"{options.file.name}: {features.encoder} on {len(features.points)} points"
-    save_picture(draw_cloud(features.points, rows, title=title, symmetries=symmetries, up=_UP[options.up]), picture)
-    say(f"wrote {picture}")
+    title = f"{options.file.name}: {features.encoder} on {count} points"
+    _save(
+        draw_cloud(features.points, rows, title=title, symmetries=symmetries, up=_UP[options.up]), "features", options
+    )
+
+
+def _draws(options: Options) -> bool:
+    """Return whether pictures are asked for; where not, print how to get them."""
+    if options.plots is None:
+        next_command("avmsf info", options.file, "--plots plots")
+    return options.plots is not None
+
+
+def _save(picture: Any, stem: str, options: Options) -> None:
+    from avmsf.plotting.pictures import save_picture
+
+    assert options.plots is not None
+    save_picture(picture, options.plots / f"{stem}.png")
+    say(f"wrote {options.plots / stem}.png")
 
 
 def _colors_of(path: Path, features: "FeatureField") -> "Float[Tensor, 'points 3']":

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from avmsf._utils.text import format_number
-from avmsf.capture.settings import METRES, CaptureSettings
-from avmsf.cli.common import Flag, Printing, Unit
-from avmsf.cli.paths import ContactTable, Existing, FieldFile, OutputError, OutputFolder, SettingsFile
-from avmsf.cli.printing import doing, next_command, note, print_json, say, show
+from avmsf._utils.text import counted, format_number
+from avmsf.capture.settings import CaptureSettings
+from avmsf.cli.options import Common, Flag, Number, Unit
+from avmsf.cli.output import doing, next_command, note, print_json, say, show
+from avmsf.cli.paths import ContactTable, Existing, FieldFile, OutputError, OutputFolder, SettingsFile, arg
 from avmsf.errors import AvmsfError, LocationError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ RECORDING = Existing("a recording", ("a recording",))
 
 
 @dataclass(frozen=True)
-class Options(Printing):
+class Options(Common):
     """Find where on the object the impact of a recording was, with a heat map and the uncertainty.
 
     Each recording holds one impact, of any force and polarity; with --several, any number of them.
@@ -48,11 +48,11 @@ class Options(Printing):
     """Read the recordings by this capture.toml; by default like the recordings of the fit."""
     several: Flag = False
     """The recordings hold several impacts each; locate every one of them."""
-    force: float | None = None
+    force: Number = None
     """Peak force of every impact, newtons (or relative to an average one), which tells contacts by loudness."""
     probability: float = 0.9
     """Probability that the contact lies within the region that is reported."""
-    true_contact: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    true_contact: Annotated[tuple[float, float, float] | None, arg("X Y Z")] = None
     """True contact of every impact, to print and mark its distance."""
     true_contact_table: ContactTable = None
     """True contacts of several recordings: columns file,x,y,z, such as impacts.csv."""
@@ -66,22 +66,14 @@ class Options(Printing):
         super().check_inputs()
         if not self.recordings:
             raise OutputError.expected("one or more after the field, such as HIT.wav", 0, name="recordings")
-        # One that is missing does not keep the others from being located.
-        failures = []
-        for path in self.recordings:
-            try:
-                RECORDING.check(path)
-            except AvmsfError as error:
-                failures.append(error)
-        if len(failures) == len(self.recordings):
-            raise failures[0]
         if self.true_contact is not None and self.true_contact_table is not None:
             wanted = "true contacts by it, X Y Z, or by --true-contact-table TABLE.csv"
             raise OutputError.expected(wanted, list(self.true_contact), got="both", name="--true-contact")
         if not 0.0 < self.probability < 1.0:
-            raise OutputError.expected(
-                "a probability between 0 and 1, such as 0.9", self.probability, name="--probability"
-            )
+            wanted = "a probability between 0 and 1, such as 0.9"
+            raise OutputError.expected(wanted, self.probability, name="--probability")
+        if len(self.recordings) == 1:
+            RECORDING.check(self.recordings[0])
 
 
 def run(options: Options) -> int:
@@ -94,7 +86,7 @@ def run(options: Options) -> int:
     say("preparing the gains over the surface and their posterior, once a run (seconds to minutes)")
     verdict = field.origin.report.get("guess") if field.quality is None else field.quality.verdict
     if verdict is not None:
-        show(verdict, json=options.json)
+        show(verdict)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     locate = _locator(options, field)
     for path in options.recordings:
@@ -103,6 +95,7 @@ def run(options: Options) -> int:
             RECORDING.check(path)
             answers = locate(path)
         except AvmsfError as error:
+            # One that cannot be read does not keep the others from being located.
             if len(options.recordings) == 1:
                 raise
             failures.append({"recording": str(path), "error": " ".join(str(error).split())})
@@ -112,17 +105,17 @@ def run(options: Options) -> int:
         for values, contact in answers:
             if truth is not None and contact is not None:
                 values |= _error(contact, truth, options.probability)
-            show(_words(values), json=options.json)
+                values["training"] = _is_training(field, path, truth)
+            show(_words(values))
             if contact is not None and options.output is not None:
                 values |= _draw(contact, options.output, _name(path, taken), values, truth)
             found.append(values)
     summary = _summary(found)
     if summary is not None:
-        show(_summary_line(summary, options.probability), json=options.json)
-    if options.json:
-        results = {"impacts": found, "summary": summary, "failures": failures}
-        print_json({"field": str(options.field), "quality": verdict, **results})
-    if field.gain_field.contacts is not None and not field.origin.report.get(EDITS):
+        show(_summary_line(summary, options.probability))
+    results = {"impacts": found, "summary": summary, "failures": failures}
+    print_json({"field": str(options.field), "quality": verdict, **results})
+    if found and field.gain_field.contacts is not None and not field.origin.report.get(EDITS):
         next_command("avmsf suggest", options.field)
     return UNLOCATED if failures or any(each["position"] is None for each in found) else 0
 
@@ -159,19 +152,15 @@ def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_A
 
 def _true_contacts(options: Options, field: "SoundField") -> "Contacts | None":
     """Return the true contacts, if any. Raises OutputError for one far from the object, as in another unit."""
-    import torch
+    from avmsf.cli.contacts import expect_on_object, given_contacts, read_contacts
 
-    from avmsf.cli.contacts import Contacts, read_contacts, refuse_far
-
-    meters = METRES[options.unit]
     if options.true_contact_table is not None:
-        contacts = read_contacts(options.true_contact_table, meters=meters, recordings=True)
+        contacts = read_contacts(options.true_contact_table, unit=options.unit, recordings=True)
     elif options.true_contact is not None:
-        place = torch.tensor([options.true_contact], dtype=torch.float64) * meters
-        contacts = Contacts(place, ("true",), option="--true-contact")
+        contacts = given_contacts([options.true_contact], None, unit=options.unit, option="--true-contact")
     else:
         return None
-    refuse_far(contacts, field, advice=", see --unit")
+    expect_on_object(contacts, field)
     return contacts
 
 
@@ -197,30 +186,42 @@ def _error(contact: "ContactMap", truth: "Float64[Tensor, ' 3']", level: float) 
     places = (contact.points[int(contact.distance.argmin())], contact.position)
     cosine, likely = (float((place.double() - truth).norm()) for place in places)
     relative = {"rmed": cosine / diagonal, "rmed_posterior": likely / diagonal}
-    inside = {"in_region": contact.contains(truth, level)}
-    return {"true_contact": truth.tolist(), "error": likely, **relative, **inside}
+    return {"true_contact": truth.tolist(), "error": likely, **relative, "in_region": contact.contains(truth, level)}
+
+
+def _is_training(field: "SoundField", path: Path, truth: "Float64[Tensor, ' 3']") -> bool:
+    """Return whether a field was fitted to a recording, by its name and, where they are known, the fit's contacts."""
+    if not any(f"/{path.absolute().as_posix()}".endswith(f"/{name}") for name in field.origin.trained_on):
+        return False
+    contacts, points = field.gain_field.contacts, field.gain_field.points
+    # Tables have fewer digits than a field.
+    near = 1e-4 * float((points.amax(0) - points.amin(0)).norm())
+    return contacts is None or float((contacts.double() - truth).norm(dim=1).min()) <= near
 
 
 def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Return values over the located impacts of known contacts; None where there are fewer than two.
 
     These are their number, the median error in meters, the mean of both relative errors, and the fraction of the true
-    contacts that are within their credible region.
+    contacts that are within their credible region. Recordings that the field was fitted to are left out, and counted as
+    `training`.
     """
     known = [each for each in impacts if "error" in each]
-    if len(known) < 2:
+    scored = [each for each in known if not each["training"]]
+    if len(scored) < 2:
         return None
-    means = {name: mean(each[name] for each in known) for name in ("rmed", "rmed_posterior", "in_region")}
-    return {"impacts": len(known), "median_error": median(each["error"] for each in known), **means}
+    means = {name: mean(each[name] for each in scored) for name in ("rmed", "rmed_posterior", "in_region")}
+    counts = {"impacts": len(scored), "training": sum(each["training"] for each in known)}
+    return {**counts, "median_error": median(each["error"] for each in scored), **means}
 
 
 def _summary_line(summary: dict[str, Any], level: float) -> str:
-    count = summary["impacts"]
+    count, training = summary["impacts"], counted(summary["training"], "training recording")
     return (
         f"{count} located impacts of known contacts: median distance {1000 * summary['median_error']:.1f} mm, mean "
         f"distance over the object's diagonal (RMED) {100 * summary['rmed_posterior']:.1f} % "
         f"({100 * summary['rmed']:.1f} % by cosine distance), {round(count * summary['in_region'])} of {count} true "
-        f"contacts within the {100 * level:g} % region"
+        f"contacts within the {100 * level:g} % region{f'; {training} not counted' if summary['training'] else ''}"
     )
 
 
@@ -238,11 +239,11 @@ def _words(values: dict[str, Any]) -> str:
         f"the surface; an impact there explains {100 * values['explained_energy']:.0f} % of the sound"
     ]
     if "rmed" in values:
-        error, share = 1000 * values["error"], 100 * values["rmed_posterior"]
         side = "within" if values["in_region"] else "outside"
         lines.append(
-            f"  {error:.1f} mm from the true contact ({share:.1f} % of the diagonal), which is {side} the "
-            f"{100 * region['probability']:g} % region"
+            f"  {1000 * values['error']:.1f} mm from the true contact ({100 * values['rmed_posterior']:.1f} % of the "
+            f"diagonal), which is {side} the {100 * region['probability']:g} % region"
+            f"{'; a training recording' * values['training']}"
         )
     if values["multimodal"]:
         lines.append("  ambiguous: there are other possible positions")

@@ -20,20 +20,22 @@ FileKind = Literal[
     "a sound field", "features", "a recording", "a mesh or Gaussians", "a picture", "a video", "a folder"
 ]  # fmt: skip
 """Kinds of inputs that are told apart."""
-_SOUND_SUFFIXES = (".wav", ".flac", ".ogg", ".aif", ".aiff", ".mp3")
-_SHAPE_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl")
-FILE_SUFFIXES = frozenset(
-    (
-        *(*_SOUND_SUFFIXES, *_SHAPE_SUFFIXES, *PICTURE_SUFFIXES, *VIDEO_SUFFIXES),
-        *(".csv", ".json", ".sfz", ".txt", ".toml", ".safetensors", ".gif", ".html", ".htm"),
-        *(".gz", ".tar", ".zip", ".dsp", ".lib", ".uff", ".unv"),
-    )
+_KINDS: dict[str, FileKind] = {
+    **dict.fromkeys((".wav", ".flac", ".ogg", ".aif", ".aiff", ".mp3"), "a recording"),
+    **dict.fromkeys((".ply", ".obj", ".glb", ".gltf", ".stl"), "a mesh or Gaussians"),
+    **dict.fromkeys(PICTURE_SUFFIXES, "a picture"),
+    **dict.fromkeys(VIDEO_SUFFIXES, "a video"),
+}
+"""Kinds by the endings of names."""
+_FILE_SUFFIXES = (
+    *(*_KINDS, ".csv", ".json", ".sfz", ".txt", ".toml", ".safetensors", ".gif", ".html", ".htm"),
+    *(".gz", ".tar", ".zip", ".dsp", ".lib", ".uff", ".unv"),
 )
 """Endings by which a name is that of a file: a folder's may have a dot too, as in bowl-1.2 or name.github.io."""
 
 
 class InputError(AvmsfError):
-    """An option names a file or folder that does not exist, or is of another kind."""
+    """An option is unknown, or names a file or folder that does not exist or is of another kind."""
 
 
 class OutputError(AvmsfError):
@@ -45,11 +47,11 @@ class Existing:
     """Marks a path that has to exist before a verb begins."""
 
     what: str
-    kinds: tuple[FileKind, ...]
+    kinds: tuple[FileKind, ...] = ()
     """What it may be; a file of no known kind is left to its reader."""
 
     def check(self, path: Path) -> None:
-        """Raise `InputError` where nothing is at the path, or something of a kind that is known and no other use."""
+        """Raise `InputError` for no file or one of another kind, `FieldFileError` for a field that cannot be read."""
         try:
             found = None if path.exists() else "no such file or folder"
         except OSError as error:
@@ -62,19 +64,8 @@ class Existing:
             cached = path / CACHE / CACHED_FIELD
             other = cached if "a sound field" in self.kinds and cached.is_file() else "another"
             raise InputError.expected(self.what, kind, got=kind, file=path, advice=f"name {other}")
-
-
-@dataclass(frozen=True)
-class ExistingField(Existing):
-    """Marks the path of a field's file that this version has to be able to read."""
-
-    what: str = "a sound field, as avmsf fit writes it"
-    kinds: tuple[FileKind, ...] = ("a sound field",)
-
-    def check(self, path: Path) -> None:
-        """Raise `InputError` for no file or another kind, `FieldFileError` for a field that cannot be read."""
-        super().check(path)
-        FIELD.read_record(path)
+        if "a sound field" in self.kinds and kind in (None, "a sound field"):
+            FIELD.read_record(path)
 
 
 @dataclass(frozen=True)
@@ -89,7 +80,7 @@ class NewFile:
     def check(self, path: Path) -> None:
         """Raise `OutputError` for a path where no file can be written, and for the ending of another format."""
         suffix = path.suffix.lower()
-        if self.or_folder and (is_folder(path) or suffix not in FILE_SUFFIXES):
+        if self.or_folder and (is_folder(path) or suffix not in _FILE_SUFFIXES):
             return
         expect_writable(path)
         if suffix not in self.suffixes:
@@ -104,38 +95,40 @@ class NewFolder:
 
     def check(self, path: Path) -> None:
         """Raise `OutputError` for a path where no folder can be made, and for a name with the ending of a file."""
-        if not is_folder(path) and path.suffix.lower() in FILE_SUFFIXES:
+        if not is_folder(path) and path.suffix.lower() in _FILE_SUFFIXES:
             got, advice = f"one with {path.suffix}", f"use {path.with_suffix('')}"
             wanted = "the name of a folder"
             raise OutputError.expected(wanted, path.suffix, got=got, file=path, name="suffix", advice=advice)
         expect_writable(path / "file")
 
 
-FieldFile = Annotated[Path, tyro.conf.arg(metavar="FIELD.safetensors"), ExistingField()]
+def arg(metavar: str, *aliases: str, name: str | None = None) -> Any:
+    """Return how an option is shown: what its value is called, and no default, which its text gives if there is one."""
+    return tyro.conf.arg(name=name, metavar=metavar, aliases=aliases or None, help_behavior_hint="")
+
+
+FieldFile = Annotated[
+    Path,
+    tyro.conf.arg(metavar="FIELD.safetensors"),
+    Existing("a sound field, as avmsf fit writes it", ("a sound field",)),
+]
 CaptureFolder = Annotated[
     Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv", ("a folder",))
 ]
-OtherCapture = Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder", ("a folder",))]
-ShapeFile = Annotated[
-    Path | None, tyro.conf.arg(metavar="MESH|PLY"), Existing("a mesh or Gaussians", ("a mesh or Gaussians",))
-]
-SettingsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml"), Existing("a capture.toml", ())]
-OutputFolder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER"), NewFolder()]
-PlotsFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), NewFolder()]
-CacheFolder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER"), NewFolder()]
-ContactTable = Annotated[Path | None, tyro.conf.arg(metavar="TABLE.csv"), Existing("a table of contacts", ())]
-PositionList = Annotated[
-    tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], tyro.conf.arg(metavar="X Y Z")
-]
+OtherCapture = Annotated[Path | None, arg("CAPTURE"), Existing("a capture folder", ("a folder",))]
+ShapeFile = Annotated[Path | None, arg("MESH|PLY"), Existing("a mesh or Gaussians", ("a mesh or Gaussians",))]
+SettingsFile = Annotated[Path | None, arg("FILE.toml"), Existing("a capture.toml")]
+ContactData = Annotated[Path | None, arg("FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))]
+OutputFolder = Annotated[Path | None, arg("FOLDER", "-o"), NewFolder()]
+PlotsFolder = Annotated[Path | None, arg("FOLDER"), NewFolder()]
+CacheFolder = Annotated[Path | None, arg("FOLDER"), NewFolder()]
+ContactTable = Annotated[Path | None, arg("TABLE.csv"), Existing("a table of contacts")]
+PositionList = Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], arg("X Y Z")]
 """Vectors, one for each time that the option is given."""
-NEW_TENSORS = NewFile((".safetensors",))
-"""A field or features to write."""
 
 
-def expect_writable(path: Path | None) -> None:
-    """Raise `OutputError` where no file can be written at `path`, where one is given: before work of minutes."""
-    if path is None:
-        return
+def expect_writable(path: Path) -> None:
+    """Raise `OutputError` where no file can be written at `path`: before work of minutes."""
     if is_folder(path):
         raise OutputError.expected("the name of a file", "folder", got="a folder", file=path)
     folder = path.parent
@@ -167,23 +160,13 @@ def path_mark(hint: Any) -> Existing | NewFile | NewFolder | None:
 
 
 def kind_of(path: Path) -> FileKind | None:
-    """Return what is at a path, by its first bytes and its name; None for what is not known."""
+    """Return what is at a path, by its name and its first bytes; None for what is not known."""
     if path.is_dir():
         return "a folder"
-    suffix = path.suffix.lower()
-    by_name: tuple[tuple[tuple[str, ...], FileKind], ...] = (
-        (_SOUND_SUFFIXES, "a recording"),
-        (_SHAPE_SUFFIXES, "a mesh or Gaussians"),
-        (PICTURE_SUFFIXES, "a picture"),
-        (VIDEO_SUFFIXES, "a video"),
-    )
-    named = next((kind for suffixes, kind in by_name if suffix in suffixes), None)
-    if named is not None:
+    if named := _KINDS.get(path.suffix.lower()):
         return named
     try:
         entries = read_metadata(path)
     except (OSError, ValueError):
         return None
-    if FEATURES_KEY in entries:
-        return "features"
-    return "a sound field" if FIELD.key in entries else None
+    return "features" if FEATURES_KEY in entries else "a sound field" if FIELD.key in entries else None

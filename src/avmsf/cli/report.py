@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
-from avmsf.cli.printing import MAX_LISTED_MODES, decimals, display, table
+from avmsf.cli.output import decimals, display, table
 from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.task import Renderer
@@ -23,10 +23,13 @@ from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.quality import ModeQuality
 from avmsf.modal.modes import ModalBank
 from avmsf.pipeline.record import RECORD, modes_words, recorded
 from avmsf.symmetry.symmetries import Symmetries
 
+MAX_LISTED_MODES = 15
+"""Modes in a table, those of most energy."""
 HEADINGS = {"relative_stft": "relative STFT error", "l1": "L1", "l1_log": "L1-log", "envelope": "ENV"}
 """Metrics in the order of the table, as its columns call them."""
 
@@ -34,7 +37,6 @@ HEADINGS = {"relative_stft": "relative STFT error", "l1": "L1", "l1_log": "L1-lo
 def describe(field: SoundField) -> dict[str, Any]:
     """Return what the field is, as plain values."""
     points = field.gain_field.points
-    noise = float(field.residual.magnitude.square().mean().sqrt())
     return {
         "capture": field.origin.capture,
         "sample_rate": field.sample_rate,
@@ -45,7 +47,7 @@ def describe(field: SoundField) -> dict[str, Any]:
         "extent_meters": (points.amax(0) - points.amin(0)).tolist(),
         "bounds_meters": [points.amin(0).tolist(), points.amax(0).tolist()],
         "gain_field": {"kind": field.gain_field.kind, **field.gain_field.record()},
-        "residual_rms": noise,
+        "residual_rms": float(field.residual.magnitude.square().mean().sqrt()),
         "per_newton": field.origin.per_newton,
         "trained_on": list(field.origin.trained_on),
         "pipeline": {**recorded(field), "fit": asdict(field.origin.config)},
@@ -57,31 +59,30 @@ def describe(field: SoundField) -> dict[str, Any]:
 def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list[str]:
     """Return lines on a field in the file `path`: what it is and how good it is; all with `settings`."""
     values = describe(field)
-    report, trained = values["report"], counted(len(values["trained_on"]), "recording")
-    extent = ", ".join(
-        f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in zip("xyz", *values["bounds_meters"], strict=True)
-    )
+    report = values["report"]
     reason = f" ({report['damping_reason']})" if "damping_reason" in report else ""
     modes = modes_words(len(field.bank), values["supporting_pole_count"])
-    scale = "per newton" if values["per_newton"] else "on the scale of the recordings"
     rows = [
         ("modes", f"{modes}, {report.get('damping', 'shared')} damping{reason}"),
         ("gains", _gains_words(values["gain_field"])),
-        ("fitted to", trained),
+        ("fitted to", counted(len(values["trained_on"]), "recording")),
     ]
     if settings:
+        extent = ", ".join(
+            f"{axis} {low:.3g} to {high:.3g}" for axis, low, high in zip("xyz", *values["bounds_meters"], strict=True)
+        )
+        scale = "per newton" if values["per_newton"] else "on the scale of the recordings"
         rows += [
             ("sounds", f"{values['seconds']:.3g} s at {values['sample_rate']:g} Hz, {scale}"),
             ("noise", f"{values['residual_rms']:.2g} (root mean square of the residual)"),
             ("object", f"{values['points']} points, {extent} m"),
         ]
-    if settings and "guess" not in report:
-        rows += _settings_rows(values["pipeline"])
+        rows += _settings_rows(values["pipeline"]) if "guess" not in report else []
     if field.body is not None:
         rows.append(("body", f"{field.body} (the most probable one{_gained(report)})"))
+        rows += [("warning", field.body.warning)] if field.body.warning else []
     elif report.get("supports_tried"):
         rows.append(("body", "none, free or held, predicts contacts left out better than smooth kernels"))
-    rows += [("warning", field.body.warning)] if field.body is not None and field.body.warning else []
     rows += [("quality", words) for words in quality_words(field, path)]
     rows += [("outlier", words) for words in outlier_words(field)]
     rows += [("edited", _edit_words(edit)) for edit in report.get("edits", [])]
@@ -111,8 +112,7 @@ def _gains_words(gains: dict[str, Any]) -> str:
 
 def _settings_rows(pipeline: dict[str, Any]) -> list[tuple[str, str]]:
     """Return lines on the stages that made the field, if its file names them."""
-    fit, scene = pipeline["fit"], pipeline.get("scene")
-    rows = []
+    fit, scene, rows = pipeline["fit"], pipeline.get("scene"), []
     if "extraction" in pipeline:
         rows.append(("extraction", f"{pipeline['extraction']}, {pipeline['modes']} modes at most"))
         rows.append(("gain model", pipeline["gain_model"]))
@@ -133,22 +133,19 @@ def _edit_words(edit: dict[str, Any]) -> str:
         parts.append(f"from {edit['from']['name']} to {edit['to']['name']}")
     parts += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
     usual = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
-    parts += [f"{name} {_by_mode(edit[name])}" for name, same in usual.items() if edit.get(name, same) != same]
+    for name in [name for name, same in usual.items() if edit.get(name, same) != same]:
+        # One value, or one for each mode; None is one that is muted.
+        values = edit[name] if isinstance(edit[name], list) else [edit[name]]
+        known = [each for each in values if each is not None] or [-math.inf]
+        ends = dict.fromkeys(f"{each:.4g}" for each in (min(known), max(known)))
+        mute = f", {values.count(None)} muted" if None in values else ""
+        parts.append(f"{name} {' to '.join(ends)}{' by mode' * (len(values) > 1)}{mute}")
     parts += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
     beyond = {"silent_hertz": "beyond half the sample rate", "overdamped_hertz": "overdamped"}
     parts += [f"modes {what}: {len(edit[name])}" for name, what in beyond.items() if edit.get(name)]
     if scores := edit.get("clap", {}).get("scores"):
         parts.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
     return ", ".join(parts)
-
-
-def _by_mode(values: float | list[float | None] | None) -> str:
-    """Return one value, or the range of those of single modes; None is what is muted."""
-    if not isinstance(values, list):
-        return "-inf" if values is None else f"{values:.4g}"
-    known = [each for each in values if each is not None] or [0.0]
-    mute = values.count(None)
-    return f"{min(known):.4g} to {max(known):.4g} by mode" + (f", {mute} muted" if mute else "")
 
 
 def quality_words(field: SoundField, path: Path) -> list[str]:
@@ -167,34 +164,36 @@ def outlier_words(field: SoundField) -> list[str]:
     lines = []
     for name, words in report.get("outliers", {}).items():
         done = "left out of the fit" if name in report.get("excluded", ()) else "used in the fit all the same"
-        found = report.get("outlier_figures", {}).get(name)
-        lines.append(f"{done}: {words}" + (f" ({_figures(found)})" if display.verbose and found else ""))
+        figures = ""
+        if display.verbose and (found := report.get("outlier_figures", {}).get(name)):
+            where = ", ".join(f"{each + 0.0:.4g}" for each in found["place"])
+            figures = (
+                f" (log likelihood ratio per mode {found['ratio']:.2g}, and {found['place_ratio']:.2g} at ({where}) m, "
+                f"{found['distance']:.2g} m away; plausible above 0)"
+            )
+        lines.append(f"{done}: {words}{figures}")
     return lines
-
-
-def _figures(found: Mapping[str, Any]) -> str:
-    where = ", ".join(f"{each + 0.0:.4g}" for each in found["place"])
-    return (
-        f"log likelihood ratio per mode {found['ratio']:.2g}, and {found['place_ratio']:.2g} at ({where}) m, "
-        f"{found['distance']:.2g} m away; plausible above 0"
-    )
 
 
 def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction) -> dict[str, Scores]:
     """Score the field, baselines of the same training impacts, and the held-out recordings' own gains without noise.
 
-    All by recordings aligned like those that the modes were found in.
+    All by recordings aligned like those that the modes were found in. Directions count in a baseline of their own where
+    they choose other neighbors.
     """
     train, test, count = modes.aligned(train), modes.aligned(test), min(3, len(train))
+    nearest = f"mean waveform of {count} nearest"
     renderers: dict[str, Renderer] = {
         "field": field,
         "nearest recording": NearestRecording(train),
-        f"mean waveform of {count} nearest": MeanWaveform(train, count),
+        nearest: MeanWaveform(train, count),
+        f"{nearest}, by direction": MeanWaveform(train, count, by_direction=True),
+        f"mean gains of {count} nearest": MeanGains(train, modes, count),
+        "white noise": WhiteNoise(train),
     }
-    if train.directions is not None:
-        renderers[f"mean waveform of {count} nearest, by direction"] = MeanWaveform(train, count, by_direction=True)
-    renderers |= {f"mean gains of {count} nearest": MeanGains(train, modes, count), "white noise": WhiteNoise(train)}
     scores = {name: evaluate(renderer, test) for name, renderer in renderers.items()}
+    if scores[nearest].mean() == scores[f"{nearest}, by direction"].mean():
+        del scores[f"{nearest}, by direction"]
     return scores | {"the held-out recordings' own gains, no noise": score(floor(test, modes.bank), test)}
 
 
@@ -217,11 +216,6 @@ def score_table(title: str, scores: Mapping[str, Scores]) -> str:
         with_error = f"{format_number(mean[first])} ± {format_number(error[first], 1)}"
         rows.append([method, with_error, *(format_number(mean[metric]) for metric in others)])
     return table(title, ["", *HEADINGS.values()], rows)
-
-
-def score_values(scores: Mapping[str, Scores]) -> dict[str, dict[str, float]]:
-    """Return the means as plain values for JSON."""
-    return {method: each.mean() for method, each in scores.items()}
 
 
 def features_lines(report: Mapping[str, Any]) -> list[str]:
@@ -251,22 +245,40 @@ def levels(amplitudes: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes
     return 20 * torch.log10((size / size.max().clamp_min(smallest)).clamp_min(1e-10))
 
 
-def mode_rows(bank: ModalBank, level_db: Float[Tensor, " modes"]) -> list[dict[str, Any]]:
-    """Return the modes in the bank's order, numbered from 1 by frequency; levels are against the strongest pole's."""
-    names = ("number", "frequency_hertz", "damping_per_second", "t60_seconds", "level_db")
-    columns = (bank.frequency.tolist(), bank.damping.tolist(), level_db.tolist())
-    return [
-        dict(zip(names, (number, frequency, damping, math.log(1000) / damping, level), strict=True))
-        for number, (frequency, damping, level) in enumerate(zip(*columns, strict=True), start=1)
-    ]
+def mode_rows(
+    bank: ModalBank,
+    level_db: Float[Tensor, " modes"],
+    is_mode: Bool[Tensor, " modes"],
+    quality: ModeQuality | None = None,
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the modes and the supporting poles as plain values, numbered together from 1 by frequency."""
+    columns = {
+        "frequency_hertz": bank.frequency,
+        "damping_per_second": bank.damping,
+        "t60_seconds": math.log(1000) / bank.damping,
+        "level_db": level_db,
+    }
+    if quality is not None:
+        columns |= {
+            "frequency_spread_hertz": quality.frequency_spread,
+            "damping_spread_per_second": quality.damping_spread,
+            "stable_orders": quality.stable_orders,
+            "phase_coherence": quality.coherence,
+            "energy_share": quality.energy_share,
+            "explained_left_out": quality.explained_left_out,
+        }
+    cells = zip(*(column.tolist() for column in columns.values()), strict=True)
+    rows = [{"number": number, **dict(zip(columns, row, strict=True))} for number, row in enumerate(cells, start=1)]
+    parts = list(zip(rows, is_mode.tolist(), strict=True))
+    return [row for row, mode in parts if mode], [row for row, mode in parts if not mode]
 
 
-def mode_table(of: str, rows: Sequence[dict[str, Any]], supporting: int) -> str:
-    """Return the modes of most energy for printing, with their quality where the rows have it, and the other poles."""
+def mode_table(of: str, rows: Sequence[dict[str, Any]], supporting: int, *, every: bool = False) -> str:
+    """Return the modes of most energy, or all, for printing, with their quality where the rows have it."""
     # Energy over time: proportional to the square of the amplitude and to the decay time.
     most = sorted(rows, key=lambda row: row["level_db"] + 10 * math.log10(row["t60_seconds"]), reverse=True)
-    most = most[:MAX_LISTED_MODES]
-    which = "by energy" if len(most) == len(rows) else f"the {MAX_LISTED_MODES} of most energy"
+    most = most if every else most[:MAX_LISTED_MODES]
+    which = "by energy" if len(most) == len(rows) else f"the {MAX_LISTED_MODES} of most energy (--all lists all)"
     columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
     scored = any("energy_share" in row for row in rows)
     columns += ["energy", "phase", "orders", "left out"] if scored else []

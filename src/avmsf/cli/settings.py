@@ -16,14 +16,12 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import tyro
 
-from avmsf.cli.paths import Existing, InputError
+from avmsf.cli.paths import Existing, InputError, arg
 
 T = TypeVar("T")
-Assignments = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")]
+Assignments = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg("NAME=VALUE", name="set")]
 """Settings, one for each time that the option is given."""
-SettingsTable = Annotated[
-    Path | None, tyro.conf.arg(metavar="FILE.toml"), Existing("settings, as --print-config writes them", ())
-]
+SettingsTable = Annotated[Path | None, arg("FILE.toml"), Existing("settings, as --print-config writes them")]
 _OTHER: Any = object()
 """Stands for a value of another type."""
 _WIDTH = 100
@@ -63,14 +61,10 @@ def as_toml(config: object) -> str:
             lines += ["", f"[{owner}]"]
             section = owner
         lines += textwrap.wrap(" ".join(meaning.split()), _WIDTH, initial_indent="# ", subsequent_indent="# ")
-        lines.append(f"{last} = {_toml(value)}")
+        infinite = isinstance(value, float) and not math.isfinite(value)
+        text = str(value) if infinite else json.dumps("null" if value is None else value, default=str)
+        lines.append(f"{last} = {text}")
     return "\n".join(lines)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return json.dumps("null" if value is None else value, default=str)
 
 
 def settings_of(config: object, owner: str = "") -> Iterator[tuple[str, Any, Any, str]]:
@@ -126,11 +120,15 @@ def _full_name(name: str, known: Mapping[str, Any], file: Path | None) -> str:
     if len(meant) == 1:
         return meant[0]
     if meant:
-        advice = f"write {' or '.join(each.removeprefix('scene.') for each in meant)}"
-        raise InputError.expected("the name of one setting", name, file=file, name="--set", advice=advice)
-    near = get_close_matches(name, [*known, *(each.removeprefix("scene.") for each in known)], n=1, cutoff=0.5)
-    advice = f"did you mean {near[0]}? --print-config lists all" if near else "--print-config lists all"
-    raise InputError.expected("the name of a setting", name, file=file, name="--set", advice=advice)
+        wanted, advice = (
+            "the name of one setting",
+            f"write {' or '.join(each.removeprefix('scene.') for each in meant)}",
+        )
+    else:
+        near = get_close_matches(name, [*known, *(each.removeprefix("scene.") for each in known)], n=1, cutoff=0.5)
+        advice = "; ".join([*(f"did you mean {each}?" for each in near), "--print-config lists all"])
+        wanted = "the name of a setting"
+    raise InputError.expected(wanted, name, file=file, name="--set", advice=advice)
 
 
 def _parsed(name: str, value: Any, hint: Any) -> Any:
@@ -162,11 +160,9 @@ def _as_type(value: Any, hint: Any) -> Any:
         return value if value in arguments else _OTHER
     if kind is tuple and isinstance(value, list):
         parts = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
-        if len(parts) != len(value):
-            return _OTHER
-        found = tuple(_as_type(*pair) for pair in zip(value, parts, strict=True))
+        found = tuple(map(_as_type, value, parts)) if len(parts) == len(value) else (_OTHER,)
         return _OTHER if _OTHER in found else found
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    if hint is float and type(value) is int:
         return float(value)
     if hint is Path and isinstance(value, str):
         return Path(value)

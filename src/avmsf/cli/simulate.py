@@ -7,10 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli import INTERRUPTED
-from avmsf.cli.common import Configured, Flag
-from avmsf.cli.paths import CacheFolder, Existing, OutputFolder
-from avmsf.cli.printing import display, next_command, print_json, print_result, say, show, table
+from avmsf.cli.options import Configured, Flag, Int, Name, Number
+from avmsf.cli.output import display, next_command, print_json, print_result, show, table
+from avmsf.cli.paths import CacheFolder, Existing, OutputFolder, arg
 from avmsf.cli.settings import with_settings
 from avmsf.errors import SimulationError
 from avmsf.fem.material import MATERIALS
@@ -24,41 +23,38 @@ _IDENTITY = ("kind", "mesh", "material", "seed")
 class Options(Configured):
     """Simulate objects, their recordings and images, as capture folders with ground truth.
 
-    `avmsf simulate sim-20 --output FOLDER` makes a benchmark set, one folder per object. It skips complete objects, so
-    repeat an interrupted command to continue it. A single object, of the set by its name or any other by --kind or
-    --mesh, is written to FOLDER itself.
+    Of a set (sim-20, held-out) every object gets a folder in the output, and those that are complete are skipped; a
+    single object, of a set or by --kind or --mesh, is written to the output itself.
     """
 
-    what: tyro.conf.Positional[Annotated[str | None, tyro.conf.arg(metavar="NAME")]] = None
-    """sim-20 or held-out for a set, one of its objects, or example; nothing for an object of your own."""
+    what: tyro.conf.Positional[Name] = None
+    """A set, one of its objects, or example; nothing for your own."""
     output: OutputFolder = None
     """Output folder."""
     list: Flag = False
     """Only list the sets' objects, the shapes and the materials."""
     cache: CacheFolder = None
     """Cache of elastic modes, which take most of the time."""
-    kind: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    kind: Name = None
     """Shape; --list names them."""
-    mesh: Annotated[
-        Path | None, tyro.conf.arg(metavar="MESH"), Existing("a mesh: obj, ply, glb or stl", ("a mesh or Gaussians",))
-    ] = None
+    mesh: Annotated[Path | None, arg("MESH"), Existing("a mesh: obj, ply, glb or stl", ("a mesh or Gaussians",))] = None
     """A mesh or scan instead of a shape, in meters."""
-    material: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Name in the table of materials; --list names them."""
-    seed: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Random seed of the proportions, the contacts, the noise and the imperfections."""
-    impacts: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    material: Name = None
+    """Material; --list names them."""
+    seed: Int = None
+    """Seed of proportions, contacts, noise and imperfections."""
+    impacts: Int = None
     """Number of impacts; by default 40."""
-    seconds: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Length of each recording that is used, from its onset, by default 2 s."""
-    sample_rate: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    seconds: Number = None
+    """Length of each recording from its onset, by default 2 s."""
+    sample_rate: Int = None
     """Sample rate, Hz; by default 48000."""
-    thickness: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Wall thickness, meters; by default drawn at random for a shape, and none (solid) for a mesh."""
-    size: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    thickness: Number = None
+    """Wall, meters; by default random for a shape, solid for a mesh."""
+    size: Number = None
     """Longest side of the bounding box, meters."""
-    views: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Images to render on three circles: a multiple of 3, by default 72; 0 for none."""
+    views: Int = None
+    """Images, a multiple of 3, by default 72; 0 for none."""
 
     usual = ObjectRecipe()
 
@@ -70,8 +66,10 @@ class Options(Configured):
 
     @cached_property
     def all_settings(self) -> ObjectRecipe:
-        """The recipe of a single object."""
-        return self.applied(_recipe_of(self.what))
+        """The recipe of a single object: the named one, or for a set and an object of the user's own the usual one."""
+        if self.what is None or self.what in SETS:
+            return self.applied(ObjectRecipe())
+        return self.applied(EXAMPLE if self.what == "example" else named_recipe(self.what))
 
     def check_inputs(self) -> None:
         """Raise `InputError` for a mesh that does not exist, `SimulationError` for options that do not fit."""
@@ -86,43 +84,26 @@ class Options(Configured):
                 raise SimulationError.expected(f"none with {self.what}", got="one", name=name, advice=advice)
 
 
-def _recipe_of(what: str | None) -> ObjectRecipe:
-    """Return the named object's recipe; for the whole set and for an object of the user's own the usual one."""
-    if what is None or what in SETS:
-        return ObjectRecipe()
-    return EXAMPLE if what == "example" else named_recipe(what)
-
-
 def run(options: Options) -> int:
-    """Simulate; return 130 where Ctrl-C stopped it."""
+    """Simulate, or list what can be simulated."""
     from avmsf.simulate.simulation_folder import simulate_set
 
     if options.list:
-        _list(json=options.json)
-        return 0
+        return _list()
     assert options.output is not None
-    recipes, folder = _chosen(options, options.output)
-    try:
-        simulate_set(recipes, folder, cache=options.cache, progress=display.objects())
-    except KeyboardInterrupt:
-        say("avmsf simulate: interrupted; repeat the command to continue", always=True)
-        return INTERRUPTED
+    if options.what in SETS:
+        recipes, folder = {name: options.applied(each) for name, each in SETS[options.what].items()}, options.output
+    else:
+        place = options.output.resolve()
+        recipes, folder = {place.name: options.all_settings}, place.parent
+    simulate_set(recipes, folder, cache=options.cache, progress=display.objects())
     text = f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}"
-    values = {"output": str(options.output), "objects": [str(folder / name) for name in recipes]}
-    print_result(text, values, json=options.json)
+    print_result(text, {"output": str(options.output), "objects": [str(folder / name) for name in recipes]})
     next_command("avmsf check", folder / next(iter(recipes)))
     return 0
 
 
-def _chosen(options: Options, output: Path) -> tuple[dict[str, ObjectRecipe], Path]:
-    """Return the recipes by their folders' names, and the folder that holds these."""
-    if options.what in SETS:
-        return {name: options.applied(recipe) for name, recipe in SETS[options.what].items()}, output
-    place = output.resolve()
-    return {place.name: options.all_settings}, place.parent
-
-
-def _list(*, json: bool) -> None:
+def _list() -> int:
     from avmsf.simulate.shapes import KINDS
 
     rows = [
@@ -131,8 +112,8 @@ def _list(*, json: bool) -> None:
         for name, recipe in objects.items()
     ]
     columns = ("set", "object", "shape", "material", "seed", "rotational symmetry")
-    shapes = f"shapes for --kind: {', '.join(KINDS)}\nmaterials: {', '.join(MATERIALS)}"
-    show(f"{table('objects', columns, rows, words=4)}\n{shapes}", json=json)
-    if json:
-        names = [name for objects in SETS.values() for name in objects]
-        print_json({"objects": names, "shapes": list(KINDS), "materials": list(MATERIALS)})
+    show(table("objects", columns, rows, words=4))
+    show(f"shapes for --kind: {', '.join(KINDS)}\nmaterials: {', '.join(MATERIALS)}")
+    names = [name for objects in SETS.values() for name in objects]
+    print_json({"objects": names, "shapes": list(KINDS), "materials": list(MATERIALS)})
+    return 0

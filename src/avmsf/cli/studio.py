@@ -8,16 +8,19 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.common import Flag, Printing
-from avmsf.cli.paths import Existing, ShapeFile
-from avmsf.cli.printing import print_json, say
+from avmsf.cli.options import Common, Flag, Int
+from avmsf.cli.output import print_json, say
+from avmsf.cli.paths import Existing, FileKind, ShapeFile, arg
 from avmsf.errors import StudioError
 from avmsf.modal.config import expect_modes
 from avmsf.pipeline.config import Preset
 
+_SHOWN = "a field, a capture folder, a folder of images or a mesh"
+_KINDS: tuple[FileKind, ...] = ("a sound field", "a folder", "a mesh or Gaussians")
+
 
 @dataclass(frozen=True)
-class Options(Printing):
+class Options(Common):
     """Open a web page that plays an object, locates impacts, edits fields and records captures.
 
     The page plays and edits a field and locates recordings with it; of a capture folder, a folder of images or a mesh
@@ -25,41 +28,32 @@ class Options(Printing):
     secret; Ctrl-C ends it.
     """
 
-    target: tyro.conf.Positional[
-        Annotated[
-            Path | None,
-            tyro.conf.arg(metavar="FIELD|FOLDER|MESH"),
-            Existing(
-                "a field, a capture folder, a folder of images or a mesh",
-                ("a sound field", "a folder", "a mesh or Gaussians"),
-            ),
-        ]
-    ] = None
+    target: tyro.conf.Positional[Annotated[Path | None, arg("FIELD|FOLDER|MESH"), Existing(_SHOWN, _KINDS)]] = None
     """A field file, a capture folder, a folder that shows the object, or a mesh. A mesh is copied to a folder of its
     name next to it, which becomes the capture; but surface.obj, .ply, .glb or .stl, and Gaussians called splats.ply or
     point_cloud.ply, open the folder that holds them as the capture. --capture names another folder for either."""
     object: ShapeFile = None
-    """Mesh, in meters, or Gaussians to show; by default what the capture folder holds."""
-    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE")] = None
-    """Capture folder of a field, to show its recordings and record more; for a mesh, the folder to make."""
-    port: int | None = None
+    """Mesh, in meters, or Gaussians to show; by default the capture's."""
+    capture: Annotated[Path | None, arg("CAPTURE")] = None
+    """Capture folder of a field, or for a mesh the folder to make."""
+    port: Int = None
     """Port to serve at; 0 for any free one. By default 8634, for which a browser remembers that the page may record, or
     any free one if that is taken."""
     no_browser: Flag = False
     """Do not open the browser."""
-    model: Annotated[str | None, tyro.conf.arg(metavar="FOLDER|NAME")] = None
+    model: Annotated[str | None, arg("FOLDER|NAME")] = None
     """Stable Audio pipeline for edits by text: a folder, or its name on the hub; needs the extra `text`."""
     modes: int = 128
     """Maximum number of modes of a reconstruction."""
     preset: Preset = "default"
-    """Settings of a reconstruction; paper: everything as published, which takes hours."""
+    """Settings of a reconstruction; paper: as published, takes hours."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         expect_modes(self.modes)
         if self.target is None:
-            raise StudioError.expected("a field, a capture folder, a folder of images or a mesh", name="target")
+            raise StudioError.expected(_SHOWN, name="target")
 
 
 def run(options: Options) -> int:
@@ -79,7 +73,7 @@ def run(options: Options) -> int:
         opened,
         port=options.port,
         browser=not options.no_browser,
-        log=lambda address: _print(address, json=options.json),
+        log=_print,
         config=StudioConfig(options.model, options.modes, preset=options.preset),
     )
     say("closed")
@@ -89,9 +83,8 @@ def run(options: Options) -> int:
     return 0
 
 
-def _print(address: str, *, json: bool) -> None:
+def _print(address: str) -> None:
     say(f"open {address}   (Ctrl-C ends)")
-    if json:
-        print_json({"address": address})
-        # A program that starts the studio reads this while the page is served.
-        sys.stdout.flush()
+    print_json({"address": address})
+    # A program that starts the studio reads this while the page is served.
+    sys.stdout.flush()

@@ -1,10 +1,13 @@
 """What the options of verbs have in common: how they are parsed and checked, before what computes is loaded."""
 
+import io
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import redirect_stderr
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
@@ -13,12 +16,17 @@ from avmsf.capture.issues import Issues
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.settings import settings_of as capture_settings_of
 from avmsf.capture.table import present_impacts, read_impacts
-from avmsf.cli.paths import InputError, path_mark
+from avmsf.cli.paths import InputError, arg, path_mark
 from avmsf.cli.settings import Assignments, SettingsTable, as_toml, settings_of
 from avmsf.errors import AvmsfError, CaptureError
 
-Flag = tyro.conf.FlagCreatePairsOff[bool]
+Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
 """An option that is off unless it is given."""
+Int = Annotated[int | None, arg("INT")]
+Number = Annotated[float | None, arg("FLOAT")]
+Name = Annotated[str | None, arg("NAME")]
+"""Options that may be left out."""
+Device = Annotated[str | None, arg("cpu|cuda")]
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 _RENAMED = {"--at": "--position", "--picture": "--plots", "--to-material": "--to"}
 """Options of earlier versions, and what they are called now."""
@@ -26,6 +34,10 @@ DEVICES = ("cpu", "cuda")
 """Kinds of devices that commands compute on."""
 _PLY_HEADER_BYTES = 1 << 16
 """Bytes in which the header of a .ply ends: a hundred times those of a mesh with colors and normals."""
+_BORDERS = re.compile(r"[─│╭╮╰╯|+]|-{3,}")
+"""What tyro draws around a message."""
+_MORE = re.compile(r"Argument helptext:|For full helptext|Got errors:")
+"""What follows a message of tyro's in its box."""
 T = TypeVar("T")
 # Not Self, which run-time checks of types cannot read in a dataclass.
 C = TypeVar("C", bound="Common")
@@ -40,6 +52,10 @@ class Common:
     """Print only results, warnings and errors."""
     verbose: Flag = False
     """Print each step of the work as it begins."""
+    json: Flag = False
+    """Print the results as one JSON object to standard output."""
+    resumes: ClassVar[bool] = False
+    """Whether an interrupted command goes on from where it was when it is repeated."""
 
     @classmethod
     def parse(cls: type[C], words: Sequence[str]) -> C:
@@ -50,46 +66,48 @@ class Common:
         """Raise for the first path that cannot be used, see `paths`, and for what a command's own checks find."""
         hints = get_type_hints(type(self), include_extras=True)
         for each in fields(self):
-            mark = path_mark(hints[each.name])
-            value = getattr(self, each.name)
-            if mark is None or value is None:
-                continue
-            for path in value if isinstance(value, tuple) else (value,):
-                mark.check(path)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Printing(Common):
-    """Options of the verbs that print results."""
-
-    json: Flag = False
-    """Print the results as one JSON object to standard output, all else to standard error."""
+            mark, value = path_mark(hints[each.name]), getattr(self, each.name)
+            if mark is not None and value is not None:
+                for path in value if isinstance(value, tuple) else (value,):
+                    mark.check(path)
 
 
 def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | None = None) -> T:
-    """Return the options that the words spell; leaves by SystemExit for help and for what cannot be understood.
+    """Return the options that the words spell; leaves by SystemExit for help.
 
-    Raises `InputError` for an option that has another name now.
+    Raises `InputError` for what cannot be understood, and for an option that has another name now.
     """
     for word in words:
         if word in _RENAMED:
             raise InputError.expected(_RENAMED[word], got=word, name=word)
     given: dict[str, Any] = {} if default is None else {"default": default}
-    return tyro.cli(kind, prog=f"avmsf {verb}", args=words, **given)
+    try:
+        with redirect_stderr(io.StringIO()) as box:
+            return tyro.cli(kind, prog=f"avmsf {verb}", args=words, **given)
+    except SystemExit as ending:
+        if not ending.code:
+            raise
+        # The first line of the box is its title.
+        found = _MORE.split(box.getvalue().strip().partition("\n")[2])[0]
+        commas = any(re.fullmatch(r"-?[\d.]+(,-?[\d.]+)+", word) for word in words)
+        advice = "separate numbers by blanks" if commas else f"`avmsf {verb} --help` lists the options"
+        got = " ".join(_BORDERS.sub(" ", found).split()).rstrip(".")
+        raise InputError.expected("options of this command", got=got, name=verb, advice=advice) from None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Configured(Printing, ABC):
+class Configured(Common, ABC):
     """Options of the verbs that have more settings than options."""
 
     set: Assignments = ()
-    """Change a setting, such as splat.steps=500; once per setting."""
+    """Change a setting, such as splat.steps=500; once for each."""
     config: SettingsTable = None
-    """Take settings from this file; --set and other options come after it."""
+    """Take settings from this file; other options come after it."""
     print_config: Flag = False
-    """Print all settings with these options as a file for --config, and do nothing else."""
+    """Print all settings as a file for --config, and do nothing else."""
     usual: ClassVar[object]
     """The settings where nothing changes them."""
+    resumes: ClassVar[bool] = True
 
     @property
     @abstractmethod
@@ -141,21 +159,19 @@ def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
     return capture_settings_of(folder) if settings is None else CaptureSettings.read(settings)
 
 
-def expect_capture(folder: Path, settings: Path | None) -> None:
-    """Raise `CaptureError` for a capture folder whose table, settings or surface cannot be used, see `expect_rows`."""
-    expect_rows(folder, read_settings(folder, settings))
+def expect_capture(folder: Path, settings: CaptureSettings) -> int:
+    """Return the number of impacts of a capture folder's table.
 
-
-def expect_rows(folder: Path, settings: CaptureSettings) -> None:
-    """Raise `CaptureError` for a capture folder whose table cannot be used, or whose .ply has no such header."""
-    present_impacts(folder, read_impacts(folder, settings, Issues()), Issues())
+    Raises `CaptureError` where the table cannot be used, and where the surface is a .ply without such a header.
+    """
+    impacts = present_impacts(folder, read_impacts(folder, settings, Issues()), Issues())
     surface = find_surface_file(folder, settings)
-    if surface is None or surface.suffix.lower() != ".ply" or not surface.is_file():
-        return
-    with surface.open("rb") as file:
-        start = file.read(_PLY_HEADER_BYTES)
-    if not start.startswith(b"ply") or b"end_header" not in start:
-        raise CaptureError.expected(
-            "a mesh or point cloud", start[:8], got="a file without the header of a .ply", file=surface,
-            advice="export it again",
-        )  # fmt: skip
+    if surface is not None and surface.suffix.lower() == ".ply" and surface.is_file():
+        with surface.open("rb") as file:
+            start = file.read(_PLY_HEADER_BYTES)
+        if not start.startswith(b"ply") or b"end_header" not in start:
+            raise CaptureError.expected(
+                "a mesh or point cloud", start[:8], got="a file without the header of a .ply", file=surface,
+                advice="export it again",
+            )  # fmt: skip
+    return len(impacts)

@@ -11,10 +11,15 @@ from typing import Any
 from avmsf._utils.progress import ProgressDisplay
 from avmsf._utils.text import printable
 
-MAX_LISTED_MODES = 20
-"""Modes in a table, those of most energy."""
-display = ProgressDisplay()
-"""What a verb is doing, on the standard error: quiet or verbose by the options of the verb that runs."""
+
+class _Console(ProgressDisplay):
+    """What a verb prints: quiet, verbose or as JSON by the options of the verb that runs."""
+
+    json = False
+    """Whether the standard output is for one JSON object: results for people go to the standard error then."""
+
+
+display = _Console()
 say = display.say
 note = display.note
 doing = display.doing
@@ -46,26 +51,30 @@ def next_step(text: str) -> None:
 
 def next_command(command: str, path: Path | None = None, options: str = "") -> None:
     """Print a command that is useful next, unless --quiet is given."""
-    words = [command, *([] if path is None else [shlex.quote(str(path))]), *([options] if options else [])]
-    next_step(" ".join(words))
+    next_step(" ".join([command, *([] if path is None else [shlex.quote(str(path))]), *([options] if options else [])]))
 
 
-def show(text: str, *, json: bool = False) -> None:
-    """Print a result for people: to the standard output, or with `json`, which is for programs, the standard error."""
+def show(text: str) -> None:
+    """Print a result for people."""
     display.close()
-    print(printable(text), file=sys.stderr if json else sys.stdout, flush=True)
+    print(printable(text), file=sys.stderr if display.json else sys.stdout, flush=True)
 
 
-def print_json(value: Mapping[str, Any]) -> None:
-    """Print one JSON object to the standard output: what is not finite becomes null, what JSON does not know text."""
-    show(json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False, default=str))
+def print_json(values: Mapping[str, Any]) -> None:
+    """With --json, print a verb's result to the standard output: what is not finite as null, what JSON has not as text.
+
+    Without it, print nothing.
+    """
+    if display.json:
+        display.close()
+        text = json.dumps(_plain(values), indent=2, ensure_ascii=False, allow_nan=False, default=str)
+        print(printable(text), flush=True)
 
 
-def print_result(text: str, values: Mapping[str, Any], *, json: bool) -> None:
-    """Print a verb's result: as text, or as JSON with the text on the standard error."""
-    show(text, json=json)
-    if json:
-        print_json(values)
+def print_result(text: str, values: Mapping[str, Any]) -> None:
+    """Print a verb's result: as text, and with --json as values too."""
+    show(text)
+    print_json(values)
 
 
 def _plain(value: Any) -> Any:
@@ -73,6 +82,4 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(each) for each in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
