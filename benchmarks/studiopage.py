@@ -159,7 +159,7 @@ def _draw_field(browser: Any, address: str, capture: Path, folder: Path) -> list
 def _draw_capture(browser: Any, address: str, recorded: Path, folder: Path) -> Path:
     with _page(browser, address, TALL) as page:
         for number, (right, down) in enumerate(((-40, 30), (50, -20), (0, 60)), start=1):
-            place = page.evaluate("window.avmsf.project(window.avmsf.studio.view.controls.target.toArray())")
+            place = page.evaluate("window.avmsf.project(window.avmsf.studio.view.eye.controls.target.toArray())")
             page.mouse.click(place["x"] + right, place["y"] + down)
             page.set_input_files("#sheet-capture input[type=file]", _well_recorded(recorded / f"{number:03d}.wav"))
             page.wait_for_selector("#sheet-capture dl")
@@ -178,7 +178,7 @@ def _well_recorded(path: Path) -> Any:
 
 
 def _strike(page: Any) -> None:
-    place = page.evaluate("window.avmsf.project(window.avmsf.studio.view.controls.target.toArray())")
+    place = page.evaluate("window.avmsf.project(window.avmsf.studio.view.eye.controls.target.toArray())")
     page.mouse.click(place["x"] + 30, place["y"] + 20)
     # The first blow starts the browser's sound.
     page.wait_for_function("window.avmsf.studio.engine.context.state === 'running'")

@@ -41,7 +41,7 @@ CONVENTIONS = (
     f"last {MOST} have to make room.",
 )
 _START = """
-import { loadBundle } from "./bundle.js";
+import { loadBundle } from "./api.js";
 import { renderOffline } from "./sound.js";
 window.loaded = loadBundle().then((bundle) => { Object.assign(window, { bundle, renderOffline }); });
 """

@@ -36,7 +36,7 @@ ACROSS, ALONG = 21, 31
 RATE = 16_000.0
 FIELD_ABILITIES = ["locate", "edit", "save", "like"]
 LIVE = {"revision": 1, "undo": False, "abilities": FIELD_ABILITIES, "mode": "field", "rows": [0, 1, 2, 3, 4, 5]}
-LIVE |= {"materials": ["ceramic", "glass", "wood", "iron", "steel"], "jobKind": None}
+LIVE |= {"materials": ["ceramic", "glass", "wood", "iron", "steel"], "oldMaterial": "Present material"}
 Serve = Callable[..., str]
 Open = Callable[..., "Page"]
 

@@ -13,7 +13,7 @@ from typing import Any
 from avmsf.studio.guard import MAX_UPLOAD_BYTES, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
-from avmsf.studio.server import _listening, make_server
+from avmsf.studio.server import listen, make_server
 from avmsf.studio.studio import Studio, StudioConfig
 
 
@@ -73,14 +73,14 @@ def served(
     folder.mkdir(exist_ok=True)
     studio = Studio(opened, folder, config)
     token = new_token()
-    with _listening(0) as listener:
+    with listen(0) as listener:
         port = listener.getsockname()[1]
         app = Guard(make_app(studio), token=token, port=port, largest=largest)
         server = make_server(app)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:
-            _wait_until(lambda: server.started or not thread.is_alive())
+            wait_until(lambda: server.started or not thread.is_alive())
             yield Served(studio, port, token)
         finally:
             server.should_exit = True
@@ -88,7 +88,7 @@ def served(
         assert not thread.is_alive()
 
 
-def _wait_until(done: Any, seconds: float = 20.0) -> None:
+def wait_until(done: Any, seconds: float = 20.0) -> None:
     end = time.monotonic() + seconds
     while not done():
         assert time.monotonic() < end, "waited in vain"

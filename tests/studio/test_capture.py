@@ -6,6 +6,7 @@ import io
 import os
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ import torch
 
 from avmsf._utils.processes import write_lock
 from avmsf.capture import check, read_capture
+from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.capture.table import Impact
 from avmsf.errors import CaptureError, FolderInUseError, RecordingLengthError
 from avmsf.pipeline.config import CACHE
-from avmsf.studio import capture
-from avmsf.studio.capture import CaptureEditor, ImpactTable, read_contact
+from avmsf.studio.capture import CaptureEditor, read_contact
 from avmsf.studio.responses import RequestError, response_to
 from factories.capture_folder import fill, ring
 from factories.raising import raises
@@ -105,18 +106,21 @@ def test_what_fails_for_want_of_space_leaves_everything_as_it_was(
 ) -> None:
     editor = recorded(tmp_path, 2)
     before = contents(tmp_path)
+    replace = os.replace
 
-    def fail(*arguments: object) -> None:
-        raise CaptureError("No space left on device") from OSError(28, os.strerror(28))
+    def fail(source: Path, path: Path) -> None:
+        if path.name == "impacts.csv":
+            raise OSError(28, os.strerror(28))
+        replace(source, path)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(ImpactTable, "_write", fail)
-        for change in (lambda: editor.add(blow(2), contact(0.2)), lambda: editor.remove("002.wav")):
-            with pytest.raises(CaptureError):
-                change()
-            assert {path: content for path, content in contents(tmp_path).items() if path.parent == tmp_path} == {
-                path: content for path, content in before.items() if path.parent == tmp_path
-            }
+    monkeypatch.setattr(os, "replace", fail)
+    for change in (lambda: editor.add(blow(2), contact(0.2)), lambda: editor.remove("002.wav")):
+        with pytest.raises(CaptureError):
+            change()
+        assert {path: content for path, content in contents(tmp_path).items() if path.parent == tmp_path} == {
+            path: content for path, content in before.items() if path.parent == tmp_path
+        }
+    monkeypatch.undo()
     assert editor.add(blow(2), contact(0.2))["file"] == "003.wav"
 
 
@@ -296,10 +300,11 @@ def test_a_recording_that_cannot_be_used_is_refused(tmp_path: Path, content: byt
     assert [path.name for path in contents(tmp_path)] == ["capture.lock"]
 
 
-def test_a_recording_that_is_long_beyond_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.capture.audio.MAX_SAMPLES", 1000)
+def test_a_recording_that_is_long_beyond_use_is_refused(tmp_path: Path) -> None:
+    """Half an hour of silence, compressed to a few kilobytes."""
+    content = wav(np.zeros(MAX_SAMPLES + 1, dtype=np.float32), subtype="PCM_16", kind="FLAC")
     with pytest.raises(RecordingLengthError) as refused:
-        recorded(tmp_path, 0).add(blow(), contact(0.1))
+        recorded(tmp_path, 0).add(content, contact(0.1))
     assert response_to(refused.value).status_code == 413
 
 
@@ -348,56 +353,34 @@ def test_a_broken_table_is_left_alone(tmp_path: Path, text: str) -> None:
     assert (folder / "impacts.csv").read_text() == text
 
 
-def test_impacts_of_two_studios_at_once_are_all_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    both = threading.Barrier(2)
-    choose = CaptureEditor._next_name
-
-    def choose_at_once(self: CaptureEditor, table: ImpactTable) -> str:
-        name = choose(self, table)
-        try:
-            # Without a lock both are here at the same time, and have chosen the same name.
-            both.wait(0.5)
-        except threading.BrokenBarrierError:
-            both.reset()
-        return name
-
-    monkeypatch.setattr(CaptureEditor, "_next_name", choose_at_once)
+def test_impacts_of_two_studios_at_once_are_all_there(tmp_path: Path) -> None:
     added: dict[str, bytes] = {}
+    together = threading.Barrier(2)
 
-    def strike(number: int) -> None:
-        added[CaptureEditor(tmp_path).add(blow(number), contact(0.1))["file"]] = blow(number)
+    def record(studio: int) -> None:
+        editor = CaptureEditor(tmp_path)
+        for number in range(studio, 8, 2):
+            together.wait(20)
+            added[editor.add(blow(number), contact(0.1))["file"]] = blow(number)
 
-    studios = [threading.Thread(target=strike, args=(number,)) for number in range(2)]
-    for each in studios:
-        each.start()
-    for each in studios:
-        each.join()
-    assert sorted(row[0] for row in table(tmp_path)) == ["001.wav", "002.wav", "file"]
-    assert {name: (tmp_path / name).read_bytes() for name in ("001.wav", "002.wav")} == added
+    with ThreadPoolExecutor(2) as studios:
+        list(studios.map(record, range(2)))
+    names = [f"{number:03d}.wav" for number in range(1, 9)]
+    assert [row[0] for row in table(tmp_path)] == ["file", *names]
+    assert sorted(added) == names
+    assert {name: (tmp_path / name).read_bytes() for name in names} == added
 
 
-def test_a_change_that_another_process_does_not_let_through_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(capture, "_LOCK_TIMEOUT_SECONDS", 0.1)
-    held, done = threading.Event(), threading.Event()
+def test_a_change_waits_for_another_studios_and_then_changes_nothing(tmp_path: Path) -> None:
+    def change() -> None:
+        CaptureEditor(tmp_path, lock_seconds=0.1).add(blow(0), contact(0.1))
 
-    def hold() -> None:
-        with write_lock(tmp_path / CACHE, "capture", command="avmsf studio"):
-            held.set()
-            done.wait()
-
-    other = threading.Thread(target=hold)
-    other.start()
-    try:
-        held.wait()
+    with ThreadPoolExecutor(1) as other, write_lock(tmp_path / CACHE, "capture", command="avmsf studio"):
         with pytest.raises(FolderInUseError) as refused:
-            CaptureEditor(tmp_path).add(blow(0), contact(0.1))
-    finally:
-        done.set()
-        other.join()
+            other.submit(change).result(20)
     assert response_to(refused.value).status_code == 503
     assert not (tmp_path / "impacts.csv").exists()
     # Stages that are made meanwhile do not keep impacts out.
-    with write_lock(tmp_path / CACHE, "stages", command="avmsf fit"):
-        assert CaptureEditor(tmp_path).add(blow(0), contact(0.1))["file"] == "001.wav"
+    with ThreadPoolExecutor(1) as other, write_lock(tmp_path / CACHE, "stages", command="avmsf fit"):
+        other.submit(change).result(20)
+    assert (tmp_path / "001.wav").read_bytes() == blow(0)

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import pytest
 
 from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, new_token
-from avmsf.studio.routes import PAGE
 from event_loop import run_async
 from opened_plate import blow, open_plate
 from served import Served, served
@@ -34,10 +33,6 @@ def test_the_page_and_its_data_are_there_under_the_token(server: Served) -> None
     assert len(server.get("field.bin").content) > 1000
 
 
-def test_the_page_knows_the_words_of_an_address_that_is_not_its_studios_any_more() -> None:
-    assert f'const NOTHING = "{NOTHING_HERE}";' in (PAGE / "server.js").read_text()
-
-
 def test_without_the_token_nothing_is_told(server: Served) -> None:
     paths = [
         "/",
@@ -49,7 +44,7 @@ def test_without_the_token_nothing_is_told(server: Served) -> None:
     ]
     answers = [server.ask("GET", path, whole=True) for path in paths]
     assert {answer.status for answer in answers} == {404}
-    assert {answer.content for answer in answers} == {b'{"error":"there is nothing at this address"}'}
+    assert [answer.words for answer in answers] == [{"error": NOTHING_HERE, "moved": True}] * len(paths)
     assert server.ask("POST", "/edit", {"base": 1}, whole=True).status == 404
     assert all(server.token not in str(answer.headers) for answer in answers)
 

@@ -22,7 +22,7 @@ SPACING = SIDES[0] / 30
 
 def last_place(page: "Page") -> torch.Tensor:
     """Return where the last blow fell, meters."""
-    return torch.tensor(page.evaluate("avmsf.studio.view.placeOf(avmsf.studio.last.row)"))
+    return torch.tensor(page.evaluate("avmsf.studio.contacts.position(avmsf.studio.last.row)"))
 
 
 def packed(values: torch.Tensor) -> str:
@@ -43,7 +43,7 @@ def test_a_click_strikes_the_contact_that_it_shows_and_a_mode_is_painted_by_its_
 
 def test_dragging_turns_and_does_not_strike(plain: "Page") -> None:
     page = plain
-    page.click("#look")
+    page.click("#reset-view")
     x, y = on_screen(page, (0.0, 0.0, 0.01))
     before, before_row = on_screen(page, (0.1, 0.0, 0.01)), page.evaluate("avmsf.studio.last?.row")
     page.mouse.move(x, y)
@@ -56,7 +56,7 @@ def test_dragging_turns_and_does_not_strike(plain: "Page") -> None:
 
 def test_a_longer_press_strikes_harder(plain: "Page") -> None:
     page = plain
-    page.click("#look")
+    page.click("#reset-view")
     page.mouse.move(*on_screen(page, (0.0, 0.0, 0.01)))
     forces = []
     for milliseconds in (0, 600, 1450):
@@ -71,7 +71,7 @@ def test_a_longer_press_strikes_harder(plain: "Page") -> None:
 
 def test_keys_turn_and_strike_what_is_in_the_middle(plain: "Page") -> None:
     page = plain
-    page.click("#look")
+    page.click("#reset-view")
     page.locator("#stage canvas").focus()
     before = on_screen(page, (0.1, 0.0, 0.01))
     page.keyboard.press("Enter")

@@ -17,100 +17,77 @@ MIDDLE = (0.0, 0.0, SIDES[2] / 2)
 CORNER = (0.1, 0.06, SIDES[2] / 2)
 
 
-def in_module(page: "Page", module: str, does: str, given: Any = None) -> Any:
-    """Return what a function of one of the page's modules, and of three, makes of something."""
-    return page.evaluate(
-        f"""async (given) => {{
-              const three = await import("three");
-              const module = await import(new URL("page/{module}.js", document.baseURI));
-              return ({does})(module, given, three);
-            }}""",
-        given,
-    )
+def page_module(page: "Page", module: str, does: str, given: Any = None) -> Any:
+    """Return what a function of one of the page's modules makes of something."""
+    load = f'import(new URL("page/{module}.js", document.baseURI))'
+    return page.evaluate(f"async (given) => ({does})(await {load}, given)", given)
 
 
-BUMPY = """(three, width, height) => {
-  const ball = new three.SphereGeometry(1, width, height).toNonIndexed();
-  const corners = ball.attributes.position.array;
-  for (let at = 0; at < corners.length; at++) corners[at] *= 1 + 0.2 * Math.sin(5 * corners[at - at % 3]);
-  return corners;
-}"""
-
-
-def test_a_ray_meets_the_nearest_triangle_of_all(plain: "Page") -> None:
-    """Against three's own search of every triangle, from outside and from within."""
-    found = in_module(
-        plain,
-        "triangletree",
-        f"""({{ TriangleTree }}, _, three) => {{
-          const corners = ({BUMPY})(three, 40, 20);
-          const geometry = new three.BufferGeometry();
-          geometry.setAttribute("position", new three.BufferAttribute(corners, 3));
-          const mesh = new three.Mesh(geometry, new three.MeshBasicMaterial({{ side: three.DoubleSide }}));
-          const tree = new TriangleTree(corners);
-          const rays = Array.from({{ length: 300 }}, (_, n) => {{
-            const origin = new three.Vector3(Math.sin(n), Math.cos(2 * n), Math.sin(3 * n)).multiplyScalar(n % 3 + 0.2);
-            const aim = new three.Vector3(Math.cos(5 * n), Math.sin(7 * n), Math.cos(n * n)).multiplyScalar(0.9);
-            return [origin, aim.sub(origin).normalize()];
-          }});
-          return rays.map(([origin, direction]) => {{
-            const [first] = new three.Raycaster(origin, direction).intersectObject(mesh);
-            return [tree.distance(origin.toArray(), direction.toArray()), first?.distance ?? Infinity];
-          }});
-        }}""",
-    )
-    ours, theirs = np.array(found, dtype=float).T
-    assert np.isfinite(ours).sum() > 100
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5)
-
-
-def test_the_nearest_contacts_are_found(plain: "Page") -> None:
+def test_the_nearest_contacts_are_found_and_those_of_the_same_side_of_a_wall(plain: "Page") -> None:
+    """Contacts drawn on both faces of a plate that is thinner than they are apart, against numpy."""
     draw = np.random.default_rng(0)
-    points = draw.normal(size=(400, 3)).astype(np.float32)
-    points[:, 2] *= 0.05
-    places = 2 * draw.normal(size=(60, 3))
-    found = in_module(
+    points = draw.uniform(-1, 1, size=(400, 3)).astype(np.float32)
+    points[:, 2] = np.where(np.arange(400) % 2, 0.01, -0.01)
+    normals = np.zeros_like(points)
+    normals[:, 2] = np.sign(points[:, 2])
+    places = draw.uniform(-1, 1, size=(60, 3)).astype(np.float32)
+    places[:, 2] = 0.01
+    found = page_module(
         plain,
-        "nearest",
-        """({ PointGrid }, { points, places }) => {
-          const grid = new PointGrid(Float32Array.from(points.flat()));
-          return places.map((place) => grid.nearest(...place, 5).map(({ row, distance }) => [row, distance]));
+        "contacts",
+        """({ Contacts }, { points, normals, places }) => {
+          const flat = (values) => Float32Array.from(values.flat());
+          const contacts = new Contacts({ points: flat(points), normals: flat(normals) });
+          return places.map((place) => [
+            contacts.nearest(place).row, contacts.nearestFacing(place, [0, 0, 1]).row, contacts.outward(place)]);
         }""",
-        {"points": points.tolist(), "places": places.tolist()},
+        {"points": points.tolist(), "normals": normals.tolist(), "places": places.tolist()},
     )
     distances = np.linalg.norm(points[None].astype(float) - places[:, None], axis=2)
-    rows = np.argsort(distances, axis=1)[:, :5]
-    np.testing.assert_array_equal(np.array(found)[:, :, 0], rows)
-    np.testing.assert_allclose(np.array(found)[:, :, 1], np.take_along_axis(distances, rows, 1), rtol=1e-12)
+    assert [row for row, _, _ in found] == distances.argmin(axis=1).tolist()
+    assert [row for _, row, _ in found] == np.where(normals[:, 2] > 0, distances, np.inf).argmin(axis=1).tolist()
+    # Where both faces are about as near, no side is told from the other.
+    gaps = np.stack([distances[:, normals[:, 2] == side].min(axis=1) for side in (-1, 1)])
+    unclear = gaps.max(axis=0) < 1.5 * gaps.min(axis=0)
+    assert unclear.sum() > 5
+    assert all(side is None for (_, _, side), it in zip(found, unclear, strict=True) if it)
 
 
-def test_finer_triangles_cover_the_same_surface_without_gaps(plain: "Page") -> None:
-    """A box: as much surface, normals along for the ride, no edge too long, every edge met by two triangles."""
-    found = in_module(
+def test_a_thin_plate_is_painted_on_each_side_by_its_own_contacts(plain: "Page") -> None:
+    """One side black, the other white: no position between contacts is gray, with or without normals of its own."""
+    found = page_module(
         plain,
-        "subdivide",
-        """({ subdivide }, longest, three) => {
-          const box = new three.BoxGeometry(1, 0.6, 0.1).toNonIndexed();
-          const { position, normal } = box.attributes;
-          const fine = subdivide(
-            { position: { array: position.array, size: 3 }, normal: { array: normal.array, size: 3 } }, longest, 5000);
-          return [Array.from(fine.position.array), Array.from(fine.normal.array)];
+        "paint",
+        """async ({ Paint }) => {
+          const { Contacts } = await import(new URL("page/contacts.js", document.baseURI));
+          const [points, normals, colors, places, sides] = [[], [], [], [], []];
+          for (let n = 0; n < 600; n++) {
+            const side = n % 2 ? 1 : -1;
+            points.push(Math.sin(7 * n), Math.cos(5 * n * n), 0.01 * side);
+            normals.push(0, 0, side);
+            colors.push(...[1, 1, 1].map((one) => (side > 0 ? 255 * one : 0)));
+            places.push(Math.sin(3 * n), Math.cos(n * n), 0.01 * side);
+            sides.push(0, 0, side);
+          }
+          const contacts = new Contacts({ points: Float32Array.from(points), normals: Float32Array.from(normals) });
+          const mixed = (...own) => [...new Paint(contacts, Float32Array.from(places), ...own).mix(colors)];
+          return [mixed(sides), mixed()];
         }""",
-        0.1,
     )
-    corners, normals = (np.array(each).reshape(-1, 3, 3) for each in found)
-    sides = np.roll(corners, -1, axis=1) - corners
-    crossed = np.cross(sides[:, 0], sides[:, 1])
-    assert np.linalg.norm(sides, axis=2).max() <= 0.1
-    assert np.linalg.norm(crossed, axis=1).sum() / 2 == pytest.approx(2 * (0.6 + 0.1 + 0.06), rel=1e-5)
-    outward = crossed / np.linalg.norm(crossed, axis=1, keepdims=True)
-    np.testing.assert_allclose(normals, outward[:, None].repeat(3, axis=1), atol=1e-4)
-    edges: dict[frozenset[tuple[float, ...]], int] = {}
-    for triangle in corners.round(5) + 0.0:
-        for one, other in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
-            edge = frozenset((tuple(one), tuple(other)))
-            edges[edge] = edges.get(edge, 0) + 1
-    assert set(edges.values()) == {2}
+    with_normals, without = (np.array(each)[::3] for each in found)
+    np.testing.assert_allclose(with_normals, np.where(np.arange(600) % 2, 255, 0), atol=0.01)
+    assert np.minimum(without, 255 - without).max() < 0.01
+
+
+def test_a_mesh_without_colors_stands_out_from_the_page(visit: Open) -> None:
+    """Light gray paper, (244, 243, 240): a white object on it was hardly seen."""
+    page = visit(kind="mesh")
+    page.evaluate("document.getElementById('hint').hidden = true")
+    image = picture(page)
+    paper = image[5, 5]
+    seen = image[np.abs(image - paper).max(axis=2) > 8]
+    assert len(seen) > 5000
+    assert np.median(np.abs(seen - paper).max(axis=1)) > 50
 
 
 def picture(page: "Page") -> np.ndarray:
@@ -149,13 +126,13 @@ def test_the_surface_is_shown_struck_and_painted_in_the_place_of_the_object(visi
     page.evaluate("document.getElementById('legend').style.visibility = 'hidden'")
     painted = picture(page)
     assert (np.abs(painted - surface).max(axis=2) > 40).mean() > 0.02
-    page.click("#other-look")
+    page.click("#other-source")
     page.wait_for_selector("text=Show surface")
     # The paint stays on what is shown instead, and comes off all.
     assert (np.abs(picture(page) - own).max(axis=2) > 40).mean() > 0.02
     page.evaluate("document.getElementById('unpaint').click()")
     assert (np.abs(picture(page) - own).max(axis=2) > 40).mean() < 1e-4
-    page.click("#other-look")
+    page.click("#other-source")
     page.wait_for_selector("text=Show Gaussians")
     assert (np.abs(picture(page) - surface).max(axis=2) > 40).mean() < 1e-4
 
@@ -175,7 +152,7 @@ def test_sound_comes_at_the_press_and_the_object_can_be_turned_afterwards(visit:
     """Also where the press ends over the panel, after the view was reset."""
     page = visit()
     page.check("text=Sound at the press")
-    page.click("#look")
+    page.click("#reset-view")
     page.mouse.move(*on_screen(page, MIDDLE))
     page.mouse.down()
     assert page.evaluate("avmsf.studio.last.force") == 1
@@ -185,13 +162,13 @@ def test_sound_comes_at_the_press_and_the_object_can_be_turned_afterwards(visit:
     page.mouse.move(*on_screen(page, MIDDLE))
     page.mouse.down()
     page.evaluate("document.querySelector('#stage canvas').dispatchEvent(new PointerEvent('pointercancel'))")
-    assert page.evaluate("avmsf.studio.view.controls.enabled")
+    assert page.evaluate("avmsf.studio.view.eye.controls.enabled")
     page.mouse.up()
 
 
 def test_a_pen_strikes_as_hard_as_it_is_pressed(plain: "Page") -> None:
     page = plain
-    page.click("#look")
+    page.click("#reset-view")
     x, y = on_screen(page, MIDDLE)
     session = page.context.new_cdp_session(page)
     for force in (0.75, 0.25):
@@ -282,3 +259,20 @@ def test_spectrum_and_decay_show_the_modes_that_were_struck(visit: Open) -> None
     early, late = (np.nanmin(curve[column_of(page, t / seconds) - 6 :][:12]) for t in (0.5, 1.5))
     # The slowest mode falls by 35 dB a second; the canvas has 80 dB over 76 of its 104 pixels.
     assert late - early == pytest.approx(20 / np.log(10) * 4 / 80 * 76 / 104, rel=0.15)
+
+
+def test_a_recorded_impact_is_compared_with_the_model(visit: Open) -> None:
+    page = visit(strikes=True)
+    page.click("#sheet-strike >> text=100.wav")
+    page.wait_for_function("document.getElementById('strike-facts').textContent.includes('recording and model')")
+    compared = page.evaluate("(({ recording, model }) => [[...recording], [...model]])(avmsf.studio.spectra.compared)")
+    recording, model = np.array(compared)
+    # Its recording is the model's own sound: a picture of both shows one line, with its peaks at the modes' pitches.
+    near = recording > recording.max() - 60
+    np.testing.assert_allclose(model[near], recording[near], atol=0.1)
+    peak = 40 * 500 ** (float(recording.argmax() + 0.5) / len(recording))
+    assert min(abs(peak - 400 * order) for order in range(1, 7)) < 0.02 * peak
+    assert page.locator(".mark .dot[data-impact]").count() == 2
+    assert page.locator(".mark .dot[data-impact].chosen").count() == 1
+    page.uncheck("text=Show them on the object")
+    assert page.locator(".mark .dot[data-impact]").count() == 0

@@ -1,5 +1,6 @@
 """The server as the page uses it: struck, located, edited, recorded, and ended."""
 
+import asyncio
 import base64
 import io
 import json
@@ -10,12 +11,10 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from urllib.parse import quote
 
@@ -24,33 +23,26 @@ import pytest
 import soundfile
 import torch
 import trimesh
-from filelock import FileLock
 
-from avmsf._utils.files import copy_whole
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
-from avmsf.errors import AvmsfError, StudioError
+from avmsf.errors import LocationError, StudioError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
-from avmsf.gaussians.ply import write_splats
 from avmsf.localization.contact_map import enlarged
 from avmsf.localization.locate import locate_impacts
 from avmsf.localization.locator import Locator
-from avmsf.pipeline.config import CACHE, PRESETS
-from avmsf.studio import edit, locate, server, studio, worker
-from avmsf.studio.locate import Finder
-from avmsf.studio.opening import Opened, find_object, open_target
-from avmsf.studio.server import serve
+from avmsf.studio.jobs import Threads
+from avmsf.studio.opening import open_target
+from avmsf.studio.server import listen, serve
 from avmsf.studio.studio import StudioConfig
 from avmsf.symmetry.find import find_symmetries
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
 from factories.raising import raises
-from factories.ringing_field import SameGains
 from opened_plate import RATE, blow, open_plate, plate_field, wav
-from served import Served, served
+from served import Served, served, wait_until
 
 
 @pytest.fixture
@@ -166,13 +158,11 @@ def test_only_the_last_revisions_are_kept_and_all_can_be_undone(plate: Served) -
     assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("elastic").bank.frequency)
 
 
-def test_words_need_their_model(plate: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_words_need_their_model(plate: Served) -> None:
     assert "words" not in plate.manifest()["live"]["abilities"]
     answer = plate.ask("POST", "edit", {"base": 1, "prompt": "a wooden bowl is hit"})
     assert answer.status == 422
     assert "pip install 'avmsf[text]'" in answer.words["error"]
-    monkeypatch.setattr(edit, "find_spec", lambda name: None)
-    assert edit.text_model("folder") is None
 
 
 def test_a_descent_is_asked_for_alone(plate: Served) -> None:
@@ -183,8 +173,8 @@ def test_a_descent_is_asked_for_alone(plate: Served) -> None:
     assert list(plate.studio.folder.glob("lead-*")) == []
 
 
-def test_a_descent_that_another_tab_has_overtaken_is_taken_in_and_its_change_comes_back_by_undo(
-    plate: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_guided_edit_that_another_tab_has_overtaken_is_taken_and_its_change_comes_back_by_undo(
+    plate: Served, tmp_path: Path
 ) -> None:
     script = "import json, shutil, sys; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
     wait = (
@@ -192,9 +182,7 @@ def test_a_descent_that_another_tab_has_overtaken_is_taken_in_and_its_change_com
     )
     led = adjust_modes(plate_field("elastic"), pitch=1.25)
     save(led, tmp_path / "led")
-    worker = (sys.executable, "-c", script + wait, str(tmp_path / "led"), str(tmp_path / "go"))
-    start = plate.studio.jobs.start
-    monkeypatch.setattr(plate.studio.jobs, "start", lambda kind, task, take: start(kind, task, take, worker))
+    plate.studio.jobs.command = (sys.executable, "-c", script + wait, str(tmp_path / "led"), str(tmp_path / "go"))
     job = plate.ask("POST", "lead?base=1", blow()).words["job"]
     assert plate.ask("POST", "lead?base=1", blow()).status == 409
     assert len(list(plate.studio.folder.glob("lead-*"))) == 1
@@ -208,51 +196,40 @@ def test_a_descent_that_another_tab_has_overtaken_is_taken_in_and_its_change_com
     assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
 
 
-def test_only_the_current_revision_is_prepared_and_symmetries_once(
-    plate: Served, monkeypatch: pytest.MonkeyPatch
+def test_of_edits_in_quick_succession_the_last_is_prepared_and_an_error_is_only_reported(
+    plate: Served, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    prepared: list[int] = []
-    searched: list[object] = []
-    search, prepare = locate.symmetries_of, Finder.prepare
-
-    def counted(field: SoundField) -> Any:
-        searched.append(field)
-        return search(field)
-
+    prepared: list[SoundField] = []
     edited = threading.Event()
 
-    def slow(finder: Finder) -> None:
-        prepared.append(plate.studio.session.current.number)
-        assert edited.wait(20)
-        prepare(finder)
+    class Held(Threads):
+        async def run(self, kind: Any, act: Any, *arguments: Any) -> Any:
+            prepared.append(act.__self__.field)
+            while not edited.is_set():
+                await asyncio.sleep(0.01)
+            if len(prepared) == 1:
+                raise LocationError("no mode is left to locate by")
+            return await super().run(kind, act, *arguments)
 
-    monkeypatch.setattr(locate, "symmetries_of", counted)
-    monkeypatch.setattr(Finder, "prepare", slow)
-    monkeypatch.setattr("avmsf.studio.locate._SETTLED", 0.0)
+    searches, session = plate.studio.searches, plate.studio.session
+    searches.threads = Held()
+    wait_until(lambda: bool(prepared))
+    first = searches.finder_of(session.current)
     for number in range(1, 6):
         plate.ask("POST", "edit", {"base": number, "material": {"from": "ceramic"}, "size": 1.0 + number / 10})
-        end = time.monotonic() + 20
-        while not prepared:
-            assert time.monotonic() < end
-            time.sleep(0.01)
     edited.set()
-    while not prepared or prepared[-1] != 6 or plate.studio.threads.busy:
-        assert time.monotonic() < end
-        time.sleep(0.01)
-    assert len(prepared) == 2
-    finder = plate.studio.searches.finder_of(plate.studio.session.current)
-    _ = finder.symmetries
-    assert len(searched) == 1
-    assert {"locator", "tempering_factor"} <= vars(finder).keys() | vars(finder.locator).keys()
+    wait_until(lambda: len(prepared) == 2 and not searches.threads.busy)
+    assert prepared[1] is session.current.field
+    assert "LocationError: no mode is left to locate by" in capfd.readouterr().err
+    # Symmetries are searched once for all revisions of an opened field.
+    assert searches.finder_of(session.current).find_symmetries is first.find_symmetries
 
 
 @pytest.mark.slow
 def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
     grid = torch.cartesian_prod(torch.linspace(-0.1, 0.1, 21), torch.linspace(-0.06, 0.06, 13))
     points = torch.cat([grid, torch.full((len(grid), 1), 0.03)], dim=1) + torch.tensor([0.2, 0.0, 0.0])
-    found = find_symmetries(points, seed=0)
-    expected = find_symmetries(1.5 * points, seed=0)
-    larger = enlarged(found, 1.5)
+    larger, expected = enlarged(find_symmetries(points, seed=0), 1.5), find_symmetries(1.5 * points, seed=0)
     assert len(larger.mirrors) == len(expected.mirrors) > 0
     assert larger.spacing == pytest.approx(expected.spacing, rel=1e-5)
     for kind in ("mirrors", "rotations"):
@@ -339,65 +316,20 @@ def test_a_reconstruction_that_fails_says_why_and_one_can_be_stopped(tmp_path: P
         assert running.events(again)[-1]["stage"] == "cancelled"
 
 
-def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(tmp_path: Path) -> None:
     made = adjust_modes(plate_field(), pitch=1.25)
     save(made, tmp_path / "made")
-    save(plate_field(), tmp_path / "replaced")
     script = (
         "import json, shutil, sys; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
-        "print(json.dumps({'result': {'field': sys.argv[2], 'output': task['output']}}))"
+        "print(json.dumps({'result': {'field': 'replaced', 'task': task, 'output': task['output']}}))"
     )
-    with served(open_target(fill(tmp_path / "struck")), tmp_path / "files") as running:
-        start, jobs = running.studio.jobs.start, running.studio.jobs
-        worker = (sys.executable, "-c", script, str(tmp_path / "made"), str(tmp_path / "replaced"))
-        monkeypatch.setattr(jobs, "start", lambda kind, task, take: start(kind, task, take, worker))
-        last = running.events(running.ask("POST", "reconstruct", {}).words["job"])[-1]
-        assert last["field"] == str(tmp_path / "replaced")
-        assert torch.equal(running.studio.session.current.require_field().bank.frequency, made.bank.frequency)
-
-
-def test_a_reconstruction_has_the_settings_that_the_studio_was_started_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[dict[str, Any]] = []
-
-    def begin(kind: str, task: dict[str, Any], take: object) -> object:
-        asked.append(task)
-        return SimpleNamespace(identifier="j1")
-
     config = StudioConfig(modes=7, preset="paper")
     with served(open_target(fill(tmp_path / "struck")), tmp_path / "files", config=config) as running:
-        monkeypatch.setattr(running.studio.jobs, "start", begin)
-        assert running.ask("POST", "reconstruct", {}).words["job"] == "j1"
-    assert [(task["modes"], task["preset"]) for task in asked] == [(7, "paper")]
-
-
-def test_a_worker_copies_its_field_before_another_process_may_replace_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = fill(tmp_path / "struck")
-    field = folder / CACHE / "field.safetensors"
-    locked: list[bool] = []
-    given: list[tuple[object, ...]] = []
-
-    def stand_in(*arguments: Any, **named: object) -> object:
-        given.append((arguments[1], arguments[0].settings.time_zero))
-        field.write_text("made")
-        return SimpleNamespace(field=field, stages=[])
-
-    def copy(source: Path, path: Path) -> None:
-        locked.append(FileLock(folder / CACHE / "stages.lock", is_singleton=True, fallback_to_soft=False).is_locked)
-        copy_whole(source, path)
-
-    monkeypatch.setattr(worker, "fit_in_stages", stand_in)
-    monkeypatch.setattr(worker, "copy_whole", copy)
-    task = {"folder": str(folder), "preset": "paper", "modes": 6, "output": str(tmp_path / "files" / "reconstructed")}
-    with open(tmp_path / "said", "w") as said:
-        result = worker.make_field(task, worker.EventWriter(said))
-    assert (locked, Path(result["output"]).read_text()) == ([True], "made")
-    assert given == [(replace(PRESETS["paper"], modes=6), "peak")]
+        running.studio.jobs.command = (sys.executable, "-c", script, str(tmp_path / "made"))
+        last = running.events(running.ask("POST", "reconstruct", {}).words["job"])[-1]
+        assert last["field"] == "replaced"
+        assert (last["task"]["modes"], last["task"]["preset"]) == (7, "paper")
+        assert torch.equal(running.studio.session.current.require_field().bank.frequency, made.bank.frequency)
 
 
 def test_a_capture_with_a_field_is_struck_and_its_strikes_are_marked(tmp_path: Path) -> None:
@@ -418,130 +350,35 @@ def test_a_capture_with_a_field_is_struck_and_its_strikes_are_marked(tmp_path: P
         assert soundfile.read(io.BytesIO(sound.content))[1] == RATE
 
 
-def test_a_field_without_geometry_says_so(tmp_path: Path) -> None:
-    class Nowhere(SameGains):
-        points = torch.zeros(0, 3)
-
-    opened = open_plate(tmp_path / "opened")
-    field = plate_field()
-    bare = replace(field, gain_field=Nowhere(torch.zeros(len(field.bank))))
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(studio, "load", lambda path: bare)
-        with raises(StudioError, name="object"):
-            studio.Studio(opened, tmp_path)
-        mesh = tmp_path / "lid.ply"
-        trimesh.creation.box((0.24, 0.17, 0.004)).export(mesh)
-        (tmp_path / "files").mkdir()
-        shown = studio.Studio(replace(opened, object=mesh), tmp_path / "files").manifest()
-        assert shown["points"] > 1000
-        assert shown["object"]["kind"] == "mesh"
-
-
-def test_what_can_be_opened_and_what_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "note.txt").write_text("hello")
-    mesh = tmp_path / "bowl.stl"
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
-    for target, name in (("nothing", "target"), ("empty", "impacts.csv")):
-        with raises(StudioError, file=tmp_path / target, name=name):
-            open_target(tmp_path / target)
-    with raises(StudioError, file=tmp_path / "none.ply", name="object"):
-        open_target(mesh, object=tmp_path / "none.ply")
-    with raises(AvmsfError, file=tmp_path / "note.txt", value="a file that starts with b'hello'"):
-        studio.Studio(open_target(tmp_path / "note.txt"), tmp_path)
-    opened = open_target(mesh)
-    assert opened == Opened("bowl", (tmp_path / "bowl").resolve(), None, (tmp_path / "bowl").resolve())
-    assert open_target(mesh) == opened
-    assert (tmp_path / "bowl" / "surface.stl").read_bytes() == mesh.read_bytes()
-    trimesh.creation.box((0.2, 0.1, 0.1)).export(mesh)
-    with raises(StudioError, file=tmp_path / "bowl", name="capture", value="surface.stl"):
-        open_target(mesh)
-    monkeypatch.setattr("avmsf.studio.opening.MAX_MESH_BYTES", 10)
-    with raises(StudioError, file=mesh, value=mesh.stat().st_size):
-        open_target(mesh)
-
-
-def test_a_mesh_called_as_a_captures_own_opens_the_folder_that_it_lies_in(tmp_path: Path) -> None:
-    mesh = tmp_path / "surface.ply"
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
-    assert open_target(mesh).capture == tmp_path.resolve()
-    assert list(tmp_path.iterdir()) == [mesh]
-    assert open_target(mesh, capture=tmp_path / "other").capture == (tmp_path / "other").resolve()
-
-
-def wavefront(folder: Path) -> Path:
-    folder.mkdir()
-    shape = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n"
-    (folder / "bowl.obj").write_text(f"mtllib bowl.mtl\n{shape}")
-    (folder / "bowl.mtl").write_text("newmtl glazed\nmap_Kd pic.png\n")
-    (folder / "pic.png").write_bytes(b"the mesh's picture")
-    return folder / "bowl.obj"
-
-
-def test_a_mesh_brings_its_pictures_and_overwrites_none(tmp_path: Path) -> None:
-    mesh, other = wavefront(tmp_path / "mesh"), tmp_path / "other"
-    other.mkdir()
-    (other / "pic.png").write_bytes(b"the user's own picture")
-    with raises(StudioError, file=other / "pic.png", name="capture"):
-        open_target(mesh, capture=other)
-    assert [path.name for path in other.iterdir()] == ["pic.png"]
-    assert (other / "pic.png").read_bytes() == b"the user's own picture"
-    opened = open_target(mesh, capture=mesh.parent)
-    assert find_object(opened) == mesh.parent.resolve() / "surface.obj"
-    assert (mesh.parent / "pic.png").read_bytes() == b"the mesh's picture"
-    beside = open_target(mesh)
-    assert beside.capture is not None
-    names = sorted(path.name for path in beside.capture.iterdir())
-    assert names == ["bowl.mtl", "pic.png", "surface.obj"]
-
-
-def test_gaussians_are_opened_as_gaussians(tmp_path: Path) -> None:
-    points = plate_field().gain_field.points.float()
-    start = StartPoints(points, torch.full_like(points, 0.5), torch.tensor([[0.0, 0.0, 1.0]]).expand_as(points))
-    write_splats(starting_cloud(start, degree=0, scale=1.0, opacity=0.9, flatness=0.2), tmp_path / "cloud.ply")
-    opened = open_target(tmp_path / "cloud.ply")
-    assert opened.capture is not None
-    assert find_object(opened) == opened.capture / "splats.ply"
-    assert open_target(tmp_path / "cloud.ply") == opened
-    assert open_target(opened.capture / "splats.ply") == opened
-    (tmp_path / "files").mkdir()
-    manifest = studio.Studio(opened, tmp_path / "files").manifest()
-    assert manifest["object"] == {"kind": "gaussians", "file": "object.ply"}
-    assert manifest["points"] == len(points)
-
-
-def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         taken = other.getsockname()[1]
         with raises(StudioError, name="port", value=taken):
             serve(open_plate(tmp_path), port=taken, browser=False, log=print)
-        monkeypatch.setattr(server, "PORT", taken)
-        with server._listening(None) as listener:
-            assert listener.getsockname()[1] != taken
-            assert listener.getsockname()[0] == "127.0.0.1"
     with raises(StudioError, name="port", value=70_000):
-        server._listening(70_000)
+        serve(open_plate(tmp_path), port=70_000, browser=False, log=print)
+    # Without a port there is always one: at most one of two studios has the usual one.
+    with listen(None) as one, listen(None) as two:
+        assert one.getsockname()[1] != two.getsockname()[1]
+        assert {each.getsockname()[0] for each in (one, two)} == {"127.0.0.1"}
 
 
 def test_the_browsers_command_line_holds_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    heard: list[str] = []
-    looked, leave = threading.Event(), threading.Event()
+    addresses: list[str] = []
+    opened: list[tuple[str, int]] = []
 
-    def look(address: str) -> bool:
-        heard.append(address)
-        looked.set()
-        return leave.wait(20)
+    def open_browser(address: str) -> None:
+        path = Path(urllib.request.url2pathname(address.removeprefix("file:")))
+        opened.append((path.read_text(), path.stat().st_mode & 0o777))
+        os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("webbrowser.open", look)
-    # Who calls is the event loop, and must not wait for a browser that stays.
-    server._open_browser("http://127.0.0.1:8634/secret/", tmp_path)
-    assert looked.wait(20)
-    leave.set()
-    assert heard == [(tmp_path / "open.html").as_uri()]
-    assert 'content="0; url=http://127.0.0.1:8634/secret/"' in (tmp_path / "open.html").read_text()
-    assert (tmp_path / "open.html").stat().st_mode & 0o777 == 0o600
+    monkeypatch.setattr("webbrowser.open", open_browser)
+    assert not serve(open_plate(tmp_path), port=0, log=addresses.append)
+    [(text, mode)] = opened
+    assert f'content="0; url={addresses[0]}"' in text
+    assert mode == 0o600
 
 
 @pytest.mark.slow
@@ -570,10 +407,3 @@ def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_a_folder_of_strikes_alone_is_clicked_where_its_contacts_are(tmp_path: Path) -> None:
-    folder = fill(tmp_path / "bare")
-    with served(open_target(folder), tmp_path / "files") as running:
-        manifest = running.manifest()
-        assert manifest["points"] > 100
-        assert manifest["object"] == {"kind": "points", "file": None}
-        assert len(running.get("capture").words["strikes"]) == 3

@@ -25,10 +25,9 @@ BLANK = '<!doctype html><meta charset="utf-8"><script type="importmap">{"imports
 START = '<script type="module" src="page/start.js"></script>'
 """Loads what the tests call, as the studio's own page does."""
 MODULE = """
-import { loadBundle } from "./bundle.js";
-import { renderOffline, SoundEngine } from "./sound.js";
-import { pulseSamples, swingAfter } from "./pulse.js";
-import { resample } from "./resample.js";
+import { loadBundle } from "./api.js";
+import { resample } from "./audio.js";
+import { pulseSamples, renderOffline, SoundEngine, swingAfter } from "./sound.js";
 import { Bank, Limiter } from "./bank.js";
 Object.assign(window, { loadBundle, renderOffline, SoundEngine, pulseSamples, resample, swingAfter, Bank, Limiter });
 window.asText = (samples) => {
@@ -440,9 +439,10 @@ def test_a_mallet_leaves_a_mode_swinging_as_the_page_draws_it(
 
 
 def test_resampling_keeps_a_tone(any_page: "Page") -> None:
-    found = any_page.evaluate("""() => {
+    found = any_page.evaluate("""async () => {
       const tone = Float32Array.from({ length: 4000 }, (_, n) => Math.sin(2 * Math.PI * 1000 * n / 8000));
-      return [resample(tone, 8000, 11000), resample(tone, 8000, 3000)].map((sound) => Array.from(sound));
+      const sounds = await Promise.all([11000, 3000].map((rate) => resample(tone, 8000, rate)));
+      return sounds.map((sound) => Array.from(sound));
     }""")
     up, down = (np.asarray(sound) for sound in found)
     assert len(up) == round(4000 * 11_000 / 8000)

@@ -46,8 +46,6 @@ COMMAND = "avmsf studio"
 """What other processes wait for, in their messages."""
 _REMOVED = "removed"
 """In the capture's cache: the recordings that were replaced or removed."""
-_LOCK_TIMEOUT_SECONDS = 10.0
-"""How long to wait for another studio's change, which takes a fraction of a second."""
 _NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
 
 
@@ -157,8 +155,9 @@ def file_of(row: Row) -> str:
 class CaptureEditor:
     """The impacts of one capture folder. Its methods are thread-safe, and block."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder.resolve()
+    def __init__(self, folder: Path, *, lock_seconds: float = 10.0) -> None:
+        """Edit the folder; a change waits `lock_seconds` for another studio's, which takes a fraction of a second."""
+        self.folder, self.lock_seconds = folder.resolve(), lock_seconds
 
     @property
     def settings(self) -> CaptureSettings:
@@ -251,8 +250,8 @@ class CaptureEditor:
 
         Raises FolderInUseError if another one holds the lock for long; the page then sends the recording again.
         """
-        wait = _LOCK_TIMEOUT_SECONDS
-        return write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=wait, advice=", and try again")
+        wait, advice = self.lock_seconds, ", and try again"
+        return write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=wait, advice=advice)
 
     def _described(self, index: int, row: Row, settings: CaptureSettings) -> dict[str, Any]:
         values: dict[str, Any] = {"row": index, "file": file_of(row), "contact": None, "direction": None}

@@ -17,7 +17,7 @@ from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.studio.responses import bad_request
 
-_OLD_CONTROL = '"Present material"'
+OLD_MATERIAL = "Present material"
 """What the page calls its choice of the old material."""
 _NEUTRAL = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness": 0.0, "db": 0.0}
 _LIMITS = {
@@ -109,7 +109,7 @@ class Sliders:
         edited, notes, old = ground, list[str](), None if self.old is None else material_named(self.old)
         new = None if self.material is None else material_named(self.material)
         if old is None and (new is not None or self.size != 1.0):
-            old, known = infer_material(ground, option=_OLD_CONTROL, new=new)
+            old, known = infer_material(ground, option=f'"{OLD_MATERIAL}"', new=new)
             notes.append(known)
         if replace(self, old=None, law=REST.law) != REST:
             edited = edit(

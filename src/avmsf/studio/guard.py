@@ -19,8 +19,7 @@ from avmsf.studio.responses import RequestError, bad_request, response_to
 
 _FRAMES = {"frame-ancestors": "'none'"}
 """Directive that is valid only in a header."""
-NOTHING_HERE = "there is nothing at this address"
-"""By this the page knows that its studio has moved: `server.js` has the same text."""
+NOTHING_HERE = "there is nothing at this address; a restarted studio prints a new address: open it"
 MAX_UPLOAD_BYTES = 64 << 20
 """Bytes of one request: a minute of stereo sound at 96 kHz, 32 bits."""
 MAX_JSON_BYTES = 1 << 20
@@ -88,7 +87,8 @@ class Guard:
             raise bad_request("origin", "the studio's own page", origins, got="another", status=403)
         first, slash, rest = scope["path"].removeprefix("/").partition("/")
         if not secrets.compare_digest(first.encode(), self.token.encode()):
-            raise nothing_here()
+            # By `moved` a page knows that its studio has ended, and keeps what it was to send.
+            raise RequestError(404, NOTHING_HERE, more={"moved": True})
         # Decoded already, so that %2e%2e is two dots here.
         if ".." in rest.split("/") or "\\" in rest or "\0" in rest:
             raise nothing_here()

@@ -12,7 +12,6 @@ import sys
 import traceback
 from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from threading import Lock
 from typing import Any, Literal, TypeVar, get_args
 
 import anyio
@@ -35,13 +34,22 @@ _MAX_STDERR_CHARACTERS = 4000
 """Characters of the process's standard error that are kept."""
 
 
+_TITLES = {
+    "make_field": "the reconstruction",
+    "make_object": "the reconstruction from the images",
+    "lead": "the guided edit",
+}
+"""What the worker's tasks are called in messages."""
+
+
 class Job:
     """One run of the worker, and its events."""
 
-    def __init__(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> None:
+    def __init__(self, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> None:
         """Prepare `task` for the worker; `finish` turns its result into the last event, which may have an "error"."""
-        self.command = command
-        self.identifier, self.kind, self.task, self.finish = secrets.token_hex(8), kind, task, finish
+        self.task, self.finish, self.command = task, finish, command
+        self.identifier, self.kind = secrets.token_hex(8), str(task["task"])
+        self.title = _TITLES.get(self.kind, self.kind)
         self.events: list[Event] = []
         self.ended = False
         self._cancelled = self._finishing = False
@@ -64,7 +72,7 @@ class Job:
         except Exception as error:  # whatever it is, the next job must be able to start
             traceback.print_exception(error)
             words = " ".join(f"{type(error).__name__}: {error}".split())[:_MAX_STDERR_CHARACTERS]
-            last = {"error": f"{self.kind} failed ({words}); see the server's terminal, and start it again"}
+            last = {"error": f"{self.title} failed ({words}); see the server's terminal, and start it again"}
         finally:
             await self._publish(last, last=True)
 
@@ -128,9 +136,9 @@ class Job:
         if status < 0:
             print(printable(text), end="", file=sys.stderr)
             cause = f"was stopped by the system or crashed ({ending_of(status)})"
-            return {"error": f"{self.kind} {cause}; close other programs if memory is short, and start it again"}
+            return {"error": f"{self.title} {cause}; close other programs if memory is short, and start it again"}
         ending = text.strip().splitlines()[-1:] or ["no message"]
-        return {"error": f"{self.kind} ended with status {status} and no result: {ending[0]}"}
+        return {"error": f"{self.title} ended with status {status} and no result: {ending[0]}"}
 
     async def _publish(self, event: Event, *, last: bool = False) -> None:
         async with self._changed_events:
@@ -142,7 +150,9 @@ class Job:
 class Jobs:
     """All jobs of a server, one of which runs at most."""
 
-    def __init__(self) -> None:
+    def __init__(self, command: Sequence[str] = WORKER) -> None:
+        self.command = command
+        """The worker's process."""
         self._jobs: dict[str, Job] = {}
         self._running: asyncio.Task[None] | None = None
 
@@ -152,7 +162,7 @@ class Jobs:
         return next((job for job in self._jobs.values() if not job.ended), None)
 
     def failure(self, kind: str) -> str | None:
-        """Return the error of the last job of a kind; None if it succeeded or has not ended."""
+        """Return the error of the last job of this task; None if it succeeded or has not ended."""
         last = next((job for job in reversed(self._jobs.values()) if job.kind == kind), None)
         if last is None or not last.ended:
             return None
@@ -163,12 +173,12 @@ class Jobs:
         current = self.current
         if current is not None:
             advice, running = "wait for it or stop it", current.identifier
-            raise bad_request("job", "none that runs", current.kind, advice=advice, status=409, job=running)
+            raise bad_request("job", "none that runs", current.title, advice=advice, status=409, job=running)
 
-    def start(self, kind: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> Job:
+    def start(self, task: Event, finish: Finish) -> Job:
         """Start a job. Raises RequestError (409) while another one runs."""
         self.check_idle()
-        job = Job(kind, task, finish, command)
+        job = Job(task, finish, self.command)
         self._jobs[job.identifier] = job
         self._running = asyncio.create_task(job.run())
         return job
@@ -213,24 +223,23 @@ class Threads:
 
     def __init__(self) -> None:
         self._limiters = {kind: anyio.CapacityLimiter(1) for kind in get_args(Kind)}
-        self._computing, self._lock = 0, Lock()
+        self._computing: set[object] = set()
 
     @property
     def busy(self) -> bool:
         """Whether a thread is computing, which cannot be interrupted and may outlive the server."""
-        return self._computing > 0
+        return bool(self._computing)
 
     async def run(self, kind: Kind, act: Callable[..., Result], *arguments: Any) -> Result:
         """Call a function in a thread, after the others of its kind."""
-        computes = kind in ("compute", "prepare")
 
-        def counted() -> Result:
-            with self._lock:
-                self._computing += computes
+        def call() -> Result:
+            token = object()
+            if kind in ("compute", "prepare"):
+                self._computing.add(token)
             try:
                 return act(*arguments)
             finally:
-                with self._lock:
-                    self._computing -= computes
+                self._computing.discard(token)
 
-        return await anyio.to_thread.run_sync(counted, limiter=self._limiters[kind])
+        return await anyio.to_thread.run_sync(call, limiter=self._limiters[kind])

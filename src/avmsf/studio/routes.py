@@ -45,20 +45,20 @@ def make_app(studio: Studio, announce: Callable[[], None] = lambda: None) -> Sta
         _route("GET", "/", lambda request: HTMLResponse(html, headers=policy)),
         _route("GET", "/page/{path:path}", lambda request: _file(PAGE, request)),
         _route("GET", "/manifest.json", lambda request: studio.manifest()),
-        _route("GET", "/capture", _without_body(studio.capture)),
+        _route("GET", "/capture", lambda request: studio.capture()),
         _route("GET", "/revisions/{number:int}/{path:path}", calls.send_shown),
-        _route("POST", "/locate", _with_body(studio.locate)),
-        _route("POST", "/edit", _with_json(studio.edit)),
+        _route("POST", "/locate", studio.locate, read=Request.body),
+        _route("POST", "/edit", studio.edit, read=read_json_object),
         _route("POST", "/lead", calls.lead),
-        _route("POST", "/undo", _with_json(studio.undo)),
-        _route("POST", "/save", _with_json(studio.save), status=201),
-        _route("POST", "/capture/check", _with_body(studio.check_recording)),
+        _route("POST", "/undo", studio.undo, read=read_json_object),
+        _route("POST", "/save", studio.save, read=read_json_object, status=201),
+        _route("POST", "/capture/check", studio.check_recording, read=Request.body),
         _route("POST", "/capture/strikes", calls.add_impact, status=201),
         _route("GET", "/capture/strikes/{path:path}", calls.send_recording),
         _route("PUT", "/capture/strikes/{path:path}", calls.redo_impact),
         _route("DELETE", "/capture/strikes/{path:path}", calls.remove_impact),
-        _route("POST", "/reconstruct", _without_body(studio.reconstruct)),
-        _route("POST", "/object", _without_body(studio.make_object)),
+        _route("POST", "/reconstruct", lambda request: studio.reconstruct()),
+        _route("POST", "/object", lambda request: studio.make_object()),
         _route("GET", "/jobs/{job}/events", calls.send_job_events),
         _route("DELETE", "/jobs/{job}", calls.cancel_job),
         _route("GET", "/{path:path}", calls.send_shown),
@@ -137,34 +137,26 @@ def _expected(request: Request) -> str | None:
     return None if match == "*" else match
 
 
-def _route(method: str, path: str, act: Callable[[Request], Any], *, status: int = 200) -> Route:
-    """Return a route that answers with the response of `act`, or with JSON of its plain values."""
+def _route(
+    method: str,
+    path: str,
+    act: Callable[[Any], Any],
+    *,
+    read: Callable[[Request], Awaitable[Any]] | None = None,
+    status: int = 200,
+) -> Route:
+    """Return a route that calls `act` with the request, or with what `read` makes of it.
+
+    It answers with the response of `act`, or with JSON of its plain values.
+    """
 
     async def answer(request: Request) -> Response:
-        done = act(request)
+        done = act(request if read is None else await read(request))
         if isinstance(done, Awaitable):
             done = await done
         return done if isinstance(done, Response) else Answer(done, status)
 
     return Route(path, answer, methods=[method])
-
-
-def _with_json(act: Callable[[dict[str, Any]], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
-    async def read(request: Request) -> Any:
-        return await act(await read_json_object(request))
-
-    return read
-
-
-def _with_body(act: Callable[[bytes], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
-    async def read(request: Request) -> Any:
-        return await act(await request.body())
-
-    return read
-
-
-def _without_body(act: Callable[[], Awaitable[Any]]) -> Callable[[Request], Awaitable[Any]]:
-    return lambda request: act()
 
 
 def _file(folder: Path, request: Request, *, only: Sequence[str] = tuple(MEDIA_TYPES)) -> Response:

@@ -47,7 +47,7 @@ def serve(
     Without `port` it is PORT, or a free one if that is in use. Return whether a thread is still computing a result that
     is no longer needed. Raises StudioError if a given port is in use, and the errors of the readers.
     """
-    with _listening(port) as listener, _temporary_folder() as folder:
+    with listen(port) as listener, _temporary_folder() as folder:
         number, token = listener.getsockname()[1], new_token()
         address = f"http://{_HOME}:{number}/{token}/"
         studio = Studio(opened, Path(folder), config)
@@ -88,8 +88,11 @@ def _open_browser(address: str, folder: Path) -> None:
     threading.Thread(target=webbrowser.open, args=(path.as_uri(),), daemon=True).start()
 
 
-def _listening(port: int | None) -> socket.socket:
-    """Return a socket bound on this machine. Raises StudioError for a port that is taken or forbidden."""
+def listen(port: int | None) -> socket.socket:
+    """Return a socket bound on this machine, by default at PORT or a free port.
+
+    Raises StudioError for a given port that is taken or forbidden.
+    """
     number = PORT if port is None else port
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     # Without it a port would stay taken for a minute after the server before.
@@ -104,7 +107,7 @@ def _listening(port: int | None) -> socket.socket:
     except OSError as error:
         listener.close()
         if error.errno == errno.EADDRINUSE and port is None:
-            return _listening(0)
+            return listen(0)
         advice = "leave --port out, or give --port 0 for any free one"
         got = f"{error.strerror!r} at {number}"
         raise StudioError.expected("a free one", number, got=got, name="port", advice=advice) from error

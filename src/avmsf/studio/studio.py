@@ -14,17 +14,13 @@ from avmsf.fem.material import MATERIALS
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import CaptureEditor, read_upload
-from avmsf.studio.edit import Sliders, read_prompt, text_model
+from avmsf.studio.edit import OLD_MATERIAL, Sliders, read_prompt, text_model
 from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Event, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
 from avmsf.studio.opening import Opened, find_object, shows_more
 from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, error_response
 from avmsf.studio.session import Revision, Session
-
-_MAKING = "reconstruct the object from its images"
-"""The kind of job that has something to click for its result."""
-
 
 @dataclass(frozen=True)
 class StudioConfig:
@@ -144,12 +140,12 @@ class Studio:
         output = str(self.folder / "reconstructed")
         chosen = {"preset": self.config.preset, "modes": self.config.modes}
         task = {"task": "make_field", "folder": str(editor.folder), "output": output, **chosen}
-        return {"job": self.jobs.start("reconstruct", task, self._take_field).identifier}
+        return {"job": self.jobs.start(task, self._take_field).identifier}
 
     async def make_object(self) -> dict[str, Any]:
         """Begin to make Gaussians of the capture's pictures, to have something to click."""
         task = {"task": "make_object", "folder": str(self.require_editor().folder)}
-        return {"job": self.jobs.start(_MAKING, task, self._take_object).identifier}
+        return {"job": self.jobs.start(task, self._take_object).identifier}
 
     async def _lead(self, base: int, target: Event, *, recording: bytes | None = None) -> dict[str, Any]:
         """Start to optimize the field towards the recording, or the prompt in `target`."""
@@ -164,7 +160,7 @@ class Studio:
                 task["recording"] = str(folder / "like.wav")
             await self.threads.run("compute", save, field, folder / "field")
             take = partial(self._take_led, base)
-            return {"job": self.jobs.start("guided edit", {**task, "steps": self.config.steps}, take).identifier}
+            return {"job": self.jobs.start({**task, "steps": self.config.steps}, take).identifier}
         except BaseException:
             shutil.rmtree(folder, ignore_errors=True)
             raise
@@ -219,9 +215,11 @@ class Studio:
             "remarks": [*self.showcase.current.remarks, *revision.remarks],
             "rows": [] if field is None else field.audible.nonzero().flatten().tolist(),
             "materials": list(MATERIALS),
+            "oldMaterial": OLD_MATERIAL,
+            "folder": None if self.editor is None else str(self.editor.folder),
             "job": None if running is None else running.identifier,
             "jobKind": None if running is None else running.kind,
-            "noObject": self.jobs.failure(_MAKING),
+            "noObject": self.jobs.failure("make_object"),
         }
 
 

@@ -48,30 +48,27 @@ class EventWriter:
         self.listener = ProgressListener(self.log, self._stage_step, note=self.log)
         """What the stages of a fit report to."""
 
-    def write(self, event: Values) -> None:
+    def write(self, **event: Any) -> None:
         """Write one event."""
         self.stream.write(json.dumps(event) + "\n")
         self.stream.flush()
 
-    def step(self, stage: str, done: int, total: int, words: str, **numbers: float | None) -> None:
-        """Send the progress of a stage; `numbers` are for programs, in addition to the text."""
-        self.write({"stage": stage, "done": done, "total": total, "words": words, **numbers})
-
     def log(self, words: str) -> None:
         """Send that a stage begins: its name before the colon, a description after it."""
         stage, _, rest = words.partition(": ")
-        self.step(stage, 0, 0, rest)
+        self.write(stage=stage, done=0, total=0, words=rest)
 
     def guided_edit(self, progress: GuidedEditProgress) -> None:
         """Send the progress of an edit's optimization."""
         words = f"loss {progress.loss:.3g}, pitch x {progress.pitch:.4g}"
         # In JSON there is no NaN.
         loss = progress.loss if math.isfinite(progress.loss) else None
-        self.step("edit", progress.step, progress.steps, words, loss=loss, pitch=progress.pitch)
+        step = {"stage": "edit", "done": progress.step, "total": progress.steps, "words": words}
+        self.write(**step, loss=loss, pitch=progress.pitch)
 
     def _stage_step(self, stage: str, done: int, total: int, words: str) -> None:
         if done % _EVENT_INTERVAL == 0 or done == total or stage == "features":
-            self.step(stage, done, total, words)
+            self.write(stage=stage, done=done, total=total, words=words)
 
 
 def make_field(task: Values, events: EventWriter) -> Values:
@@ -116,7 +113,9 @@ def lead(task: Values, events: EventWriter) -> Values:
 
 
 _TASKS: Mapping[str, Callable[[Values, EventWriter], Values]] = {
-    task.__name__: task for task in (make_field, make_object, lead)
+    "make_field": make_field,
+    "make_object": make_object,
+    "lead": lead,
 }
 
 
@@ -131,14 +130,14 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with warnings.catch_warnings():
         warnings.simplefilter("always", CaptureWarning)
-        warnings.showwarning = lambda message, *rest, **more: events.write({"stage": "note", "words": str(message)})
+        warnings.showwarning = lambda message, *rest, **more: events.write(stage="note", words=str(message))
         try:
-            events.write({"result": _TASKS[task["task"]](task, events)})
+            events.write(result=_TASKS[task["task"]](task, events))
         except Exception as error:
             if not (isinstance(error, AvmsfError) or lacks_memory(error)):
                 raise
             message = str(error) if isinstance(error, AvmsfError) else NO_MEMORY
-            events.write({"error": " ".join(message.split())})
+            events.write(error=" ".join(message.split()))
             return 2
     return 0
 

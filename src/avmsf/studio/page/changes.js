@@ -1,74 +1,67 @@
-/** Changes of the open field: one at a time, each of the revision that this page knows, and no other tab's is lost. */
+/** Changes of the open field: one at a time, each of the revision that this page shows; the server refuses others. */
 
+import { server } from "./api.js";
 import { say, unsay } from "./dom.js";
-import { server } from "./server.js";
 
 const SETTLED_MS = 200;
+const CHANGED_ELSEWHERE =
+  "Another tab has changed this field, or your last change was made although its answer was lost: the page shows the " +
+  "current state. Repeat your change if you still want it.";
 
 export class Changes {
   #last = Promise.resolve();
   #timer = null;
-  #unsent = false;
-  #lost = false;
+  /** Movements of the sliders, and how many of them the server has. */
+  #moves = 0;
+  #sent = 0;
 
   /**
-   * `load()` fetches the server's present bundle and takes it; `wish()` gives what the sliders ask for; `takeSliders()`
-   * puts them where the server has them; `onBusy(busy)` hears when the server works.
+   * `load()` fetches the server's current bundle and takes it; `request()` is what the sliders ask for; `takeSliders()`
+   * puts them where the server has them; `onBusy(busy)` is called when the server begins and ends to work.
    */
-  constructor(studio, { load, wish, takeSliders, onBusy }) {
-    Object.assign(this, { studio, load, wish, takeSliders, onBusy });
+  constructor(studio, { load, request, takeSliders, onBusy }) {
+    Object.assign(this, { studio, load, request, takeSliders, onBusy });
   }
 
-  /** A slider has moved; what the sliders say together is sent when they rest. */
+  /** A slider has moved; what the sliders ask for together is sent when they rest. */
   moved() {
-    this.#unsent = true;
+    this.#moves++;
     clearTimeout(this.#timer);
     this.#timer = setTimeout(() => this.queue(() => this.settle()), SETTLED_MS);
   }
 
-  /** Do something when all that was asked for earlier is done; gives what it gave. */
+  /** Do something when all that was asked for earlier is done; gives its result. */
   queue(action) {
     this.#last = this.#last.then(action).catch((error) => say(error.message, { name: "edit", bad: true }));
     return this.#last;
   }
 
-  /** Within the queue: send what the sliders say unless the server has it; gives whether it has it now. */
+  /** Within the queue: send what the sliders ask for unless the server has it; gives whether it has it now. */
   async settle() {
     clearTimeout(this.#timer);
-    if (!this.#unsent) return true;
-    this.#unsent = false;
-    const answer = await this.ask(() => server.edit(this.studio.revision, this.wish()), {
+    const moves = this.#moves;
+    if (moves === this.#sent) return true;
+    const answer = await this.ask(() => server.edit(this.studio.revision, this.request()), {
       again: () => this.queue(() => this.settle()),
       refused: [["Revert it", () => this.#take()]],
     });
-    if (!answer) {
-      this.#unsent = true;
-      return false;
-    }
+    if (!answer) return false;
+    this.#sent = moves;
     if (await this.show(answer)) this.studio.strikeAgain();
     return true;
   }
 
-  /**
-   * Within the queue: do what changes the field; undefined where it failed, which is said. Where another tab was faster
-   * nothing is overwritten, and the user chooses; `mine` is false for what makes no sense on top of its change, which
-   * is shown then.
-   */
-  async ask(action, { again, mine = true, refused = [] }) {
+  /** Within the queue: do what changes the field; undefined where it failed, which is said, or another tab was faster. */
+  async ask(action, { again, refused = [] }) {
     this.onBusy(true);
     try {
       const answer = await action();
-      this.#lost = false;
       unsay("edit");
       return answer;
     } catch (error) {
-      if (error.stale && mine) this.#tellStale(error, again);
-      else if (error.stale) await this.#showStale(error);
-      else {
-        const answers = error.unreachable ? [["Try again", again]] : refused;
-        say(error.message, { name: "edit", bad: true, answers });
-      }
-      this.#lost = Boolean(error.unreachable);
+      const answers = error.unreachable ? [["Try again", again]] : refused;
+      if (!error.stale) say(error.message, { name: "edit", bad: true, answers });
+      else if (await this.show(error, { sliders: true })) say(CHANGED_ELSEWHERE, { name: "edit" });
       return undefined;
     } finally {
       this.onBusy(false);
@@ -76,8 +69,8 @@ export class Changes {
   }
 
   /**
-   * Within the queue: take the bundle that an answer speaks of, and with `sliders` the server's sliders; gives whether
-   * it is the one that is heard now.
+   * Within the queue: take the bundle of a revision, and with `sliders` the server's sliders; gives whether this is what
+   * is played now, and not the change of another tab.
    */
   async show({ revision }, { sliders = false } = {}) {
     const { studio } = this;
@@ -90,42 +83,15 @@ export class Changes {
       return false;
     }
     unsay("reload");
-    const theirs = studio.revision !== revision;
-    if (sliders || (theirs && !this.#unsent)) this.#take();
-    // Sliders that have moved on are of the answered revision: the server will say that it is not the last.
-    else studio.revision = revision;
-    if (theirs) say("Another tab changed this field after your change: the page shows its current state.", { name: "edit" });
-    return !theirs;
-  }
-
-  get #meanwhile() {
-    return this.#lost
-      ? "Another tab changed this field, or your last change was made although its answer was lost."
-      : "Another tab has changed this field.";
-  }
-
-  async #showStale({ revision }) {
-    const meanwhile = this.#meanwhile;
-    if (await this.show({ revision }, { sliders: true }))
-      say(`${meanwhile} The page shows its current state: repeat your change if you still want it.`, { name: "edit" });
-  }
-
-  #tellStale({ revision }, again) {
-    const answers = [["Show that change", () => this.queue(() => this.show({ revision }, { sliders: true }))]];
-    const insist = () => {
-      this.studio.revision = revision;
-      // Whatever is to be done next is done with this page's sliders, not with those of the other tab.
-      this.#unsent = true;
-      again();
-    };
-    answers.push(["Replace it with mine", insist]);
-    const choice = "Nothing was overwritten: show that change, or replace it with yours.";
-    say(`${this.#meanwhile} ${choice}`, { name: "edit", bad: true, answers });
+    const current = studio.revision === revision;
+    if (sliders || !current) this.#take();
+    if (!current) say(CHANGED_ELSEWHERE, { name: "edit" });
+    return current;
   }
 
   #take() {
     clearTimeout(this.#timer);
-    this.#unsent = false;
+    this.#sent = this.#moves;
     this.takeSliders();
   }
 }

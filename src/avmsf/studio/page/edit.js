@@ -1,117 +1,105 @@
-/** The tab that edits: sliders heard at once, undo, saved as a new field. */
+/** The tab that edits: sliders that are played at once, guided edits, undo, saved as a new field. */
 
+import { server } from "./api.js";
 import { Changes } from "./changes.js";
-import { button, element, group, line, say, section, Slider } from "./dom.js";
-import { leadGroup } from "./lead.js";
-import { server } from "./server.js";
+import { button, element, filePicker, group, line, say, section, Slider } from "./dom.js";
+import { JobProgress } from "./jobs.js";
 
 const factor = (value) => `× ${value.toPrecision(3)}`;
 const decibel = (value) => `${value > 0 ? "+" : ""}${value.toFixed(1)} dB`;
-const WHOLE = {
+const PITCH = ["Pitch", { low: 0.5, high: 2, value: 1, words: factor }];
+const DECAY = ["Decay time", { low: 0.1, high: 10, value: 1, words: factor }];
+const even = (low, high) => ({ low, high, value: 0, words: decibel, even: true, steps: 240 });
+const OF_ALL = {
   size: ["Size", { low: 0.25, high: 4, value: 1, words: factor }],
-  pitch: ["Pitch", { low: 0.5, high: 2, value: 1, words: factor }],
-  decay: ["Decay time", { low: 0.1, high: 10, value: 1, words: factor }],
-  brightness: [
-    "Brightness, each octave",
-    { low: -12, high: 12, value: 0, words: decibel, even: true, steps: 240 },
-  ],
+  pitch: PITCH,
+  decay: DECAY,
+  brightness: ["Brightness, each octave", even(-12, 12)],
 };
-const SINGLE = {
-  db: ["Level", { low: -40, high: 20, value: 0, words: decibel, even: true, steps: 240 }],
-  pitch: ["Pitch", { low: 0.5, high: 2, value: 1, words: factor }],
-  decay: ["Decay time", { low: 0.1, high: 10, value: 1, words: factor }],
-};
+const OF_ONE = { db: ["Level", even(-40, 20)], pitch: PITCH, decay: DECAY };
 
-/** `load()` fetches the server's present bundle and takes it. */
-export function editSheet(studio, load) {
-  const single = new Map();
-  const onInput = () => changes.moved();
-  const makeSliders = (which, onInput) =>
+const isNeutral = ({ db, pitch, decay }) => db === 0 && pitch === 1 && decay === 1;
+
+/** `load()` fetches the server's current bundle and takes it. */
+export function editTab(studio, load) {
+  /** By the mode's row in the bank: the values of the sliders for one mode. */
+  const changedModes = new Map();
+  const makeSliders = (sliders, onInput) =>
     Object.fromEntries(
-      Object.entries(which).map(([name, [words, options]]) => [name, new Slider(words, { ...options, onInput })]),
+      Object.entries(sliders).map(([name, [words, options]]) => [name, new Slider(words, { ...options, onInput })]),
     );
-  const sliders = makeSliders(WHOLE, onInput);
-  const modeSliders = makeSliders(SINGLE, () => {
-    const values = Object.fromEntries(Object.entries(modeSliders).map(([name, slider]) => [name, slider.value]));
-    single.set(studio.bank, values);
+  const valuesOf = (sliders) => Object.fromEntries(Object.entries(sliders).map(([name, { value }]) => [name, value]));
+  const onInput = () => changes.moved();
+  const sliders = makeSliders(OF_ALL, onInput);
+  const modeSliders = makeSliders(OF_ONE, () => {
+    changedModes.set(studio.bank, valuesOf(modeSliders));
     changes.moved();
   });
   const select = (none, onchange) =>
-    element(
-      "select",
-      { onchange },
-      element("option", { value: "" }, none),
-      ...studio.live.materials.map((name) => element("option", { value: name }, name)),
-    );
-  // What the object is of counts where it shall be of another material or size, and changes nothing by itself.
+    element("select", { onchange }, ...["", ...studio.live.materials].map((name) => element("option", { value: name }, name || none)));
+  // The present material counts where the object gets another material or size, and changes nothing by itself.
   const changesMaterial = () => to.value !== "" || sliders.size.value !== sliders.size.rest;
   const from = select("inferred", () => changesMaterial() && onInput());
   const to = select("unchanged", onInput);
   const remarks = element("div", { className: "group", "aria-live": "polite" });
   const busy = element("progress", { hidden: true, "aria-label": "Editing" });
-  const asked = () => ({
-    material: changesMaterial() && (from.value || to.value) ? { from: from.value || null, to: to.value || null } : null,
-    ...Object.fromEntries(Object.entries(sliders).map(([name, slider]) => [name, slider.value])),
-    modes: [...single].filter(([, values]) => !atRest(values)).map(([mode, values]) => ({ mode, ...values })),
-  });
-
-  const tell = (words) => remarks.replaceChildren(...words.map((word) => element("p", { className: "faint" }, word)));
-  /** Put the sliders where the server has them. */
-  const takeSliders = () => {
-    const there = studio.live.sliders ?? {};
-    for (const [name, slider] of Object.entries(sliders)) slider.set(there[name] ?? slider.rest);
-    from.value = there.material?.from ?? "";
-    to.value = there.material?.to ?? "";
-    single.clear();
-    for (const { mode, ...values } of there.modes ?? []) single.set(mode, values);
-    showMode();
-  };
   const changes = new Changes(studio, {
     load,
-    wish: asked,
-    takeSliders,
+    request: () => ({
+      material: changesMaterial() && (from.value || to.value) ? { from: from.value || null, to: to.value || null } : null,
+      ...valuesOf(sliders),
+      modes: [...changedModes].filter(([, values]) => !isNeutral(values)).map(([mode, values]) => ({ mode, ...values })),
+    }),
+    takeSliders: () => setSliders(studio.live.sliders ?? {}),
     onBusy: (yes) => {
       busy.hidden = !yes;
     },
   });
+  const setSliders = ({ material, modes = [], ...values }) => {
+    for (const [name, slider] of Object.entries(sliders)) slider.set(values[name] ?? slider.rest);
+    from.value = material?.from ?? "";
+    to.value = material?.to ?? "";
+    changedModes.clear();
+    for (const { mode, ...changed } of modes) changedModes.set(mode, changed);
+    showMode();
+  };
 
-  // What changes the field from under the sliders holds them until it is done; work of minutes holds the buttons too.
-  const held = { moments: 0, minutes: 0 };
-  const showHolds = () => {
+  // What changes the field from under the sliders disables them until it is done; work of minutes the buttons too.
+  const running = { moments: 0, minutes: 0 };
+  const enable = () => {
     const all = [...Object.values(sliders), ...Object.values(modeSliders)].map(({ input }) => input);
-    for (const control of [...all, from, to]) control.disabled = held.moments + held.minutes > 0;
-    for (const control of [undo, reset, save]) control.disabled = held.minutes > 0;
+    for (const control of [...all, from, to]) control.disabled = running.moments + running.minutes > 0;
+    for (const control of [undo, reset, save]) control.disabled = running.minutes > 0;
     undo.disabled ||= !studio.live?.undo;
   };
   const hold = async (work, time = "moments") => {
-    held[time] += 1;
-    showHolds();
+    running[time] += 1;
+    enable();
     try {
       await work();
     } finally {
-      held[time] -= 1;
-      showHolds();
+      running[time] -= 1;
+      enable();
     }
   };
-
-  const undo = button("Undo", () =>
+  /** Once the server has what the sliders ask for: do what changes the field, and then `take` its answer. */
+  const change = (action, again, take) =>
     hold(() =>
       changes.queue(async () => {
-        if (!(await changes.settle())) return;
-        const again = () => undo.click();
-        const answer = await changes.ask(() => server.undo(studio.revision), { again, mine: false });
-        if (answer && (await changes.show(answer, { sliders: true }))) studio.strikeAgain();
+        const answer = (await changes.settle()) && (await changes.ask(action, { again }));
+        if (answer) await take(answer);
       }),
-    ),
+    );
+
+  const undo = button("Undo", () =>
+    change(() => server.undo(studio.revision), () => undo.click(), async (answer) => {
+      if (await changes.show(answer, { sliders: true })) studio.strikeAgain();
+    }),
   );
   const reset = button("Reset all", () => {
-    Object.values(sliders).forEach((slider) => slider.reset());
-    [from.value, to.value] = ["", ""];
-    single.clear();
-    showMode();
+    setSliders({});
     changes.moved();
   });
-
   const name = element("input", { type: "text", "aria-label": "Name of the new field", placeholder: "new-name" });
   const save = button("Save as", async () => {
     const wanted = name.value.trim();
@@ -120,16 +108,10 @@ export function editSheet(studio, load) {
       name.focus();
       return;
     }
-    await hold(() =>
-      changes.queue(async () => {
-        if (!(await changes.settle())) return;
-        const again = () => save.click();
-        const answer = await changes.ask(() => server.save(studio.revision, wanted), { again });
-        if (!answer) return;
-        if (answer.revision !== undefined) await changes.show(answer, { sliders: true });
-        say(`Saved: ${answer.file}`, { name: "saved" });
-      }),
-    );
+    await change(() => server.save(studio.revision, wanted), () => save.click(), async (answer) => {
+      await changes.show(answer, { sliders: true });
+      say(`Saved: ${answer.file}`, { name: "saved" });
+    });
   });
 
   const modeTitle = element("p", { className: "faint" });
@@ -137,29 +119,28 @@ export function editSheet(studio, load) {
   const showMode = () => {
     const { mode } = studio;
     modeBox.hidden = mode === null;
-    const changes = [...single.values()].filter((values) => !atRest(values)).length;
-    const others = changes ? ` Changed modes: ${changes}.` : "";
-    modeTitle.textContent =
-      (mode === null
+    const count = [...changedModes.values()].filter((values) => !isNeutral(values)).length;
+    const title =
+      mode === null
         ? "Choose a mode in the tab Modes."
-        : `Mode ${studio.bank}, now at ${studio.modes.frequency(mode).toFixed(1)} Hz.`) + others;
-    const values = single.get(studio.bank) ?? {};
+        : `Mode ${studio.bank}, now at ${studio.modes.frequency(mode).toFixed(1)} Hz.`;
+    modeTitle.textContent = title + (count ? ` Changed modes: ${count}.` : "");
+    const values = changedModes.get(studio.bank) ?? {};
     for (const [which, slider] of Object.entries(modeSliders)) {
       // A muted mode has no level: null.
-      slider.set(values[which] === null ? SINGLE[which][1].low : (values[which] ?? slider.rest));
+      slider.set(values[which] === null ? OF_ONE[which][1].low : (values[which] ?? slider.rest));
     }
   };
   studio.on("mode", showMode);
   studio.on("bundle", () => {
-    showHolds();
-    tell(studio.live?.remarks ?? []);
+    enable();
+    remarks.replaceChildren(...(studio.live?.remarks ?? []).map((words) => element("p", { className: "faint" }, words)));
   });
 
   const sheet = section(
     group(
       element("h2", {}, "Material"),
-      // The server's messages use this label.
-      element("label", { className: "choice" }, "Present material", from),
+      element("label", { className: "choice" }, studio.live.oldMaterial, from),
       element("label", { className: "choice" }, "New material", to),
     ),
     group(...Object.values(sliders).map((slider) => slider.element)),
@@ -168,10 +149,52 @@ export function editSheet(studio, load) {
     busy,
     remarks,
   );
-  if (studio.can("like")) sheet.append(leadGroup(studio, changes, hold));
+  if (studio.can("like")) sheet.append(guidedEdit(studio, changes, hold));
   if (studio.can("save")) sheet.append(group(element("h2", {}, "Save"), line(name, save)));
-  takeSliders();
+  setSliders(studio.live.sliders ?? {});
   return { element: sheet };
 }
 
-const atRest = ({ db, pitch, decay }) => db === 0 && pitch === 1 && decay === 1;
+/** Optimize the sound towards a recording or a text: minutes of work, during which the sliders rest. */
+function guidedEdit(studio, changes, hold) {
+  const progress = new JobProgress();
+  const start = (ask) =>
+    hold(async () => {
+      progress.begin("Starting …");
+      const again = () => start(ask);
+      const started = await changes.queue(async () => (await changes.settle()) && changes.ask(ask, { again }));
+      if (started) await follow(started.job);
+      else progress.end();
+    }, "minutes");
+  const follow = async (job) => {
+    const steps = [];
+    const last = await progress.follow(job, (message) => {
+      // Other stages have no loss, and a step without a number says so.
+      if (Number.isFinite(message.loss)) steps.push(message);
+    });
+    if (last.error) say(last.error, { name: "edit", bad: true });
+    else if (last.revision !== undefined && (await changes.queue(() => changes.show(last, { sliders: true })))) {
+      studio.strikeAgain();
+      say(summaryOf(steps), { name: "guided" });
+    }
+  };
+
+  const byRecording = (file) => start(() => server.guide(studio.revision, file));
+  const rows = [filePicker("Towards a recording …", ".wav,audio/wav", byRecording)];
+  if (studio.can("words")) {
+    const placeholder = "a wooden bowl is hit";
+    const text = element("input", { type: "text", "aria-label": "Description of the sound", placeholder });
+    rows.push(text, button("Towards this text", () => start(() => server.edit(studio.revision, { prompt: text.value }))));
+  }
+  // One that was running before the page was loaded goes on.
+  if (studio.live.jobKind === "lead") hold(() => follow(studio.live.job), "minutes");
+  return group(element("h2", {}, "Guided edit"), line(...rows, progress.stop), progress.bar, progress.stage);
+}
+
+/** The result of an optimization's steps, {loss, pitch} each. */
+function summaryOf(steps) {
+  if (!steps.length) return "Guided edit finished.";
+  const [first, last] = [steps[0], steps.at(-1)];
+  const losses = `${first.loss.toPrecision(2)} to ${last.loss.toPrecision(2)}`;
+  return `Guided edit finished: pitch × ${last.pitch.toPrecision(3)}, loss from ${losses}. Undo reverts it.`;
+}

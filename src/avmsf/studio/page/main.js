@@ -1,60 +1,57 @@
 /** The page: load the field, show it, sound it, and put a panel with what can be done beside it. */
 
-import { BlowInput } from "./blowinput.js";
-import { loadBundle } from "./bundle.js";
+import { loadBundle, server } from "./api.js";
+import { captureTab } from "./capture.js";
+import { SpectrumView } from "./charts.js";
 import { attempt, element, makeTabs, say } from "./dom.js";
-import { editSheet } from "./edit.js";
-import { findSheet } from "./find.js";
-import { captureSheet } from "./capturemode.js";
-import { modeTable } from "./modetable.js";
-import { server } from "./server.js";
+import { editTab } from "./edit.js";
+import { locateTab } from "./locate.js";
+import { modesTab } from "./modetable.js";
+import { StrikePointer } from "./pointer.js";
 import { SoundEngine } from "./sound.js";
-import { SpectrumView } from "./spectrumview.js";
-import { strikeSheet } from "./strikesheet.js";
+import { strikeTab } from "./strike.js";
 import { Studio } from "./studio.js";
 
 const at = (name) => document.getElementById(name);
 const UPS = ["z", "y", "x"];
+const HINT = {
+  capture: "<strong>Click the object</strong> where you will strike it",
+  field: "<strong>Click the object</strong> to strike it. Hold longer for more force. Drag to rotate.",
+};
 
 async function open() {
-  // The 3D library is by far the largest part: it is fetched beside all else, and by itself, so that the panel works
-  // where it cannot be had.
+  // The 3D library is by far the largest part: it is fetched during all else, and by itself, so that the panel works
+  // where it cannot be loaded.
   const library = import("./objectview.js");
   library.catch(() => {});
   const studio = new Studio(await loadBundle());
   window.avmsf.studio = studio;
-  const capturing = studio.live?.mode === "capture";
-  showTitle(studio);
-  const sound = capturing ? null : startSound(studio);
-  const sheets = await (capturing ? captureTabs(studio) : fieldTabs(studio));
-  await showObject(studio, sheets, library);
+  const mode = studio.live?.mode ?? "field";
+  studio.on("bundle", () => showTitle(studio));
+  const sound = mode === "field" ? startSound(studio) : null;
+  const panel = await (mode === "field" ? fieldTabs(studio) : captureTabs(studio));
+  await showObject(studio, panel, library);
   await sound;
   studio.dispatchEvent(new Event("view"));
   at("hint").hidden = !studio.view;
-  at("hint").innerHTML = capturing
-    ? "<strong>Click the object</strong> where you will strike it"
-    : "<strong>Click the object</strong> to strike it. Hold longer for more force. Drag to rotate.";
-  takeDrops(sheets);
-  // Struck it can be from now on, and seen from the next frame.
+  at("hint").innerHTML = HINT[mode];
+  takeDrops(panel);
+  // It can be struck from now on, and seen from the next frame.
   await new Promise((drawn) => requestAnimationFrame(drawn));
   window.avmsf.readyAt = performance.now();
   return studio;
 }
 
-function showTitle(studio) {
-  studio.on("bundle", () => {
-    const { name, points, sampleRate, supporting = [] } = studio.bundle.manifest;
-    const poles = studio.bundle.manifest.modes;
-    const modes = poles ? poles - supporting.length : 0;
-    at("name").textContent = name;
-    document.title = studio.live ? `${name} · avmsf studio` : name;
-    const facts = [
-      poles ? `${modes} modes` : null,
-      points ? `${points.toLocaleString("en")} contacts` : null,
-      poles ? `${Math.round(sampleRate / 100) / 10} kHz` : null,
-    ];
-    at("facts").textContent = facts.filter(Boolean).join(" · ");
-  });
+function showTitle({ bundle: { manifest }, live }) {
+  const { name, modes: poles, points, sampleRate, supporting = [] } = manifest;
+  at("name").textContent = name;
+  document.title = live ? `${name} · avmsf studio` : name;
+  const facts = [
+    poles ? `${poles - supporting.length} modes` : null,
+    points ? `${points.toLocaleString("en")} contacts` : null,
+    poles ? `${Math.round(sampleRate / 100) / 10} kHz` : null,
+  ];
+  at("facts").textContent = facts.filter(Boolean).join(" · ");
 }
 
 async function startSound(studio) {
@@ -63,71 +60,62 @@ async function startSound(studio) {
   try {
     studio.engine = await SoundEngine.start(studio.bundle);
   } catch (error) {
-    const words = `No sound: ${error.message}. The charts still show the model.`;
-    say(words, { name: "sound", bad: true });
+    say(`No sound: ${error.message}. The charts still show the model.`, { name: "sound", bad: true });
     at("output").textContent = "output (no sound)";
   }
-  studio.on("bundle", () => {
-    if (studio.engine && studio.engine.bundle !== studio.bundle) studio.engine.replace(studio.bundle);
-    studio.spectra.listen(studio.modes, studio.engine);
-  });
+  studio.on("bundle", () => studio.spectra.listen(studio.modes, studio.engine));
 }
 
 async function fieldTabs(studio) {
-  const strike = strikeSheet(studio);
+  const strike = strikeTab(studio);
   studio.on("bundle", () => {
-    for (const control of strike.element.querySelectorAll("button")) control.disabled = studio.modes.points === 0;
+    for (const control of strike.element.querySelectorAll("button")) control.disabled = studio.contacts.count === 0;
   });
-  const sheets = [
+  const locate = studio.can("locate") ? locateTab(studio) : null;
+  const capture = studio.can("capture") ? await captureTab(studio) : null;
+  const tabs = [
     { name: "strike", words: "Strike", ...strike },
-    { name: "modes", words: "Modes", ...modeTable(studio) },
+    { name: "modes", words: "Modes", ...modesTab(studio) },
   ];
-  if (studio.can("locate")) sheets.push({ name: "find", words: "Locate", ...findSheet(studio) });
-  if (studio.can("edit")) sheets.push({ name: "edit", words: "Edit", ...editSheet(studio, () => reload(studio)) });
-  if (studio.can("capture")) sheets.push({ name: "capture", words: "Capture", ...(await captureSheet(studio)) });
-  const show = makeTabs(sheets);
-  const find = sheets.find(({ name }) => name === "find");
-  const capture = sheets.find(({ name }) => name === "capture");
-  const adding = () => capture !== undefined && !capture.element.hidden;
+  if (locate) tabs.push({ name: "find", words: "Locate", ...locate });
+  if (studio.can("edit")) tabs.push({ name: "edit", words: "Edit", ...editTab(studio, () => reload(studio)) });
+  if (capture) tabs.push({ name: "capture", words: "Capture", ...capture });
+  const show = makeTabs(tabs);
+  const capturing = () => capture !== null && !capture.element.hidden;
   return {
-    atPress: () => !adding() && strike.atPress(),
-    struck: (hit, factor) => {
-      if (adding()) capture.choose(hit);
-      else studio.strike(hit.row, { factor });
-    },
-    take: find && ((file) => (adding() ? capture.take(file) : (show("find"), find.take(file)))),
+    atPress: () => !capturing() && strike.atPress(),
+    strike: (hit, factor) => (capturing() ? capture.choose(hit) : studio.strike(hit.row, { factor })),
+    take: locate && ((file) => (capturing() ? capture.take(file) : (show("find"), locate.take(file)))),
   };
 }
 
 async function captureTabs(studio) {
-  const capture = await captureSheet(studio);
+  const capture = await captureTab(studio);
   makeTabs([{ name: "capture", words: "Capture", ...capture }]);
-  if (studio.modes.points <= 1) tellOfNoObject(studio.live);
-  return { atPress: () => false, struck: (hit) => capture.choose(hit), take: capture.take };
+  if (studio.contacts.count <= 1) sayNoObject(studio.live);
+  return { atPress: () => false, strike: (hit) => capture.choose(hit), take: capture.take };
 }
 
-/** The job of the server that makes an object of pictures. */
-const MAKING = "reconstruct the object from its images";
-
-function tellOfNoObject({ job, jobKind, noObject }) {
+function sayNoObject({ jobKind, noObject }) {
   const name = "object";
-  const words = "No object to click";
   const again = async () => (await attempt(() => server.makeObject(), name)) && location.reload();
-  const answers = [["Try again", again]];
-  if (job && jobKind === MAKING)
-    say(`${words} yet: it is being reconstructed from the images. Until then, enter coordinates.`, { name });
-  else if (noObject) say(`${words}: the reconstruction from the images failed: ${noObject}`, { name, bad: true, answers });
-  else say(`${words}: enter coordinates.`, { name });
+  if (jobKind === "make_object")
+    say("No object to click yet: it is being reconstructed from the images. Until then, enter coordinates.", { name });
+  else if (noObject) {
+    const words = `No object to click: the reconstruction from the images failed: ${noObject}`;
+    say(words, { name, bad: true, answers: [["Try again", again]] });
+  } else say("No object to click: enter coordinates.", { name });
 }
 
 /** Fetch what the server now has; after an edit, say, or when another tab was faster. */
 async function reload(studio) {
   const bundle = await loadBundle();
   await studio.view?.replace(bundle);
+  await studio.engine?.replace(bundle);
   studio.take(bundle);
 }
 
-async function showObject(studio, { atPress, struck }, library) {
+async function showObject(studio, { atPress, strike }, library) {
   try {
     const { ObjectView } = await library;
     studio.view = await ObjectView.create(at("stage"), at("overlay"), studio.bundle);
@@ -135,31 +123,31 @@ async function showObject(studio, { atPress, struck }, library) {
     say(error.message, { name: "view", bad: true });
     return;
   }
+  const { view } = studio;
   at("stage").append(element("div", { className: "crosshair" }));
-  new BlowInput(studio.view, {
+  new StrikePointer(view, {
     strike: (hit, factor) => {
       at("hint").hidden = true;
-      struck(hit, factor);
+      strike(hit, factor);
     },
-    hover: (hit) => studio.view.canvas.classList.toggle("over-object", hit !== null),
+    hover: (hit) => view.canvas.classList.toggle("over-object", hit !== null),
     atPress,
   });
   at("tools").hidden = false;
-  at("look").addEventListener("click", () => studio.view.look(studio.view.up));
+  at("reset-view").addEventListener("click", () => view.eye.look(view.contacts, view.eye.up));
   at("upright").addEventListener("click", () => {
-    const up = UPS[(UPS.indexOf(studio.view.up) + 1) % UPS.length];
-    studio.view.look(up);
+    const up = UPS[(UPS.indexOf(view.eye.up) + 1) % UPS.length];
+    view.eye.look(view.contacts, up);
     at("upright").textContent = `Up: ${up}`;
   });
-  const { view } = studio;
   const names = { gaussians: "Gaussians", mesh: "mesh", points: "points" };
   const label = () => {
     const { object, surface } = view.bundle.manifest;
-    at("other-look").hidden = !surface;
-    at("other-look").textContent = `Show ${view.source === "surface" ? names[object.kind] : "surface"}`;
+    at("other-source").hidden = !surface;
+    at("other-source").textContent = `Show ${view.source === "surface" ? names[object.kind] : "surface"}`;
   };
   studio.on("bundle", label);
-  at("other-look").addEventListener("click", async () => {
+  at("other-source").addEventListener("click", async () => {
     await attempt(() => view.showAs(view.source === "surface" ? "object" : "surface"), "view");
     label();
   });
@@ -172,9 +160,8 @@ async function showObject(studio, { atPress, struck }, library) {
 /** A WAV file may be dropped anywhere, where there is something to do with it; elsewhere it must not replace the page. */
 function takeDrops({ take }) {
   const target = at("drop-target");
-  const files = ({ dataTransfer }) => [...(dataTransfer?.types ?? [])].includes("Files");
   window.addEventListener("dragover", (event) => {
-    if (!files(event)) return;
+    if (![...(event.dataTransfer?.types ?? [])].includes("Files")) return;
     event.preventDefault();
     if (take) target.hidden = false;
     else event.dataTransfer.dropEffect = "none";
@@ -192,20 +179,20 @@ function takeDrops({ take }) {
   });
 }
 
-/** For scripts and tests: the same doors as the pointer's. */
+/** For scripts and tests: what the pointer can do. */
 window.avmsf = {
   ready: null,
-  /** Strike a contact, by its row or by a place on the object, meters. */
+  /** Strike a contact, by its row or by a position on the object, meters. */
   strike(contact, { force = 1, contactTime = null } = {}) {
     const { studio } = window.avmsf;
-    const row = typeof contact === "number" ? contact : studio.view.contactAt(contact).row;
+    const row = typeof contact === "number" ? contact : studio.contacts.nearest(contact).row;
     studio.strike(row, { force, contactTime });
     return row;
   },
-  /** The sound of blows [{row, force, contactTime, when}], from the bank that plays. */
-  renderOffline: (blows, seconds, options) => window.avmsf.studio.engine.renderOffline(blows, seconds, options),
+  /** The sound of strikes [{row, force, contactTime, when}], from the bank that plays. */
+  renderOffline: (strikes, seconds, options) => window.avmsf.studio.engine.renderOffline(strikes, seconds, options),
   pick: (clientX, clientY) => window.avmsf.studio.view.pick(clientX, clientY),
-  project: (place) => window.avmsf.studio.view.project(place),
+  project: (position) => window.avmsf.studio.view.project(position),
   /** Values and colors that the contacts are painted by; null without paint. */
   painted: () => window.avmsf.studio.view.painted,
 };

@@ -6,7 +6,7 @@ const SIXTY_DB = Math.log(1000);
 export const decibels = (amplitude) => DECIBELS * Math.log(Math.max(amplitude, 1e-12));
 
 export class Modes {
-  constructor({ manifest, tensors }) {
+  constructor({ manifest, tensors, contacts }) {
     this.count = manifest.modes ?? 0;
     /** Rows that are no modes of the object, but describe what its modes do not explain. */
     this.supporting = new Set(manifest.supporting ?? []);
@@ -14,12 +14,7 @@ export class Modes {
     this.sampleRate = manifest.sampleRate;
     this.shared = manifest.damping !== "perContact";
     this.tensors = tensors;
-  }
-
-  /** Whether the rows of another field's contacts are those of this one's. */
-  sameContacts(other) {
-    const [here, there] = [this.tensors.points, other?.tensors.points];
-    return here?.length === there?.length && here.every((value, at) => value === there[at]);
+    this.contacts = contacts;
   }
 
   frequency(mode) {

@@ -1,4 +1,4 @@
-/** The table of the modes: pitch, decay and level at the contact struck last; one is chosen to paint its shape. */
+/** The table of the modes: pitch, decay and level at the last contact; one is chosen to paint its shape. */
 
 import { signScale } from "./colors.js";
 import { button, element, seconds, section } from "./dom.js";
@@ -10,91 +10,77 @@ const COLUMNS = [
   ["level", "Level, dB", "Relative to the loudest mode, at the last contact"],
 ];
 
-const lineOf = (part) => part.closest("tr");
-
-export function modeTable(studio) {
+export function modesTab(studio) {
   let order = { column: "frequency", down: false };
+  let painted = false;
   const body = element("tbody");
-  const head = element("tr");
-  for (const [name, words, title] of COLUMNS) {
+  const where = element("small");
+  const heads = COLUMNS.map(([name, words, title]) => {
     const sort = button(words, () => {
       order = { column: name, down: order.column === name ? !order.down : name === "level" };
       fill();
     });
-    head.append(element("th", { scope: "col", title, "data-column": name }, sort));
-  }
-  const table = element("table", { "aria-label": "Modes" }, element("thead", {}, head), body);
-  const where = element("small");
-  let painted = false;
+    return element("th", { scope: "col", title, "data-column": name }, sort);
+  });
+  const table = element("table", { "aria-label": "Modes" }, element("thead", {}, element("tr", {}, ...heads)), body);
 
   const fill = () => {
     const { modes } = studio;
-    const row = studio.row ?? modes.loudestRow;
-    const levels = modes.levels(row);
+    const contact = studio.row ?? modes.loudestRow;
     where.textContent =
-      (studio.row === null ? "Levels at the loudest contact." : `Levels and decays at contact ${row}.`) +
+      (studio.row === null ? "Levels at the loudest contact." : `Levels and decays at contact ${contact}.`) +
       (modes.supporting.size ? " In italics: supporting poles, which are not modes of the object." : "");
-    const rows = levels.map((level, mode) => ({
+    const rows = modes.levels(contact).map((level, mode) => ({
       mode,
       frequency: modes.frequency(mode),
-      decay: modes.decayTime(mode, row),
+      decay: modes.decayTime(mode, contact),
       level,
     }));
     rows.sort((one, other) => (order.down ? -1 : 1) * (one[order.column] - other[order.column]));
-    for (const cell of head.children) {
-      if (cell.dataset.column === order.column) cell.setAttribute("aria-sort", order.down ? "descending" : "ascending");
-      else cell.removeAttribute("aria-sort");
+    for (const head of heads) {
+      const sorted = head.dataset.column === order.column;
+      head.setAttribute("aria-sort", sorted ? (order.down ? "descending" : "ascending") : "none");
     }
-    const focused = body.contains(document.activeElement) ? lineOf(document.activeElement).dataset.mode : null;
-    body.replaceChildren(
-      ...rows.map(({ mode, frequency, decay, level }) => {
-        const title = `Color the object by the gain of the mode at ${frequency.toFixed(1)} Hz`;
-        const pressed = String(mode === studio.mode);
-        const numbers = [frequency.toFixed(1), decay.toPrecision(3), level.toFixed(1)];
-        // The button is for keys and for who does not see; a click anywhere in its line presses it.
-        const choose = button(String(mode + 1), () => {}, { className: "small", title, "aria-pressed": pressed });
-        choose.setAttribute("aria-label", title);
-        return element(
-          "tr",
-          {
-            "data-mode": mode,
-            className: modes.supporting.has(mode) ? "supporting" : "",
-            onclick: () => studio.choose(studio.mode === mode ? null : mode),
-          },
-          element("td", {}, choose),
-          ...numbers.map((words) => element("td", {}, words === "NaN" ? "–" : words)),
-        );
-      }),
-    );
-    if (focused !== null) body.querySelector(`[data-mode="${focused}"] button`)?.focus();
+    const focused = document.activeElement?.closest("tr[data-mode]")?.dataset.mode;
+    body.replaceChildren(...rows.map(rowOf));
+    body.querySelector(`[data-mode="${focused}"] button`)?.focus();
+  };
+  const rowOf = ({ mode, frequency, decay, level }) => {
+    // The button is for keys and for who does not see; a click anywhere in its row presses it.
+    const choose = button(String(mode + 1), () => {}, { className: "small", "aria-pressed": String(mode === studio.mode) });
+    choose.title = `Color the object by the gain of the mode at ${frequency.toFixed(1)} Hz`;
+    choose.ariaLabel = choose.title;
+    const numbers = [frequency.toFixed(1), decay.toPrecision(3), level.toFixed(1)];
+    const properties = {
+      "data-mode": mode,
+      className: studio.modes.supporting.has(mode) ? "supporting" : "",
+      onclick: () => studio.choose(studio.mode === mode ? null : mode),
+    };
+    return element("tr", properties, ...[choose, ...numbers].map((cell) => element("td", {}, cell === "NaN" ? "–" : cell)));
   };
 
   studio.on("bundle struck", fill);
   studio.addEventListener("mode", () => {
     const { mode, modes } = studio;
-    for (const press of body.querySelectorAll("button"))
-      press.setAttribute("aria-pressed", String(Number(lineOf(press).dataset.mode) === mode));
-    // Paint of another kind, such as where a blow was found, is not this table's to take off.
+    for (const row of body.children)
+      row.querySelector("button").setAttribute("aria-pressed", String(Number(row.dataset.mode) === mode));
+    // Paint of another kind, such as the position of an impact, is not this table's to take off.
     if (mode === null && painted) studio.paint(null);
     painted = mode !== null;
-    if (painted) {
-      const title = `Mode at ${modes.frequency(mode).toFixed(1)} Hz, ${seconds(
-        modes.decayTime(mode, studio.row ?? 0),
-      )}: gain`;
-      const options = { scale: signScale, title, ends: ["−1", "0", "+1"] };
-      studio.paint(modes.shape(mode), options);
-    }
+    if (!painted) return;
+    const decay = seconds(modes.decayTime(mode, studio.row ?? 0));
+    const title = `Mode at ${modes.frequency(mode).toFixed(1)} Hz, ${decay}: gain`;
+    studio.paint(modes.shape(mode), { scale: signScale, title, ends: ["−1", "0", "+1"] });
   });
   // An edit moves pitches, not shapes; the paint of a mode that is gone goes with it.
   studio.addEventListener("bundle", () => {
     if (studio.bank !== null) studio.choose(studio.mode);
   });
 
-  const tableBox = element("div", { className: "table-box" }, table);
   return {
     element: section(
       element("p", { className: "faint" }, "Choose a mode to color the object by its gain."),
-      tableBox,
+      element("div", { className: "table-box" }, table),
       where,
     ),
   };

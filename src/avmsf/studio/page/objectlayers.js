@@ -1,24 +1,30 @@
 /** What an object looks like: its mesh, its Gaussians, or its contacts alone; each can be hit by a ray and painted. */
 
 import * as THREE from "three";
+import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { TessellateModifier } from "three/addons/modifiers/TessellateModifier.js";
+import { mergeGeometries, mergeVertices } from "three/addons/utils/BufferGeometryUtils.js";
+import { MeshBVH } from "three-mesh-bvh";
 
-import { Neighbors } from "./neighbors.js";
-import { subdivide } from "./subdivide.js";
-import { TriangleTree } from "./triangletree.js";
+import { Paint } from "./paint.js";
 
-/** Parts of the light that paint keeps of a Gaussian's own brightness, so that the shape stays to be seen. */
+/** Brightness of a mesh without a color of its own: a white one is hardly seen on the page's light ground. */
+const UNCOLORED_GRAY = 0.42;
+/** Share of the light that paint keeps of a Gaussian's own brightness, so that the shape stays to be seen. */
 const SHADING = 0.35;
+/** Edges of a painted mesh have at least this part of its diagonal, which gives at most some 200,000 triangles. */
+const MIN_EDGE_SHARE = 1 / 200;
+const MAX_HALVINGS = 30;
 
 /** Contacts as round dots. */
 export class PointLayer {
-  constructor(grid, spacing) {
-    this.grid = grid;
+  constructor(contacts) {
     const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.BufferAttribute(grid.points, 3));
-    this.colors = new THREE.BufferAttribute(new Uint8Array(grid.points.length), 3, true);
+    geometry.setAttribute("position", new THREE.BufferAttribute(contacts.points, 3));
+    this.colors = new THREE.BufferAttribute(new Uint8Array(contacts.points.length), 3, true);
     geometry.setAttribute("color", this.colors);
     const material = new THREE.PointsMaterial({
-      size: 1.7 * spacing,
+      size: 1.7 * contacts.spacing,
       vertexColors: true,
       map: roundDot(),
       alphaTest: 0.5,
@@ -38,19 +44,17 @@ export class PointLayer {
   }
 
   dispose() {
-    this.object.geometry.dispose();
-    this.object.material.map.dispose();
-    this.object.material.dispose();
+    dispose(this.object);
   }
 }
 
 function roundDot() {
   const size = 32;
   const pixels = new Uint8Array(4 * size * size);
-  for (let place = 0; place < size * size; place++) {
-    const [x, y] = [(place % size) + 0.5, Math.floor(place / size) + 0.5].map((value) => (2 * value) / size - 1);
-    const lit = 255 * (1 - 0.35 * (x * x + y * y));
-    pixels.set([lit, lit, lit, x * x + y * y < 1 ? 255 : 0], 4 * place);
+  for (let at = 0; at < size * size; at++) {
+    const [x, y] = [(at % size) + 0.5, Math.floor(at / size) + 0.5].map((value) => (2 * value) / size - 1);
+    const light = 255 * (1 - 0.35 * (x * x + y * y));
+    pixels.set([light, light, light, x * x + y * y < 1 ? 255 : 0], 4 * at);
   }
   const map = new THREE.DataTexture(pixels, size, size);
   map.colorSpace = THREE.SRGBColorSpace;
@@ -60,35 +64,41 @@ function roundDot() {
 
 /** A mesh, lit; painted, a finer copy of it. */
 export class MeshLayer {
-  static async load(bytes, grid, spacing) {
-    const { GLTFLoader } = await import("three/addons/loaders/GLTFLoader.js");
+  static async load(bytes, contacts) {
     const { scene } = await new GLTFLoader().parseAsync(bytes, "");
-    return new MeshLayer(scene, grid, spacing);
+    return new MeshLayer(scene, contacts);
   }
 
-  constructor(scene, grid, spacing) {
+  constructor(scene, contacts) {
     this.object = new THREE.Group();
     this.object.add(scene);
-    this.grid = grid;
-    this.spacing = spacing;
+    this.contacts = contacts;
     this.scene = scene;
     this.painted = null;
     scene.updateMatrixWorld(true);
+    const parts = [];
     scene.traverse((part) => {
       if (!part.isMesh) return;
-      part.material.side = THREE.DoubleSide;
-      // Metal shows but what it mirrors, and there is nothing around the object.
-      part.material.metalness = 0;
-      part.material.roughness = 0.8;
-      if (!part.geometry.attributes.normal) part.geometry.computeVertexNormals();
+      const { geometry, material } = part;
+      material.side = THREE.DoubleSide;
+      // Metal shows only what it mirrors, and there is nothing around the object.
+      material.metalness = 0;
+      material.roughness = 0.8;
+      const { s: saturation, l: lightness } = material.color.getHSL({});
+      if (!material.map && !geometry.attributes.color && saturation < 0.05 && lightness > UNCOLORED_GRAY)
+        material.color.setScalar(UNCOLORED_GRAY);
+      if (!geometry.attributes.normal) geometry.computeVertexNormals();
+      const bare = new THREE.BufferGeometry();
+      for (const name of ["position", "normal"]) bare.setAttribute(name, geometry.attributes[name].clone());
+      bare.setIndex(geometry.index?.clone() ?? null);
+      parts.push((bare.index ? bare.toNonIndexed() : bare).applyMatrix4(part.matrixWorld));
     });
-    this.corners = cornersOf(scene);
-    this.tree = new TriangleTree(this.corners.position.array);
+    this.geometry = mergeGeometries(parts);
+    this.tree = new MeshBVH(this.geometry, { indirect: true });
   }
 
   hit({ ray }) {
-    const along = this.tree.distance(ray.origin.toArray(), ray.direction.toArray());
-    return along === Infinity ? null : ray.at(along, new THREE.Vector3());
+    return this.tree.raycastFirst(ray, THREE.DoubleSide)?.point ?? null;
   }
 
   paint(colors) {
@@ -97,18 +107,18 @@ export class MeshLayer {
     if (!colors) return;
     this.painted ??= this.#finerCopy();
     const attribute = this.painted.geometry.attributes.color;
-    attribute.array.set(this.neighbors.mix(colors, toLight));
+    attribute.array.set(this.paints.mix(colors).map(toLight));
     attribute.needsUpdate = true;
   }
 
+  /** A copy whose edges are so short that colors of its corners show what the contacts between them have. */
   #finerCopy() {
-    const fine = subdivide(this.corners, 1.5 * this.spacing);
-    const geometry = new THREE.BufferGeometry();
-    const position = fine.position.array;
-    geometry.setAttribute("position", new THREE.BufferAttribute(position, 3));
-    geometry.setAttribute("normal", new THREE.BufferAttribute(fine.normal.array, 3));
-    geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(position.length), 3));
-    this.neighbors = new Neighbors(this.grid, position);
+    const { spacing, diagonal } = this.contacts;
+    const longest = Math.max(1.5 * spacing, MIN_EDGE_SHARE * diagonal);
+    const geometry = mergeVertices(new TessellateModifier(longest, MAX_HALVINGS).modify(this.geometry));
+    const { position, normal } = geometry.attributes;
+    geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(position.array.length), 3));
+    this.paints = new Paint(this.contacts, position.array, normal.array);
     const material = new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide });
     const copy = new THREE.Mesh(geometry, material);
     this.object.add(copy);
@@ -116,33 +126,15 @@ export class MeshLayer {
   }
 
   dispose() {
-    this.object.traverse((part) => {
-      part.geometry?.dispose();
-      for (const value of Object.values(part.material ?? {})) if (value?.isTexture) value.dispose();
-      part.material?.dispose();
-    });
+    this.geometry.dispose();
+    dispose(this.object);
   }
 }
 
-/** Positions and normals of all corners of all triangles of a scene, in the world. */
-function cornersOf(scene) {
-  const parts = [];
-  scene.traverse((part) => {
-    if (!part.isMesh) return;
-    const flat = part.geometry.index ? part.geometry.toNonIndexed() : part.geometry.clone();
-    parts.push(flat.applyMatrix4(part.matrixWorld));
+function dispose(object) {
+  object.traverse(({ geometry, material }) => {
+    for (const each of [geometry, material, ...Object.values(material ?? {})]) each?.dispose?.();
   });
-  const joined = (name) => {
-    const arrays = parts.map(({ attributes }) => attributes[name].array);
-    const array = new Float32Array(arrays.reduce((sum, { length }) => sum + length, 0));
-    let at = 0;
-    for (const values of arrays) {
-      array.set(values, at);
-      at += values.length;
-    }
-    return { array, size: 3 };
-  };
-  return { position: joined("position"), normal: joined("normal") };
 }
 
 /** A byte of the screen's red, green or blue as an amount of light from 0 to 1, as three wants it. */
@@ -153,63 +145,58 @@ function toLight(byte) {
 
 /** Gaussians, drawn by spark; painted, each keeps a part of its own brightness. */
 export class SplatLayer {
-  static async load(bytes, grid, { renderer, onDirty }) {
+  static async load(bytes, contacts, { renderer, onDirty }) {
     const spark = await import("@sparkjsdev/spark");
     const splats = new spark.SplatMesh({ fileBytes: bytes, fileType: spark.SplatFileType.PLY });
     await splats.initialized;
-    return new SplatLayer(spark, splats, grid, new spark.SparkRenderer({ renderer, onDirty }));
+    return new SplatLayer(spark, splats, contacts, new spark.SparkRenderer({ renderer, onDirty }));
   }
 
-  constructor(spark, splats, grid, sparkRenderer) {
+  constructor(spark, splats, contacts, sparkRenderer) {
     this.object = new THREE.Group();
     this.object.add(sparkRenderer, splats);
     this.spark = spark;
     this.splats = splats;
-    this.grid = grid;
+    this.contacts = contacts;
     this.sparkRenderer = sparkRenderer;
-    this.own = null;
+    this.opacities = null;
   }
 
   hit(raycaster) {
-    const [first] = raycaster.intersectObject(this.splats, false);
-    return first ? first.point : null;
+    return raycaster.intersectObject(this.splats, false)[0]?.point ?? null;
   }
 
   paint(colors) {
-    if (!this.own) {
+    if (!this.opacities) {
       if (!colors) return;
-      this.#readOwn();
+      this.#readSplats();
     }
-    const { rgba } = this;
-    if (!colors) rgba.count = 0;
-    else {
-      const mixed = this.neighbors.mix(colors);
-      for (let splat = 0; splat < this.lightness.length; splat++) {
-        const light = 1 - SHADING + SHADING * this.lightness[splat];
-        for (let channel = 0; channel < 3; channel++)
-          rgba.array[4 * splat + channel] = light * mixed[3 * splat + channel];
-        rgba.array[4 * splat + 3] = this.own[splat];
-      }
-      rgba.count = this.lightness.length;
+    const { rgba, brightness } = this;
+    const mixed = colors && this.paints.mix(colors);
+    rgba.count = colors ? brightness.length : 0;
+    for (let splat = 0; splat < rgba.count; splat++) {
+      const light = 1 - SHADING + SHADING * brightness[splat];
+      for (let channel = 0; channel < 3; channel++) rgba.array[4 * splat + channel] = light * mixed[3 * splat + channel];
+      rgba.array[4 * splat + 3] = this.opacities[splat];
     }
     rgba.needsUpdate = true;
     this.splats.updateVersion();
   }
 
-  #readOwn() {
-    const places = [];
+  #readSplats() {
+    const centers = [];
     const opacities = [];
-    const lightness = [];
-    this.splats.forEachSplat((_, center, scales, turn, opacity, color) => {
-      places.push(center.x, center.y, center.z);
+    const brightness = [];
+    this.splats.forEachSplat((_, center, scales, rotation, opacity, color) => {
+      centers.push(center.x, center.y, center.z);
       opacities.push(255 * opacity);
-      lightness.push(Math.min(0.3 * color.r + 0.6 * color.g + 0.1 * color.b, 1));
+      brightness.push(Math.min(0.3 * color.r + 0.6 * color.g + 0.1 * color.b, 1));
     });
-    this.own = Uint8Array.from(opacities);
-    this.lightness = Float32Array.from(lightness);
-    this.neighbors = new Neighbors(this.grid, Float32Array.from(places));
+    this.opacities = Uint8Array.from(opacities);
+    this.brightness = Float32Array.from(brightness);
+    this.paints = new Paint(this.contacts, Float32Array.from(centers));
     this.rgba = new this.spark.RgbaArray();
-    this.rgba.ensureCapacity(lightness.length);
+    this.rgba.ensureCapacity(brightness.length);
     this.splats.splatRgba = this.rgba;
     this.splats.updateGenerator();
   }

@@ -3,15 +3,8 @@
 import * as THREE from "three";
 
 import { element } from "./dom.js";
-import { PointGrid } from "./nearest.js";
 import { MeshLayer, PointLayer, SplatLayer } from "./objectlayers.js";
 import { Viewpoint } from "./viewpoint.js";
-
-/** Contacts about a place among which one on the near side of a wall is sought. */
-const WALL_NEIGHBORS = 16;
-
-/** The object cannot be shown; the message says why. */
-export class ViewError extends Error {}
 
 export class ObjectView {
   /** Show a bundle's object in `host`; marks are drawn as elements in `overlay`. */
@@ -20,11 +13,9 @@ export class ObjectView {
     try {
       renderer = new THREE.WebGLRenderer({ antialias: bundle.manifest.object.kind !== "gaussians", alpha: true });
     } catch {
-      throw new ViewError(
+      throw new Error(
         "This browser shows no 3D (WebGL is missing or off), so the object is not shown." +
-          (bundle.tensors.points?.length
-            ? " Sound still works: use the buttons in the panel."
-            : ""),
+          (bundle.tensors.points?.length ? " Sound still works: use the buttons in the panel." : ""),
       );
     }
     const view = new ObjectView(host, overlay, renderer);
@@ -50,32 +41,14 @@ export class ObjectView {
     return this.renderer.domElement;
   }
 
-  get controls() {
-    return this.eye.controls;
-  }
-
-  get up() {
-    return this.eye.up;
-  }
-
-  /** Show another bundle, from where one looked at the last if its contacts are the same. */
+  /** Show another bundle, from the same viewpoint if its contacts are the same. */
   async replace(bundle) {
-    const points = bundle.tensors.points;
-    if (!points?.length) {
-      throw new ViewError(
-        "This field has no geometry to show. Add it with " +
-          "`avmsf studio FIELD --object MESH`.",
-      );
-    }
-    const same = this.grid?.count === points.length / 3 && points.every((value, at) => value === this.grid.points[at]);
+    const { contacts } = bundle;
+    if (!contacts.count)
+      throw new Error("This field has no geometry to show. Add it with `avmsf studio FIELD --object MESH`.");
     const files = ({ object, surface }) => `${object.file} ${surface?.file}`;
-    if (this.bundle && same && files(this.bundle.manifest) === files(bundle.manifest)) {
-      this.normals = bundle.tensors.normals;
-      return;
-    }
-    this.grid = new PointGrid(points);
-    this.spacing = this.grid.spacing;
-    this.normals = bundle.tensors.normals;
+    if (this.bundle && contacts.equal(this.contacts) && files(this.bundle.manifest) === files(bundle.manifest)) return;
+    this.contacts = contacts;
     const layers = { object: this.#layer(bundle, "object") };
     await layers.object;
     if (this.layer) {
@@ -88,7 +61,7 @@ export class ObjectView {
     this.layers = layers;
     this.bundle = bundle;
     await this.showAs("object");
-    this.look();
+    this.eye.look(contacts, "z");
   }
 
   /** Show the object as its own file has it, "object", or the "surface" that was reconstructed, in the same paint. */
@@ -113,28 +86,13 @@ export class ObjectView {
 
   async #layer(bundle, source) {
     const { kind, file } = bundle.manifest[source];
-    if (kind === "points" || !file) return new PointLayer(this.grid, this.spacing);
+    if (kind === "points" || !file) return new PointLayer(this.contacts);
     const bytes = await bundle.read(file);
-    if (kind === "mesh") return MeshLayer.load(bytes, this.grid, this.spacing);
-    return SplatLayer.load(bytes, this.grid, { renderer: this.renderer, onDirty: () => this.redraw() });
+    if (kind === "mesh") return MeshLayer.load(bytes, this.contacts);
+    return SplatLayer.load(bytes, this.contacts, { renderer: this.renderer, onDirty: () => this.redraw() });
   }
 
-  /** Look at the whole object from above its side, with this axis upwards. */
-  look(up = "z") {
-    this.eye.look(this.grid, up);
-  }
-
-  /** Turn about the object by angles, radians: to the right, and up. */
-  turn(right, up) {
-    this.eye.turn(right, up);
-  }
-
-  /** Look at the object from the side on which a place lies, a little from above. */
-  face(place) {
-    this.eye.face(place, this.grid.diagonal);
-  }
-
-  /** What lies under a place on the screen: {row, place, normal}, the nearest contact's row; null beside the object. */
+  /** What lies under a point of the screen: {row, place, normal}, the nearest contact's row; null beside the object. */
   pick(clientX, clientY) {
     const box = this.canvas.getBoundingClientRect();
     const onScreen = new THREE.Vector2(
@@ -144,45 +102,27 @@ export class ObjectView {
     const raycaster = new THREE.Raycaster();
     this.camera.updateMatrixWorld();
     raycaster.setFromCamera(onScreen, this.camera);
-    const hit = this.layer.hit(raycaster) ?? this.#hitContacts(raycaster.ray);
-    return hit ? this.contactAt(hit.toArray(), raycaster.ray.direction.toArray()) : null;
+    const { ray } = raycaster;
+    const place = (this.layer.hit(raycaster) ?? this.#hitContacts(ray))?.toArray();
+    if (!place) return null;
+    const { row } = this.contacts.nearestFacing(place, ray.direction.clone().negate().toArray());
+    return { row, place, normal: this.contacts.normal(row) };
   }
 
   /** Where a ray meets the surface that the contacts stand for: discs as wide as they lie apart. */
-  #hitContacts({ origin, direction }) {
-    const { points, count } = this.grid;
-    const [ox, oy, oz] = origin.toArray();
-    const [dx, dy, dz] = direction.toArray();
-    const reach = 1.5 * this.spacing;
-    let [best, nearest] = [Infinity, null];
-    for (let row = 0; row < count; row++) {
-      const [x, y, z] = [points[3 * row] - ox, points[3 * row + 1] - oy, points[3 * row + 2] - oz];
-      const along = x * dx + y * dy + z * dz;
-      const [ax, ay, az] = [x - along * dx, y - along * dy, z - along * dz];
-      // Math.hypot is tenfold slower, and this runs for every contact.
-      const beside = Math.sqrt(ax * ax + ay * ay + az * az);
+  #hitContacts(ray) {
+    const radius = 1.5 * this.contacts.spacing;
+    const point = new THREE.Vector3();
+    let [least, nearest] = [Infinity, null];
+    for (let row = 0; row < this.contacts.count; row++) {
+      point.fromArray(this.contacts.points, 3 * row);
+      const beside = ray.distanceToPoint(point);
+      if (beside > radius) continue;
       // Among neighbors on the near side, the one that the ray comes closest to.
-      const cost = along + 3 * beside;
-      if (beside <= reach && cost < best) [best, nearest] = [cost, row];
+      const cost = point.distanceTo(ray.origin) + 3 * beside;
+      if (cost < least) [least, nearest] = [cost, point.clone()];
     }
-    return nearest === null ? null : new THREE.Vector3(...this.placeOf(nearest));
-  }
-
-  /** The contact nearest to a place; along a `sight`, of those whose side of a thin wall it meets. */
-  contactAt(place, sight = null) {
-    const near = this.grid.nearest(...place, sight && this.normals ? WALL_NEIGHBORS : 1);
-    const meets = ({ row, distance }) =>
-      distance <= 3 * this.spacing && this.normalOf(row).reduce((sum, value, at) => sum + value * sight[at], 0) < 0;
-    const { row, distance } = (near.length > 1 && near.find(meets)) || near[0];
-    return { row, place, distance, normal: this.normalOf(row) };
-  }
-
-  placeOf(row) {
-    return Array.from(this.grid.points.subarray(3 * row, 3 * row + 3));
-  }
-
-  normalOf(row) {
-    return this.normals ? Array.from(this.normals.subarray(3 * row, 3 * row + 3)) : null;
+    return nearest;
   }
 
   /** Where a place is on the screen, in client coordinates, and whether its side of the surface faces the eye. */
@@ -213,10 +153,10 @@ export class ObjectView {
     this.redraw();
   }
 
-  /** Mark a place by a dot, an element, with a label if there is one; on the side that the nearest contact faces. */
-  markDot(name, dot, place, label = null) {
+  /** Mark a place by a dot, an element, with a label if there is one; on the side of the surface that it lies on. */
+  markDot(name, dot, place, label = null, normal = this.contacts.outward(place)) {
     const words = label && element("span", { className: "label" }, label);
-    this.mark(name, element("div", { className: "mark" }, dot, words), place, this.contactAt(place).normal);
+    this.mark(name, element("div", { className: "mark" }, dot, words), place, normal);
   }
 
   unmark(name) {

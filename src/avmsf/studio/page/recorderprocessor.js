@@ -1,11 +1,10 @@
 /** Hands the microphone's sound to the page, untouched, some fifty times a second. */
 
-const BLOCK_SECONDS = 0.02;
+/** Blocks of 128 samples in one message. */
+const BLOCKS = 8;
 
 class RecorderProcessor extends AudioWorkletProcessor {
-  #length = Math.round(BLOCK_SECONDS * sampleRate);
-  #block = new Float32Array(this.#length);
-  #filled = 0;
+  #blocks = [];
   #ended = false;
 
   constructor() {
@@ -15,21 +14,10 @@ class RecorderProcessor extends AudioWorkletProcessor {
     };
   }
 
-  process([[sound]]) {
-    for (let at = 0; at < (sound?.length ?? 0); ) {
-      const part = sound.subarray(at, at + this.#length - this.#filled);
-      this.#block.set(part, this.#filled);
-      this.#filled += part.length;
-      at += part.length;
-      if (this.#filled === this.#length) this.#send();
-    }
+  process([[block]]) {
+    if (block) this.#blocks.push(block.slice());
+    if (this.#blocks.length === BLOCKS) this.port.postMessage(this.#blocks.splice(0));
     return !this.#ended;
-  }
-
-  #send() {
-    this.port.postMessage(this.#block, [this.#block.buffer]);
-    this.#block = new Float32Array(this.#length);
-    this.#filled = 0;
   }
 }
 

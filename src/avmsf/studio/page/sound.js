@@ -1,7 +1,7 @@
 // The sound engine: blows on the field's points, heard through the modal bank on the audio thread.
 
-import { pulseSamples, swingAfter } from "./pulse.js";
-import { resample } from "./resample.js";
+import { resample } from "./audio.js";
+import { Bank } from "./bank.js";
 
 const PROCESSOR = "avmsf-modal-bank";
 /** Blows that may sound at once; with dampings shared by all contacts this bounds their noise alone. */
@@ -15,10 +15,60 @@ const PATIENCE = 1;
 /** Contacts, and seconds of their sound, that the loudest is sought among. */
 const LOUD_CONTACTS = 8, LOUD_SECONDS = 0.03;
 
+/** Exponents of the sine that a mallet's force follows over its contact time, as avmsf.modal.modes has it. */
+const EXPONENTS = { "half-sine": 1, hertz: 1.5 };
+/** Gauss and Legendre's five points on -1..1. */
+const NODES = [0, 0.5384693101056831, -0.5384693101056831, 0.906179845938664, -0.906179845938664];
+const WEIGHTS = [0.5688888888888889, 0.47862867049936647, 0.47862867049936647, 0.23692688505618908, 0.23692688505618908];
+const PANELS = 4;
+
+/** The part of the impulse that falls into each sample's time; their sum is 1. `contactTime` in seconds. */
+export function pulseSamples(contactTime, sampleRate, shape = "half-sine") {
+  const exponent = EXPONENTS[shape];
+  if (exponent === undefined) throw new RangeError(`pulse: expected half-sine or hertz, got ${shape}`);
+  if (!(contactTime >= 0 && contactTime < 10)) throw new RangeError(`contact time: expected 0 to 10 s, got ${contactTime}`);
+  const length = contactTime * sampleRate;
+  const count = Math.max(1, Math.ceil(length));
+  if (count === 1) return Float64Array.of(1);
+  const parts = new Float64Array(count);
+  let sum = 0;
+  for (let n = 0; n < count; n++) sum += parts[n] = impulse(n / length, Math.min(1, (n + 1) / length), exponent);
+  return parts.map((part) => part / sum);
+}
+
+/**
+ * How far a mode swings at a pulse's last sample, over what an impulse there would leave; `angle` and `decay` are the
+ * radians by which it turns and the nepers by which it falls from one sample to the next.
+ */
+export function swingAfter(pulse, angle, decay = 0) {
+  const radius = Math.exp(-decay);
+  const [turnRe, turnIm] = [radius * Math.cos(angle), radius * Math.sin(angle)];
+  let [re, im] = [0, 0];
+  for (const part of pulse) [re, im] = [turnRe * re - turnIm * im + part, turnRe * im + turnIm * re];
+  return Math.hypot(re, im);
+}
+
+/** Integrate sin(pi t)^exponent, in u with t = (1 - cos u) / 2, in which both ends are smooth. */
+function impulse(from, to, exponent) {
+  const start = Math.acos(1 - 2 * from), width = (Math.acos(1 - 2 * to) - start) / PANELS;
+  let sum = 0;
+  for (let panel = 0; panel < PANELS; panel++) {
+    for (let node = 0; node < NODES.length; node++) {
+      const u = start + width * (panel + 0.5 + NODES[node] / 2);
+      const force = Math.sin((Math.PI * (1 - Math.cos(u))) / 2);
+      sum += WEIGHTS[node] * width * Math.max(0, force) ** exponent * Math.sin(u);
+    }
+  }
+  return sum;
+}
+
 /** What a field is at one sample rate, and the blows on it as the bank wants them. */
 class Tuned {
-  constructor(bundle, rate) {
-    const { manifest, tensors } = bundle;
+  static async of({ manifest, tensors }, rate) {
+    return new Tuned(manifest, tensors, rate, await resample(tensors.noise, manifest.sampleRate, rate));
+  }
+
+  constructor(manifest, tensors, rate, noise) {
     this.rate = rate;
     this.tensors = tensors;
     this.modes = manifest.modes;
@@ -27,7 +77,6 @@ class Tuned {
     this.shared = manifest.damping === "shared";
     this.frequency = this.pick(tensors.frequency, 0);
     const damping = this.shared ? this.pick(tensors.damping, 0) : null;
-    const noise = resample(tensors.noise, manifest.sampleRate, rate);
     this.field = { frequency: this.frequency, damping, noise };
   }
 
@@ -69,17 +118,11 @@ class Tuned {
   }
 
   peak(row) {
-    const sound = new Float64Array(Math.ceil(LOUD_SECONDS * this.rate));
-    this.kept.forEach((mode) => {
-      const place = row * this.modes + mode, damping = this.tensors.damping[this.shared ? mode : place];
-      const radius = Math.exp(-damping / this.rate), angle = (2 * Math.PI * this.tensors.frequency[mode]) / this.rate;
-      const turnRe = radius * Math.cos(angle), turnIm = radius * Math.sin(angle);
-      let re = this.tensors.cosine[place], im = -this.tensors.sine[place];
-      for (let n = 0; n < sound.length; n++) {
-        sound[n] += re;
-        [re, im] = [turnRe * re - turnIm * im, turnRe * im + turnIm * re];
-      }
-    });
+    const samples = Math.ceil(LOUD_SECONDS * this.rate);
+    const bank = new Bank({ ...this.field, noise: Float32Array.of(0) }, this.rate, samples, 1);
+    bank.strike(this.blow(row, {}, 0));
+    const sound = new Float64Array(samples);
+    bank.render(sound, 0);
     return sound.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
   }
 }
@@ -111,7 +154,7 @@ export async function renderOffline(bundle, blows, seconds, { sampleRate = bundl
     ? Math.round((bundle.manifest.samples * sampleRate) / bundle.manifest.sampleRate) : Math.round(seconds * sampleRate);
   const context = new OfflineAudioContext(1, Math.max(1, samples), sampleRate);
   await addBank(context);
-  const tuned = new Tuned(bundle, context.sampleRate);
+  const tuned = await Tuned.of(bundle, context.sampleRate);
   const ready = blows.map((blow, id) => tuned.blow(blow.row, blow, Math.round((blow.when ?? 0) * sampleRate), id));
   // So low that the limiter has nothing to do, whatever the unit; a power of two rounds nothing.
   const bound = blows.reduce((sum, { row, force = 1 }) => sum + Math.abs(force) * tuned.bound(row), 0);
@@ -131,13 +174,13 @@ export class SoundEngine {
     if (typeof AudioContext === "undefined") throw new Error("this browser has no AudioContext");
     const used = context ?? new AudioContext({ latencyHint: "interactive" });
     await addBank(used);
-    return new SoundEngine(bundle, used);
+    return new SoundEngine(bundle, used, await Tuned.of(bundle, used.sampleRate));
   }
 
-  constructor(bundle, context) {
+  constructor(bundle, context, tuned) {
     this.bundle = bundle;
     this.context = context;
-    this.tuned = new Tuned(bundle, context.sampleRate);
+    this.tuned = tuned;
     this.volume = 1;
     this.comfortable = COMFORTABLE / (this.tuned.loudest() || 1);
     const ahead = Math.round(AHEAD * context.sampleRate);
@@ -195,9 +238,9 @@ export class SoundEngine {
   }
 
   /** Go on with another field, such as an edited one; what sounds fades. The level stays, so that edits are compared. */
-  replace(bundle) {
+  async replace(bundle) {
+    this.tuned = await Tuned.of(bundle, this.context.sampleRate);
     this.bundle = bundle;
-    this.tuned = new Tuned(bundle, this.context.sampleRate);
     this.node.port.postMessage({ type: "field", field: this.tuned.field });
   }
 

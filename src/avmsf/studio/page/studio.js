@@ -4,28 +4,33 @@ import { element, say, seconds } from "./dom.js";
 import { Modes } from "./modes.js";
 
 export class Studio extends EventTarget {
+  view = null;
+  engine = null;
+  spectra = null;
+  /** The contact that was struck last, and the bank's row of the mode that is chosen. */
+  row = null;
+  bank = null;
+  force = 1;
+  /** Seconds the mallet stays on the object; null strikes as the recorded impacts did. */
+  contactTime = null;
+  pulse = "half-sine";
+
   constructor(bundle) {
     super();
-    this.view = null;
-    this.engine = null;
-    this.spectra = null;
-    this.row = null;
-    this.bank = null;
-    this.force = 1;
-    /** Seconds the mallet stays on the object; null strikes as the recorded blows did. */
-    this.contactTime = null;
-    this.pulse = "half-sine";
     this.take(bundle);
   }
 
   /** Show and sound another bundle, such as an edited field. */
   take(bundle) {
-    const modes = new Modes(bundle);
-    if (!modes.sameContacts(this.modes)) this.row = null;
+    if (!bundle.contacts.equal(this.bundle?.contacts)) this.row = null;
     this.bundle = bundle;
-    this.modes = modes;
+    this.modes = new Modes(bundle);
     this.revision = bundle.manifest.live?.revision ?? null;
-    this.#tell("bundle");
+    this.#notify("bundle");
+  }
+
+  get contacts() {
+    return this.bundle.contacts;
   }
 
   get live() {
@@ -42,49 +47,40 @@ export class Studio extends EventTarget {
 
   /** Strike a contact, with `factor` times the force that is set. */
   strike(row, { factor = 1, force = this.force * factor, contactTime = this.contactTime } = {}) {
-    if (!this.modes.points) {
+    if (!this.contacts.count) {
       say("This field has no contacts to strike.", { name: "strike", bad: true });
       return;
     }
     this.row = row;
+    this.last = { row, force, contactTime };
     const mallet = { contactTime: contactTime ?? 0, shape: this.pulse };
     this.engine?.strike(row, { force, ...mallet });
-    this.last = { row, force, contactTime };
     this.spectra?.struck(row, force, mallet);
-    this.#markBlow(row);
+    const parts = ["dot struck", "wave"].map((className) => element("div", { className }));
+    const mark = element("div", { className: "mark" }, ...parts);
+    this.view?.mark("struck", mark, this.contacts.position(row), this.contacts.normal(row));
     const where = this.view ? `contact ${row}` : `contact number ${row}`;
-    const touch = contactTime === null ? "" : `, ${seconds(contactTime)}`;
-    document.getElementById("blow-facts").textContent = `${where}, ${force.toPrecision(2)}${this.forceUnit}${touch}`;
-    this.#tell("struck");
+    const duration = contactTime === null ? "" : `, ${seconds(contactTime)}`;
+    document.getElementById("strike-facts").textContent =
+      `${where}, ${force.toPrecision(2)}${this.forceUnit}${duration}`;
+    this.#notify("struck");
   }
 
-  /** Strike where one struck last; before the first blow, where the field is loudest. */
+  /** Strike the last contact again; before the first strike, the one where the field is loudest. */
   strikeAgain() {
     this.strike(this.row ?? this.modes.loudestRow);
   }
 
-  #markBlow(row) {
-    if (!this.view) return;
-    const wave = element("div", { className: "wave" });
-    const mark = element("div", { className: "mark" }, element("div", { className: "dot struck" }), wave);
-    this.view.mark("blow", mark, this.view.placeOf(row), this.view.normalOf(row));
-  }
-
-  /** The mode that is chosen; null where none is, or where it is no longer heard. */
+  /** The mode that is chosen; null where none is, or where it is no longer audible. */
   get mode() {
     const mode = this.live?.rows ? this.live.rows.indexOf(this.bank) : (this.bank ?? -1);
     return this.bank === null || mode < 0 || mode >= this.modes.count ? null : mode;
   }
 
-  /** What the server calls a mode: its row in the bank of the field as it was opened, unheard ones counted too. */
-  bankRow(mode) {
-    return this.live?.rows?.[mode] ?? mode;
-  }
-
-  /** Choose a mode, whose shape is painted on the object; null chooses none. */
+  /** Choose a mode, whose shape is painted on the object; null chooses none. The server counts inaudible modes too. */
   choose(mode) {
-    this.bank = mode === null ? null : this.bankRow(mode);
-    this.#tell("mode");
+    this.bank = mode === null ? null : (this.live?.rows?.[mode] ?? mode);
+    this.#notify("mode");
   }
 
   /** Paint values of the contacts, with a legend: `ends` are the words below it. Null takes the paint off. */
@@ -99,18 +95,18 @@ export class Studio extends EventTarget {
     if (!values) return;
     document.getElementById("legend-title").textContent = title;
     document.getElementById("legend-bar").style.background = scale.gradient;
-    [...document.getElementById("legend-ends").children].forEach((end, place) => {
-      end.textContent = ends[place];
+    [...document.getElementById("legend-ends").children].forEach((end, at) => {
+      end.textContent = ends[at];
     });
   }
 
-  /** Call `heard` now and whenever one of these things happens: bundle, struck, mode. */
-  on(names, heard) {
-    for (const name of names.split(" ")) this.addEventListener(name, heard);
-    heard();
+  /** Call `act` now and whenever one of these things happens: bundle, struck, mode, view. */
+  on(names, act) {
+    for (const name of names.split(" ")) this.addEventListener(name, act);
+    act();
   }
 
-  #tell(name) {
+  #notify(name) {
     this.dispatchEvent(new Event(name));
   }
 }

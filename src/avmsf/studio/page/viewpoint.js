@@ -4,12 +4,14 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const UPS = { z: [0, 0, 1], y: [0, 1, 0], x: [1, 0, 0] };
+/** Directions from the object to the eye, for each axis that may point upwards. */
+const EYES = { z: [0.75, -1, 0.85], y: [0.75, 0.85, 1], x: [0.85, 0.75, -1] };
 
 export class Viewpoint {
-  /** `changed` is called whenever what the camera sees is another view. */
-  constructor(canvas, changed) {
+  /** `redraw` is called whenever what the camera sees is another view. */
+  constructor(canvas, redraw) {
     this.canvas = canvas;
-    this.changed = changed;
+    this.redraw = redraw;
     this.camera = new THREE.PerspectiveCamera(35, 1, 0.001, 100);
     this.camera.up.set(...UPS.z);
     // A lamp that goes with the eye: whatever one looks at is lit.
@@ -22,26 +24,23 @@ export class Viewpoint {
   #follow() {
     this.controls?.dispose();
     this.controls = new OrbitControls(this.camera, this.canvas);
-    this.controls.addEventListener("change", this.changed);
+    this.controls.addEventListener("change", this.redraw);
   }
 
-  /** Look at all of the points of a grid from above their side, with this axis upwards. */
-  look({ low, points, diagonal }, up) {
+  /** Look at all contacts from above their side, with this axis upwards. */
+  look({ center, diagonal }, up) {
     this.up = up;
-    const high = [-Infinity, -Infinity, -Infinity];
-    for (let at = 0; at < points.length; at++) high[at % 3] = Math.max(high[at % 3], points[at]);
-    const middle = low.map((value, axis) => (value + high[axis]) / 2);
-    const away = { z: [0.75, -1, 0.85], y: [0.75, 0.85, 1], x: [0.85, 0.75, -1] }[up];
+    this.diagonal = diagonal;
     const distance = (0.62 * diagonal) / Math.sin((this.camera.fov * Math.PI) / 360);
     const fit = Math.max(1, 1 / this.camera.aspect) * distance;
     this.camera.up.set(...UPS[up]);
-    this.camera.position.set(...away).setLength(fit).add(new THREE.Vector3(...middle));
+    this.camera.position.set(...EYES[up]).setLength(fit).add(new THREE.Vector3(...center));
     this.camera.near = fit / 100;
     this.camera.far = fit * 10;
     this.camera.updateProjectionMatrix();
     // The controls take the upward axis when they are made.
     this.#follow();
-    this.controls.target.set(...middle);
+    this.controls.target.set(...center);
     this.controls.minDistance = diagonal / 20;
     this.controls.maxDistance = fit * 5;
     this.#settle();
@@ -51,8 +50,7 @@ export class Viewpoint {
   turn(right, up) {
     const offset = this.camera.position.clone().sub(this.controls.target);
     const toUp = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
-    offset.applyQuaternion(toUp);
-    const sphere = new THREE.Spherical().setFromVector3(offset);
+    const sphere = new THREE.Spherical().setFromVector3(offset.applyQuaternion(toUp));
     sphere.theta += right;
     sphere.phi -= up;
     offset.setFromSpherical(sphere.makeSafe()).applyQuaternion(toUp.invert());
@@ -60,11 +58,11 @@ export class Viewpoint {
     this.#settle();
   }
 
-  /** Look from the side on which a place of an object lies, a little from above. */
-  face(place, diagonal) {
+  /** Look from the side on which a position on the object lies, a little from above. */
+  face(position) {
     const { target } = this.controls;
     const distance = this.camera.position.distanceTo(target);
-    const outward = new THREE.Vector3(...place).sub(target).divideScalar(diagonal / 2);
+    const outward = new THREE.Vector3(...position).sub(target).divideScalar(this.diagonal / 2);
     outward.addScaledVector(this.camera.up, 0.5);
     if (outward.lengthSq() === 0) return;
     this.camera.position.copy(target).add(outward.setLength(distance));
@@ -73,6 +71,6 @@ export class Viewpoint {
 
   #settle() {
     this.controls.update();
-    this.changed();
+    this.redraw();
   }
 }
