@@ -375,9 +375,12 @@ def test_a_change_waits_for_another_studios_and_then_changes_nothing(tmp_path: P
     def change() -> None:
         CaptureEditor(tmp_path, lock_seconds=0.1).add(blow(0), contact(0.1))
 
-    with ThreadPoolExecutor(1) as other, write_lock(tmp_path / CACHE, "capture", command="avmsf studio"):
-        with pytest.raises(FolderInUseError) as refused:
-            other.submit(change).result(20)
+    with (
+        ThreadPoolExecutor(1) as other,
+        write_lock(tmp_path / CACHE, "capture", command="avmsf studio"),
+        pytest.raises(FolderInUseError) as refused,
+    ):
+        other.submit(change).result(20)
     assert response_to(refused.value).status_code == 503
     assert not (tmp_path / "impacts.csv").exists()
     # Stages that are made meanwhile do not keep impacts out.

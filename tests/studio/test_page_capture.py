@@ -15,7 +15,13 @@ pytestmark = pytest.mark.page
 SPACING = SIDES[0] / 30
 """Between neighboring contacts, meters."""
 FOLDER = "/captures/plate"
-LIVE_CAPTURE = {"revision": 1, "undo": False, "abilities": ["capture", "reconstruct"], "mode": "capture", "folder": FOLDER}
+LIVE_CAPTURE = {
+    "revision": 1,
+    "undo": False,
+    "abilities": ["capture", "reconstruct"],
+    "mode": "capture",
+    "folder": FOLDER,
+}
 HERE, THERE = (0.04, 0.04, 0.01), (-0.04, 0.0, 0.01)
 
 LOUD_MICROPHONE = """

@@ -23,15 +23,19 @@ def page_module(page: "Page", module: str, does: str, given: Any = None) -> Any:
     return page.evaluate(f"async (given) => ({does})(await {load}, given)", given)
 
 
+def thin_plate(count: int, *, start: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return points that are spread evenly, but irregularly, over both faces of a square plate, and their normals."""
+    index = np.arange(count)
+    side = np.where(index % 2, 1.0, -1.0)
+    lateral = (start + index[:, None] * [0.7548776662, 0.5698402910]) % 1
+    points = np.column_stack([lateral, 0.01 * side])
+    return points.astype(np.float32), np.column_stack([0 * lateral, side]).astype(np.float32)
+
+
 def test_the_nearest_contacts_are_found_and_those_of_the_same_side_of_a_wall(plain: "Page") -> None:
     """Contacts drawn on both faces of a plate that is thinner than they are apart, against numpy."""
-    draw = np.random.default_rng(0)
-    points = draw.uniform(-1, 1, size=(400, 3)).astype(np.float32)
-    points[:, 2] = np.where(np.arange(400) % 2, 0.01, -0.01)
-    normals = np.zeros_like(points)
-    normals[:, 2] = np.sign(points[:, 2])
-    places = draw.uniform(-1, 1, size=(60, 3)).astype(np.float32)
-    places[:, 2] = 0.01
+    points, normals = thin_plate(400)
+    places = thin_plate(60, start=0.3)[0] * np.float32([1, 1, 0]) + np.float32([0, 0, 0.01])
     found = page_module(
         plain,
         "contacts",
@@ -55,27 +59,22 @@ def test_the_nearest_contacts_are_found_and_those_of_the_same_side_of_a_wall(pla
 
 def test_a_thin_plate_is_painted_on_each_side_by_its_own_contacts(plain: "Page") -> None:
     """One side black, the other white: no position between contacts is gray, with or without normals of its own."""
+    points, normals = thin_plate(600)
+    positions, sides = thin_plate(300, start=0.3)
     found = page_module(
         plain,
         "paint",
-        """async ({ Paint }) => {
+        """async ({ Paint }, given) => {
           const { Contacts } = await import(new URL("page/contacts.js", document.baseURI));
-          const [points, normals, colors, places, sides] = [[], [], [], [], []];
-          for (let n = 0; n < 600; n++) {
-            const side = n % 2 ? 1 : -1;
-            points.push(Math.sin(7 * n), Math.cos(5 * n * n), 0.01 * side);
-            normals.push(0, 0, side);
-            colors.push(...[1, 1, 1].map((one) => (side > 0 ? 255 * one : 0)));
-            places.push(Math.sin(3 * n), Math.cos(n * n), 0.01 * side);
-            sides.push(0, 0, side);
-          }
-          const contacts = new Contacts({ points: Float32Array.from(points), normals: Float32Array.from(normals) });
-          const mixed = (...own) => [...new Paint(contacts, Float32Array.from(places), ...own).mix(colors)];
+          const [points, normals, positions, sides] = given.map((values) => Float32Array.from(values.flat()));
+          const colors = normals.map((_, at) => 127.5 + 127.5 * normals[3 * Math.floor(at / 3) + 2]);
+          const mixed = (...own) => [...new Paint(new Contacts({ points, normals }), positions, ...own).mix(colors)];
           return [mixed(sides), mixed()];
         }""",
+        [each.tolist() for each in (points, normals, positions, sides)],
     )
     with_normals, without = (np.array(each)[::3] for each in found)
-    np.testing.assert_allclose(with_normals, np.where(np.arange(600) % 2, 255, 0), atol=0.01)
+    np.testing.assert_allclose(with_normals, np.where(sides[:, 2] > 0, 255, 0), atol=0.01)
     assert np.minimum(without, 255 - without).max() < 0.01
 
 

@@ -69,7 +69,7 @@ def test_a_field_is_struck_found_edited_and_saved(browser: "Browser", home: Path
     with opened_page(browser, open_plate(home), tmp_path / "scratch") as page:
         field = plate_field()
         row = page.evaluate("avmsf.strike(60, { force: 2 })")
-        place = torch.tensor(page.evaluate(f"avmsf.studio.view.placeOf({row})"))
+        place = torch.tensor(page.evaluate(f"avmsf.studio.contacts.position({row})"))
         sound = torch.tensor(page.evaluate(f"avmsf.renderOffline([{{ row: {row} }}]).then((sound) => [...sound])"))
         expected = field.render(place[None])[0]
         assert (sound - expected).abs().max() < 1e-4 * expected.abs().max()

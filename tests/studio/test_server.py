@@ -405,5 +405,3 @@ def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
     assert rest == "closed\n"
     assert json.loads(out) == {"address": address}
     assert list((tmp_path / "temporary").iterdir()) == []
-
-

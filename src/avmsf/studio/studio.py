@@ -22,6 +22,7 @@ from avmsf.studio.opening import Opened, find_object, shows_more
 from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, error_response
 from avmsf.studio.session import Revision, Session
 
+
 @dataclass(frozen=True)
 class StudioConfig:
     """Options of the page other than what is opened."""

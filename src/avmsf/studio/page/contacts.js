@@ -1,7 +1,7 @@
 /** The contacts of a field, points on the object's surface: which of them is nearest, and how far apart they lie. */
 
-/** On a thin wall contacts of its other side may be nearer than those of its own: they are sought within this many
- * spacings first. */
+/** On a thin wall contacts of its other side may be nearer than those of its own: these may be this many spacings
+ * farther away. */
 const WALL_SPACINGS = 3;
 
 export class Contacts {
@@ -53,10 +53,11 @@ export class Contacts {
     return { row: nearest, distance: Math.sqrt(least) };
   }
 
-  /** The nearest contact whose side of a thin wall faces along a direction; without one nearby, the nearest of all. */
+  /** The nearest contact whose side of a thin wall faces along a direction; where it is far, the nearest of all. */
   nearestFacing(position, direction) {
+    const nearest = this.nearest(position);
     const same = this.nearest(position, (row) => this.facing(row, direction) > 0);
-    return same.distance <= this.wall ? same : this.nearest(position);
+    return same.distance <= nearest.distance + this.wall ? same : nearest;
   }
 
   /** The outward normal at a position; null where both sides of a thin wall are about as near. */

@@ -43,11 +43,11 @@ export class Paint {
   /** The contacts nearest to the current position, {row, distance}, all on one side of a thin wall. */
   #near(normal) {
     const { contacts } = this;
-    const same = normal ? this.#nearest(contacts.wall, (row) => contacts.facing(row, normal) > 0) : [];
-    if (same.length) return same;
     const near = this.#nearest(Infinity, () => true);
-    const side = contacts.normal(near[0].row);
-    return side ? near.filter(({ row }) => row === near[0].row || contacts.facing(row, side) > 0) : near;
+    const side = normal ?? contacts.normal(near[0].row);
+    if (!side || near.every(({ row }) => contacts.facing(row, side) > 0)) return near;
+    const same = this.#nearest(near[0].distance + contacts.wall, (row) => contacts.facing(row, side) > 0);
+    return same.length ? same : near;
   }
 
   #nearest(within, accept) {
