@@ -1,131 +1,70 @@
-"""`python -m benchmarks NAME`: the measurements behind the figures in the documentation."""
+"""`python -m benchmarks NAME`: the measurements behind the values in the documentation."""
 
 import argparse
+import inspect
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 
-from avmsf._utils.device import TRAINABLE
 from avmsf.errors import AvmsfError, CaptureWarning
-from avmsf.simulate.recipe import HELD_OUT, SIM20
-from benchmarks import (
-    align,
-    baselines,
-    extract,
-    field,
-    gains,
-    physics,
-    proof,
-    residual,
-    robustness,
-    scene,
-    speed,
-    step,
-    studio,
-    suggest,
-    surface,
-    tasks,
-)
-from benchmarks.material import MissingDataError
-from benchmarks.report import Options, show
+from benchmarks.records import Measurement, MissingDataError, Settings, code_commit, markdown, store, stored
 
-BENCHMARKS: dict[str, ModuleType] = {
-    "align": align,
-    "baselines": baselines,
-    "field": field,
-    "gains": gains,
-    "extract": extract,
-    "speed": speed,
-    "step": step,
-    "scene": scene,
-    "proof": proof,
-    "suggest": suggest,
-    "surface": surface,
-    "physics": physics,
-    "residual": residual,
-    "tasks": tasks,
-    "studio": studio,
-    "robustness": robustness,
-}
+NAMES = (
+    *("align", "baselines", "extract", "gains", "physics", "proof", "residual", "robustness", "scene", "speed"),
+    *("step", "studio", "suggest", "surface", "tasks"),
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one benchmark and return the exit code: 0, or 2 for arguments or data that cannot be used."""
+    """Run one benchmark, or all, and return the exit code: 0, or 2 where a part could not be measured."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("name", choices=tuple(BENCHMARKS), help="which benchmark to run")
-    parser.add_argument(
-        "--parts", nargs="+", metavar="PART", help="run only these: " + "; ".join(map(_parts_of, BENCHMARKS))
-    )
-    parser.add_argument(
-        "--quick-look", action="store_true", help="small settings, to see that everything runs; the output says so"
-    )
-    parser.add_argument(
-        "--paper-minutes",
-        type=float,
-        default=6.0,
-        help="speed: minutes for a real run of the paper's recipe (default 6)",
-    )
-    parser.add_argument(
-        "--sim-20",
-        type=Path,
-        metavar="FOLDER",
-        help="baselines, gains, residual, surface: objects that `avmsf simulate` has made of a set; surface and the "
-        "photographs of gains need it, the others simulate them again without it",
-    )
-    parser.add_argument(
-        "--objects",
-        nargs="+",
-        default=(),
-        choices=tuple(SIM20 | HELD_OUT),
-        metavar="NAME",
-        help="baselines, gains: some of these objects",
-    )
-    parser.add_argument(
-        "--clouds",
-        type=Path,
-        metavar="FOLDER",
-        help="gains, surface: keep the Gaussians fitted to the objects here; without it they are made again",
-    )
-    parser.add_argument(
-        "--weights",
-        type=Path,
-        metavar="FILE",
-        help="baselines: weights of sonicgauss-small, which the part sonicgauss-training makes",
-    )
-    parser.add_argument("--device", default="cpu", choices=TRAINABLE, help="step: where (default cpu)")
-    chosen = parser.parse_args(arguments)
-    benchmark = BENCHMARKS[chosen.name]
-    parts = tuple(chosen.parts or benchmark.PARTS)
-    unknown = [part for part in parts if part not in benchmark.PARTS]
-    if unknown:
-        parser.error(f"{chosen.name} has no part {', '.join(unknown)}; it has {', '.join(benchmark.PARTS)}")
-    if not chosen.paper_minutes > 0:
-        parser.error(f"--paper-minutes is {chosen.paper_minutes:g}; expected a number above 0")
-    options = Options(
-        parts,
-        chosen.quick_look,
-        chosen.paper_minutes,
-        chosen.sim_20,
-        tuple(chosen.objects),
-        chosen.clouds,
-        chosen.weights,
-        chosen.device,
-    )
+    parser.add_argument("name", choices=(*NAMES, "all"), help="which benchmark to run")
+    parser.add_argument("--parts", nargs="+", metavar="PART", help="run only these")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="store the records, and skip parts stored there")
+    parser.add_argument("--quick-look", dest="quick", action="store_true", help="small settings, to see that all runs")
+    parser.add_argument("--sim-20", dest="sim20", type=Path, help="objects that `avmsf simulate` has made of a set")
+    parser.add_argument("--objects", nargs="+", default=(), metavar="NAME", help="gains: some of these objects")
+    parser.add_argument("--clouds", type=Path, help="gains, surface: folder that keeps Gaussians of these objects")
+    parser.add_argument("--weights", type=Path, help="baselines: file for the weights of sonicgauss-small")
+    parser.add_argument("--device", default="cpu", help="step: where (default cpu)")
+    chosen = vars(parser.parse_args(arguments))
+    name, asked, output = (chosen.pop(key) for key in ("name", "parts", "output"))
+    settings = Settings(**chosen | {"objects": tuple(chosen["objects"])})
+    if output is not None and (settings.quick or settings.objects):
+        parser.error("--output stores whole measurements: leave --quick-look and --objects out")
     # Remarks on a capture are `avmsf check`'s business.
     warnings.simplefilter("ignore", CaptureWarning)
-    try:
-        report = benchmark.measure(options)
-    except (AvmsfError, MissingDataError) as error:
-        print(f"benchmarks {chosen.name}: {error}", file=sys.stderr)
-        return 2
-    show(report, options, name=chosen.name)
-    return 0
+    failed = False
+    for each in NAMES if name == "all" else (name,):
+        parts: dict[str, Measurement] = import_module(f"benchmarks.{each}").PARTS
+        unknown = [part for part in asked or () if part not in parts]
+        if unknown:
+            parser.error(f"{each} has no part {', '.join(unknown)}; it has {', '.join(parts)}")
+        for part in asked or parts:
+            try:
+                _run(f"{each}.{part}", parts[part], settings, output)
+            except (AvmsfError, MissingDataError) as error:
+                failed = True
+                print(f"benchmarks {each}, {part}: {error}", file=sys.stderr)
+    return 2 if failed else 0
 
 
-def _parts_of(name: str) -> str:
-    return f"{name}: {', '.join(BENCHMARKS[name].PARTS)}"
+def _run(name: str, measure: Measurement, settings: Settings, output: Path | None) -> None:
+    """Print the records of one part: those that are stored for this commit, or measured now and stored."""
+    commit, path = code_commit(), None if output is None else output / f"{name}.jsonl"
+    found = [] if path is None else stored(path)
+    if "+" in commit or not found or any(record.commit != commit for record in found):
+        found = []
+        for each in measure(settings):
+            found.append(replace(each, name=f"{name}.{each.name}", commit=commit))
+            print(f"{found[-1].name} {each.object}: {each.value:.4g} {each.note}", file=sys.stderr, flush=True)
+        if path is not None:
+            store(found, path)
+    quick = "QUICK LOOK: these are not the benchmark's values. " * settings.quick
+    print(f"## {name}\n\n{quick}{inspect.getdoc(getattr(measure, 'func', measure))}\n\n{markdown(found)}\n", flush=True)
 
 
 if __name__ == "__main__":

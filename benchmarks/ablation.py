@@ -1,10 +1,8 @@
 """Parts of the gain model: what each contributes, whether supports are found, and labels that are called wrong."""
 
-import tempfile
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,8 +22,17 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.recipe import ABLATED
 from avmsf.simulate.shapes import make_shape
-from benchmarks.report import Options, Report, Table, log
-from benchmarks.splitcases import COUNTS, ROUGH, SplitCase, bodies_of, measured, simulated, split_case, splits_of
+from benchmarks.objects import (
+    COUNTS,
+    ROUGH,
+    SplitCase,
+    bodies_of,
+    measured,
+    simulated,
+    splits_of,
+    surface_of,
+)
+from benchmarks.records import Record, Settings, records
 from tests.oracles.block import block
 from tests.oracles.known_gains import known_gains
 
@@ -35,115 +42,96 @@ _LESS_KNOWN = ("positions alone", "positions and symmetry", "noisy mesh")
 """Variants that know less of the object: not settings among which one would choose."""
 
 
-def ablation(options: Options) -> Report:
-    """Errors without each part of the default model, or with what was dropped; one split of each object."""
-    rows: list[list[str | float]] = []
+def ablation(settings: Settings) -> Iterator[Record]:
+    """Errors without each part of the default model, or with what was dropped; one split of each object.
+
+    over the default: geometric mean of the ratios. half: the setting that is best on one half of the cases, there and
+    on the other half; a case where a setting is no different, such as updating without a body, counts as the default.
+    """
     found: dict[str, dict[str, float]] = defaultdict(dict)
-    cases = []
-    for name, case in _ablated(options):
-        cases.append(name)
-        for variant, error in _variants(case, options):
+    for name, case in _ablated(settings):
+        for variant, error in _variants(case, settings):
             found[variant][name] = error
-            log(f"{name}, {variant}: {error:.4f}")
+            yield from records({"error": error}, group=variant, object=name)
     logs = {
         variant: {name: float(np.log(error / found[DEFAULT][name])) for name, error in errors.items()}
         for variant, errors in found.items()
     }
-    ratios = {variant: float(np.exp(np.mean(list(each.values())))) for variant, each in logs.items()}
-    for variant, errors in found.items():
-        rows.append([variant, *(errors.get(name, "-") for name in cases), ratios[variant]])
-    columns = ("model", *cases, "over the default, geometric mean")
-    tables = (Table("held-out error without each part", columns, rows), _halves(logs, cases))
-    figures = {f"gains.ablation.{variant.replace(' ', '_')}": ratio for variant, ratio in ratios.items()}
-    return Report(tables=tables, figures=figures)
+    for variant, each in logs.items():
+        yield from records({"over the default": float(np.exp(np.mean(list(each.values()))))}, group=variant)
+    choices = [each for each in logs if each not in (*_ALONE, *_LESS_KNOWN)]
+    cases = list(found[DEFAULT])
 
+    def ratio(variant: str, names: list[str]) -> float:
+        return float(np.exp(np.mean([logs[variant].get(name, 0.0) for name in names]))) if names else float("nan")
 
-def _halves(logs: Mapping[str, Mapping[str, float]], cases: list[str]) -> Table:
-    """Return the settings that are best on one half of the cases, and how they do on the other half.
-
-    A case where a variant is no different, such as updating without a body, counts as the default.
-    """
-    rows: list[list[str | float]] = []
-    settings = [each for each in logs if each not in (*_ALONE, *_LESS_KNOWN)]
     for number in range(2):
-        chosen_on, judged_on = cases[number::2], cases[1 - number :: 2]
-
-        def ratio(variant: str, names: list[str]) -> float:
-            return float(np.exp(np.mean([logs[variant].get(name, 0.0) for name in names]))) if names else float("nan")
-
-        best = min(settings, key=lambda variant: ratio(variant, chosen_on))
-        rows.append([", ".join(chosen_on), best, ratio(best, chosen_on), ratio(best, judged_on)])
-    columns = ("chosen on", "best setting", "over the default there", "on the other half")
-    return Table("settings chosen on one half and judged on the other", columns, rows)
+        chosen_on, others = cases[number::2], cases[1 - number :: 2]
+        best = min(choices, key=lambda variant: ratio(variant, chosen_on))
+        ratios = {"chosen on": ratio(best, chosen_on), "the others": ratio(best, others)}
+        yield from records(ratios, group=f"half {number + 1}", note=f"{best}, chosen on {', '.join(chosen_on)}")
 
 
-def _ablated(options: Options) -> Iterator[tuple[str, SplitCase]]:
+def _ablated(settings: Settings) -> Iterator[tuple[str, SplitCase]]:
     for name, count, start in (("aircraft_response", 15, 18), ("ruler10", 7, 0), ("tree43", 20, 18)):
         capture = measured(name)
-        bodies = None if capture.surface is None else bodies_of(capture.surface, options)
-        yield f"{name} {count}", split_case(*split(capture.impacts, count, start=start), capture, bodies)
-    with tempfile.TemporaryDirectory() as cache:
-        for name in options.objects or ABLATED[: 1 if options.quick_look else 3]:
-            capture, _ = simulated(name, options, Path(cache))
-            assert capture.surface is not None
-            bodies = bodies_of(capture.surface, options)
-            yield name, split_case(*split(capture.impacts, 0.2), capture, bodies)
+        bodies = None if capture.surface is None else bodies_of(capture.surface, settings)
+        yield f"{name} {count}", SplitCase.of(*split(capture.impacts, count, start=start), capture, bodies)
+    for name in settings.objects or settings.some(ABLATED[:3]):
+        capture, _ = simulated(name, settings)
+        bodies = bodies_of(surface_of(capture), settings)
+        yield name, SplitCase.of(*split(capture.impacts, 0.2), capture, bodies)
 
 
-def _variants(case: SplitCase, options: Options) -> Iterator[tuple[str, float]]:
+def _variants(case: SplitCase, settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield names of variants of the default model and their errors."""
-    field = case.fit(MixtureEstimator(bodies=case.bodies), quick=False)
+    default = MixtureEstimator(bodies=case.bodies)
+    field = case.fit(default)
     yield DEFAULT, case.error(field)
-    yield "not refined", case.error(case.fit(MixtureEstimator(bodies=case.bodies), quick=True))
+    yield "not refined", case.error(case.fit(default, quick=True))
     yield "stationary noise alone", case.error(replace(field, residual=Residual(field.residual.magnitude)))
     origin = replace(field.origin, config=replace(field.origin.config, residual_noise="gaussian"))
     yield "Gaussian noise", case.error(replace(field, origin=origin))
     assert isinstance(field.gain_field, MixtureGains)
-    yield (
-        "no spread within hypotheses",
-        case.error(replace(field, gain_field=replace(field.gain_field, spread_share=0.0))),
-    )
+    less = replace(field, gain_field=replace(field.gain_field, spread_share=0.0))
+    yield "no spread within hypotheses", case.error(less)
     if case.bodies is not None:
-        yield "no updating", case.error(case.fit(MixtureEstimator(bodies=case.bodies, update=False), quick=False))
+        yield "no updating", case.error(case.fit(MixtureEstimator(bodies=case.bodies, update=False)))
     for kind, label in zip(FAMILIES, _ALONE, strict=True):
         if (kind != Symmetric.kind or case.symmetries) and (kind != Elastic.kind or case.bodies):
             alone = MixtureEstimator((kind,), bodies=case.bodies, symmetries=case.symmetries)
             yield label, case.error(case.fit(alone, quick=True))
-    yield "positions alone", case.error(case.fit(MixtureEstimator((Smooth.kind, ThinPlate.kind)), quick=False))
-    yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries), quick=False))
+    yield "positions alone", case.error(case.fit(MixtureEstimator((Smooth.kind, ThinPlate.kind))))
+    yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries)))
     if case.surface is not None:
-        rough = bodies_of(roughened(case.surface, ROUGH, seed=0), options)
-        yield "noisy mesh", case.error(case.fit(MixtureEstimator(bodies=rough), quick=False))
+        rough = bodies_of(roughened(case.surface, ROUGH, seed=0), settings)
+        yield "noisy mesh", case.error(case.fit(MixtureEstimator(bodies=rough)))
 
 
-def outliers(options: Options) -> Report:
-    """Exchanged labels that are named, and right ones that are, on the aircraft; right labels named on all captures."""
+def outliers(settings: Settings) -> Iterator[Record]:
+    """Exchanged labels that are named, and right ones that are, on the aircraft; right labels named on all captures.
+
+    In each draw three of 15 contacts get the labels of one another, in a circle.
+    """
     captures = {name: measured(name) for name in COUNTS}
     bodies = {
-        name: None if each.surface is None else bodies_of(each.surface, options) for name, each in captures.items()
+        name: None if each.surface is None else bodies_of(each.surface, settings) for name, each in captures.items()
     }
-    draws = {"found": 0, "false": 0, "exchanged": 0, "clean_false": 0, "clean_fits": 0}
-    for case in splits_of(captures["aircraft_response"], 15, bodies["aircraft_response"], options):
-        for seed in range(1 if options.quick_look else 9):
-            # Three contacts get the labels of one another, in a circle.
+    draws = Counter[str]()
+    for case in splits_of(captures["aircraft_response"], 15, bodies["aircraft_response"], settings):
+        for seed in settings.some(range(9)):
             drawn = np.random.default_rng(seed).choice(len(case.train), 3, replace=False)
             order = torch.arange(len(case.train))
             order[torch.from_numpy(drawn)] = torch.from_numpy(np.roll(drawn, 1))
             directions = None if case.train.directions is None else case.train.directions[order]
             train = replace(case.train, contacts=case.train.contacts[order], directions=directions)
             named, wrong = _named(replace(case, train=train)), {case.train.names[row] for row in drawn.tolist()}
-            draws["found"] += len(named & wrong)
-            draws["false"] += len(named - wrong)
-            draws["exchanged"] += 3
-            log(f"exchanged {sorted(wrong)}, named {sorted(named)}")
+            draws.update(found=len(named & wrong), false=len(named - wrong), exchanged=3)
     for name, counts in COUNTS.items():
-        for count in counts[:1] if options.quick_look else counts:
-            for case in splits_of(captures[name], count, bodies[name], options):
-                draws["clean_false"] += len(_named(case))
-                draws["clean_fits"] += 1
-    rows: list[list[str | float]] = [["labels", *map(float, draws.values())]]
-    figures = {f"outliers.{key}": float(value) for key, value in draws.items()}
-    return Report(tables=(Table("labels called wrong", ("aircraft, 15 places", *draws), rows),), figures=figures)
+        for count in settings.some(counts):
+            for case in splits_of(captures[name], count, bodies[name], settings):
+                draws.update(clean_false=len(_named(case)), clean_fits=1)
+    yield from records(draws)
 
 
 def _named(case: SplitCase) -> set[str]:
@@ -151,32 +139,28 @@ def _named(case: SplitCase) -> set[str]:
     return set(case.fit(MixtureEstimator(bodies=case.bodies), quick=True).origin.report["outliers"])
 
 
-def supports(options: Options) -> Report:
-    """Errors of the gains of objects that are free or held, by whether supports are tried, and what is found."""
-    rows: list[list[str | float]] = []
-    figures = {}
+def supports(settings: Settings) -> Iterator[Record]:
+    """Relative error of the gains of objects that are free or held, at 200 contacts, 12 known.
+
+    free: taken for free; auto: the default; try: supports tried, and what is found; no body: by positions alone.
+    """
     mug = make_shape("mug", size=0.1, wall=0.003)
     objects = (
         ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, Patch("a short side", (-1.0, 0.0, 0.0))),
         ("mug", mug.solid, CERAMIC, Patch("its base", (0.0, 0.0, -1.0))),
     )
-    for kind, solid, material, patch in objects[: 1 if options.quick_look else None]:
-        held = Support((patch,), 1e10)
+    for kind, solid, material, patch in settings.some(objects):
         along = solid.points[solid.cells].mean(1)[:, 0] / solid.size
         uneven = 1 + 0.1 * torch.sin(2 * torch.pi * along).double()
-        for support in (None, held):
+        for support in (None, Support((patch,), 1e10)):
             true = elastic_modes(solid, material, count=30, stiffness_factor=uneven, support=support)
             case, points, ways = known_gains(true)
             exact = true.gains(points, ways)
-            row: list[str | float] = [f"{kind}, {'free' if support is None else support.name}"]
+            errors, found = {}, ""
             for tried in ("free", "auto", "try", None):
-                config = BodyConfig() if tried is None else BodyConfig(supports=tried)
-                bodies = None if tried is None else candidate_bodies(solid.surface, config, log=log)
+                bodies = None if tried is None else candidate_bodies(solid.surface, BodyConfig(supports=tried))
                 model, _ = MixtureEstimator(bodies=bodies).solve(case)
-                error = float((model.predict(points, ways).mean.real - exact).norm() / exact.norm())
-                row += [error] if tried != "try" else [error, model.report["bodies"][0]["support"]]
-                figures[f"gains.supports.{kind}.{'free' if support is None else 'held'}.{tried}"] = error
-            rows.append(row)
-            log(f"{row}")
-    columns = ("object", "taken for free", "default", "supports tried", "found", "no body")
-    return Report(tables=(Table("relative error of gains at 200 contacts, 12 known", columns, rows),), figures=figures)
+                error = (model.predict(points, ways).mean.real - exact).norm() / exact.norm()
+                errors[tried or "no body"] = float(error)
+                found = model.report["bodies"][0]["support"] if tried == "try" else found
+            yield from records(errors, group=f"{kind}, {'free' if support is None else 'held'}", note=found)

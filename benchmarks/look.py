@@ -1,4 +1,4 @@
-"""Objects with a look and, where they are struck, a sound: what the benchmarks of features and of the pipeline use."""
+"""Objects with colors on them, and pictures: what the benchmarks of features and of the pipeline use."""
 
 from collections.abc import Callable
 
@@ -9,14 +9,13 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from avmsf.features.descriptors import ImageDescriptors
-from avmsf.features.feature_field import FeatureField
 from avmsf.features.lift import Lifted
 from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.pipeline.config import LiftConfig
-from avmsf.pipeline.features import finish_features, lift_features
+from avmsf.pipeline.features import lift_features
 from tests.oracles.plate import Plate
 
 AMBIENT = 0.3
@@ -37,8 +36,7 @@ def speckled(surface: Surface, *, seed: int) -> TexturedMesh:
     low, high = surface.vertices.amin(0), surface.vertices.amax(0)
     placed = (corners - low) / (high - low).max()
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    seen_from = normals.abs().argmax(1)
-    across = torch.tensor([[1, 2], [0, 2], [0, 1]])[seen_from]
+    across = torch.tensor([[1, 2], [0, 2], [0, 1]])[normals.abs().argmax(1)]
     coordinates = placed.gather(2, across[:, None, :].expand(-1, 3, -1))
     return TexturedMesh.build(surface.vertices, surface.faces, coordinates=coordinates, textures=[_blotches(generator)])
 
@@ -52,11 +50,6 @@ def pictures(mesh: TexturedMesh, *, count: int, size: int) -> tuple[View, ...]:
 def lift_pictures(surface: Surface, views: tuple[View, ...], *, points: int = 8192) -> Lifted:
     """Lift the built-in descriptors onto points of the surface."""
     return lift_features(surface, views, ImageDescriptors(), LiftConfig(points=points))
-
-
-def finish(lifted: Lifted, *, symmetry: bool, positions: bool = True) -> FeatureField:
-    """Make features of the default settings with or without pooling over symmetries."""
-    return finish_features(lifted, LiftConfig(symmetry=symmetry, positions=positions))[0]
 
 
 def _bowl() -> trimesh.Trimesh:

@@ -1,37 +1,28 @@
 """Time and memory that a fit with elastic mode shapes takes, and how often its intervals hold the true gains."""
 
-import json
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import torch
 
 from avmsf.capture import read_capture, write_capture
-from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.splits import split
 from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.material import NOMINAL, material_named
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.posterior import coverage
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.bodies import make_body
 from avmsf.simulate.recipe import SIM20, named_recipe
 from avmsf.simulate.simulation import simulate_object
-from benchmarks.field import measured_gains
-from benchmarks.material import surface_features
-from benchmarks.report import Options, Report, Table, log
-from benchmarks.scans import processor_seconds, scans
-from benchmarks.step import peak_gigabytes
+from benchmarks.objects import SplitCase, bodies_of, features_of, surface_of
+from benchmarks.processes import apart, peak_gigabytes, processor_seconds, timed
+from benchmarks.records import Measurement, Record, Settings, means, records
+from benchmarks.scans import scans
 
 COSTED = "skillet-iron"
 COSTED_SIZE, COSTED_MODES = 0.5, 170
@@ -39,146 +30,89 @@ COSTED_SIZE, COSTED_MODES = 0.5, 170
 COVERED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
 COMPARED = 8
 """Lowest frequencies of nominal bodies and true ones."""
-CONVENTIONS = (
-    f"physics.seconds: of sim-20's {COSTED}, {COSTED_SIZE:g} m long, 8 recordings of it, from a mesh of unknown wall "
-    "to a field: bodies of several walls, the most probable one with 40,000 degrees of freedom, modes, fit end to end, "
-    "in a process of its own; seconds_cached: again, with the elastic shapes kept; filled: the same where it is told "
-    "that the mesh encloses the material whole, which it does. gigabytes: peak memory of that process. render_ms: of "
-    "one sound, after the first.",
-    "coverage90: part of the held-out recordings' own gains in the 90 % interval, of 32 blows with each of "
-    "six objects of sim-20 where 8 were learnt from; by_energy: by their energy; error: relative STFT error there.",
-    f"frequency_error: largest relative error of the {COMPARED} lowest frequencies of the body that the mesh encloses, "
-    "40,000 degrees of freedom, scaled to the true material; mean over the objects of sim-20, whose own walls and "
-    "stiffness are uneven and which stand on soft supports.",
-)
 
 
-def measure(options: Options) -> Report:
-    """Return the figures of the chosen parts."""
-    report = Report(CONVENTIONS)
-    for part in options.parts:
-        report += PARTS[part](options)
-    return report
+def _cost(settings: Settings) -> Iterator[Record]:
+    """From 8 recordings and the mesh of sim-20's skillet-iron, .5 m long, to a field, in a process of its own.
 
-
-def _cost(options: Options) -> Report:
-    """Fit in processes of their own: with nothing kept, with the shapes kept, and likewise with a wall given."""
-    rows: list[list[str | float]] = []
-    figures: dict[str, float] = {}
+    Bodies of several thicknesses or, filled, of the one that the mesh encloses; modes; fit end to end. cached: again,
+    with the elastic shapes kept. gigabytes: peak memory of that process. render_ms: of one sound, after the first.
+    """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / COSTED
         recipe = replace(named_recipe(COSTED), size=COSTED_SIZE, elastic_modes=COSTED_MODES)
         made = simulate_object(recipe, name=COSTED)
         train, _ = split(made.capture.impacts, 0.2)
         write_capture(replace(made.capture, impacts=train), folder)
-        for name, wall in (("", "unknown"), (".filled", "0")):
-            cache = Path(temporary) / f"kept{name}"
-            for kept in ("", "_cached"):
-                taken = _in_a_process(folder, cache, wall, options)
-                figures |= {
-                    f"physics{name}.seconds{kept}": taken["seconds"],
-                    f"physics{name}.gigabytes{kept}": taken["gigabytes"],
-                }
-                words = f"{'filled' if name else 'wall unknown'}, {'kept shapes' if kept else 'nothing kept'}"
-                values = [taken[each] for each in ("bodies", "fit", "seconds", "gigabytes", "modes", "dofs")]
-                rows.append([words, *values])
-                log(f"physics.cost: {words}: {taken['seconds']:.0f} s")
-        figures["physics.render_ms"] = taken["render_ms"]
-    title = f"{COSTED}, 8 recordings; a sound is rendered in {taken['render_ms']:.1f} ms"
-    columns = ("", "s for bodies", "s for modes and fit", "s", "GB", "modes", "degrees of freedom asked")
-    return Report(tables=(Table(title, columns, rows),), figures=figures)
+        for name, wall in (("unknown", None), ("filled", 0.0)):
+            cache = Path(temporary) / name
+            for kept in ("", ".cached"):
+                taken = apart(fit_cost, folder, cache, wall, 3000 if settings.quick else 40_000)
+                yield from records(taken, group=name + kept)
 
 
-def _in_a_process(folder: Path, cache: Path, wall: str, options: Options) -> dict[str, Any]:
-    """Return what `_fitted` prints in a fresh process, whose memory and caches are its own."""
-    dofs = "3000" if options.quick_look else "40000"
-    command = [sys.executable, "-m", "benchmarks.physics", str(folder), str(cache), wall, dofs]
-    ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(ended.stdout.splitlines()[-1])
-
-
-def _fitted(folder: Path, cache: Path, wall: str, dofs: int) -> dict[str, float]:
-    """Return how long a fit takes, beside the reading of the capture, and what it takes it with."""
+def fit_cost(folder: Path, cache: Path, wall: float | None, dofs: int) -> dict[str, float]:
+    """Return what a fit takes, after the reading of the capture."""
     capture = read_capture(folder)
-    assert capture.surface is not None
     begun = time.perf_counter()
-    config = BodyConfig(wall=None if wall == "unknown" else float(wall), dofs=dofs)
-    bodies = candidate_bodies(capture.surface, config, impacts=capture.impacts, cache=cache)
+    config = BodyConfig(wall=wall, dofs=dofs)
+    bodies = candidate_bodies(surface_of(capture), config, impacts=capture.impacts, cache=cache)
     solved = time.perf_counter()
     modes = extract_modes(capture.impacts)
     estimator = MixtureEstimator(bodies=bodies)
-    field = fit(capture.impacts, surface_features(capture), modes, FitConfig(), gains=estimator)
+    field = fit(capture.impacts, features_of(capture), modes, FitConfig(), gains=estimator)
     done = time.perf_counter()
     field.render(capture.impacts.contacts[:1])
-    warm = time.perf_counter()
-    field.render(capture.impacts.contacts[:1])
+    _, rendering = timed(lambda: field.render(capture.impacts.contacts[:1]))
     return {
-        "bodies": solved - begun,
-        "fit": done - solved,
+        "bodies_seconds": solved - begun,
+        "fit_seconds": done - solved,
         "seconds": done - begun,
-        "render_ms": 1e3 * (time.perf_counter() - warm),
         "gigabytes": peak_gigabytes(),
-        "modes": float(len(modes.bank)),
-        "dofs": float(dofs),
+        "render_ms": 1e3 * rendering,
+        "modes": len(modes.bank),
+        "dofs": dofs,
     }
 
 
-def _coverage(options: Options) -> Report:
-    """Predict the gains of 32 impacts on each object from those of 8."""
-    rows: list[list[str | float]] = []
-    for name in COVERED[:1] if options.quick_look else COVERED:
-        made = simulate_object(named_recipe(name), name=name)
-        assert made.capture.surface is not None
-        train, test = split(made.capture.impacts, 0.2)
-        config = BodyConfig(dofs=3000) if options.quick_look else BodyConfig()
-        with tempfile.TemporaryDirectory() as cache:
-            estimator = MixtureEstimator(bodies=candidate_bodies(made.capture.surface, config, cache=Path(cache)))
-            steps = FitConfig(steps=2) if options.quick_look else FitConfig()
-            modes = extract_modes(train)
-            field = fit(train, surface_features(made.capture), modes, steps, gains=estimator)
-            test = modes.aligned(test)
-        held = coverage(field, test.contacts, measured_gains(test, field), directions=test.directions, level=0.9)
-        rows.append([name, held.plain, held.by_energy, evaluate(field, test).mean()["relative_stft"]])
-        log(f"physics.coverage: {name}: {held.plain:.3f}, by energy {held.by_energy:.3f}, error {rows[-1][3]:.3f}")
-    plain, by_energy, error = torch.tensor([[float(value) for value in row[1:]] for row in rows]).mean(0).tolist()
-    figures = {"physics.coverage90": plain, "physics.coverage90_by_energy": by_energy, "physics.sim20.error": error}
-    columns = ("object", "coverage90", "by energy", "error")
-    return Report(
-        tables=(Table(f"intervals of 90 % on {len(rows)} objects of sim-20, 8 blows learnt from", columns, rows),),
-        figures=figures,
-    )
+def _coverage(settings: Settings) -> Iterator[Record]:
+    """Part of the held-out gains in their intervals of 90 %: 32 impacts with each object where 8 were learnt from.
+
+    by_energy: weighted by their energy; error: relative STFT error there.
+    """
+    rows = []
+    for name in settings.some(COVERED):
+        capture = simulate_object(named_recipe(name), name=name).capture
+        bodies = bodies_of(surface_of(capture), settings)
+        case = SplitCase.of(*split(capture.impacts, 0.2), capture, bodies)
+        config = FitConfig(steps=2) if settings.quick else FitConfig()
+        field = fit(case.train, case.features, case.modes, config, gains=MixtureEstimator(bodies=bodies))
+        plain, by_energy = case.coverage(field)
+        rows.append({"coverage90": plain, "coverage90_by_energy": by_energy, "error": case.error(field)})
+        yield from records(rows[-1], object=name)
+    yield from records(means(rows), group="mean")
 
 
-def _frequencies(options: Options) -> Report:
-    """Compare the lowest frequencies of nominal bodies, made of what the mesh encloses, with the true ones."""
-    rows: list[list[str | float]] = []
-    for name, recipe in list(SIM20.items())[: 1 if options.quick_look else None]:
-        true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, log=lambda words: None)
-        dofs = 3000 if options.quick_look else 40_000
-        heard: list[str] = []
+def _frequencies(settings: Settings) -> Iterator[Record]:
+    """Relative errors of the 8 lowest frequencies of the body that the mesh encloses, scaled to the true material.
+
+    The objects of sim-20 have uneven walls and stiffness of their own and stand on soft supports; 40,000 degrees of
+    freedom. seconds: of processor time.
+    """
+    rows = []
+    for name, recipe in settings.some(list(SIM20.items())):
+        true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, log=lambda message: None)
+        dofs, messages = 3000 if settings.quick else 40_000, list[str]()
         begun = processor_seconds()
-        made = SurfaceBodies(true.surface, thicknesses=[None], count=COMPARED, dofs=dofs, log=heard.append)
+        made = SurfaceBodies(true.surface, thicknesses=[None], count=COMPARED, dofs=dofs, log=messages.append)
+        modes = made.bodies[0].elastic
         taken, material = processor_seconds() - begun, material_named(recipe.material)
         speed = (material.young / material.density * NOMINAL.density / NOMINAL.young) ** 0.5
-        error = made.bodies[0].elastic.frequency * speed / true.elastic.frequency - 1.0
-        rows.append([name, float(error.abs().max()), float(error.mean()), taken, "; ".join(heard[-1:])])
-        log(f"physics.frequencies: {name}: {rows[-1][1]:.3f}, {taken:.0f} s")
-    figures = {
-        "physics.frequency_error": sum(float(row[1]) for row in rows) / len(rows),
-        "physics.largest_frequency_error": max(float(row[1]) for row in rows),
-    }
-    title = f"{COMPARED} lowest frequencies of filled meshes of sim-20 against the true objects'"
-    return Report(
-        tables=(Table(title, ("object", "largest error", "mean error", "CPU s", "last step"), rows),), figures=figures
-    )
+        error = modes.frequency * speed / true.elastic.frequency - 1.0
+        rows.append({"largest": float(error.abs().max()), "mean": float(error.mean()), "seconds": taken})
+        yield from records(rows[-1], object=name, note="; ".join(messages[-1:]))
+    yield from records({"frequency_error": means(rows)["largest"]}, group="mean")
+    yield from records({"frequency_error": max(row["largest"] for row in rows)}, group="worst")
 
 
-PARTS: dict[str, Callable[[Options], Report]] = {
-    "cost": _cost,
-    "coverage": _coverage,
-    "frequencies": _frequencies,
-    "scans": scans,
-}
-
-if __name__ == "__main__":
-    print(json.dumps(_fitted(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4]))))
+PARTS: dict[str, Measurement] = {"cost": _cost, "coverage": _coverage, "frequencies": _frequencies, "scans": scans}

@@ -1,8 +1,7 @@
 """Time to the body behind meshes as scanners make them, and how far its lowest frequencies are from the true ones."""
 
 import math
-import resource
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -17,20 +16,63 @@ from avmsf.fem.solid import Solid
 from avmsf.gaussians.points import farthest_points
 from avmsf.mesh.surface import Surface, read_surface
 from avmsf.modal.synthesis import synthesize
-from benchmarks.material import shared_data
-from benchmarks.report import Options, Report, Table, log
+from benchmarks.objects import shared_data
+from benchmarks.processes import processor_seconds
+from benchmarks.records import Record, Settings, records
 
 SPAN, CHORD, THINNEST, THICKEST, TWIST = 0.5, 0.18, 0.001, 0.006, math.radians(30.0)
 """Of the blade: meters, and the angle between the chords at its ends."""
 LOWEST, CONTACTS, RATE = 10, 8, 8000
 SCANS = ("mug", "blue_cup", "bowl", "spoon")
-CONVENTIONS = (
-    f"scans: a twisted blade, {SPAN:g} x {CHORD:g} m, {1000 * THINNEST:g} mm thick at its edges and "
-    f"{1000 * THICKEST:g} mm in its middle; damaged: every tenth triangle split at a random place off its plane by "
-    f"a tenth of its size. error: of the {LOWEST} lowest frequencies, against bricks of tetrahedra along the blade, "
-    "largest and mean; of real scans, against four times the degrees of freedom. "
-    f"body, fit: processor seconds to the modes, and of avmsf.fit to {CONTACTS} sounds of the true modes.",
-)
+
+
+def scans(settings: Settings) -> Iterator[Record]:
+    """Errors of the 10 lowest frequencies of the body behind a mesh, and processor seconds to its modes.
+
+    A twisted blade, .5 x .18 m, 1 mm thick at its edges and 6 mm in its middle, against bricks of tetrahedra along the
+    blade; damaged: every tenth triangle split at a random point off its plane by a tenth of its size. Real scans are
+    compared with four times the degrees of freedom. fit_seconds: of avmsf.fit to 8 sounds of the true modes.
+    """
+    true = elastic_modes(blade_solid(*((25, 9) if settings.quick else (61, 25))), NOMINAL, count=24)
+    blades = {"blade": blade_surface(), "blade, damaged": damaged(blade_surface())}
+    for name, surface in blades.items():
+        yield from _measured(name, surface, true)
+    for name in () if settings.quick else SCANS:
+        yield from _measured(name, read_surface(shared_data() / "meshes" / name / "textured.obj"), None)
+
+
+def _measured(name: str, surface: Surface, true: ElasticModes | None) -> Iterator[Record]:
+    messages, begun = list[str](), processor_seconds()
+    values = dict.fromkeys(("largest_error", "mean_error", "fit_seconds"), math.nan)
+    try:
+        made = _body(surface, 40_000, messages.append)
+        taken = processor_seconds() - begun
+        finest = true.frequency if true is not None else _body(surface, 160_000, messages.append).frequency
+        errors = (made.frequency[:LOWEST] / finest[:LOWEST] - 1.0).abs()
+        values |= {"largest_error": float(errors.max()), "mean_error": float(errors.mean())}
+        if true is not None:
+            values["fit_seconds"] = _fit_seconds(surface, true)
+    except SimulationError as error:
+        taken = processor_seconds() - begun
+        messages.append(str(error))
+    values |= {"body_seconds": taken, "triangles": len(surface.faces)}
+    yield from records(values, object=name, note="; ".join(messages[-1:]))
+
+
+def _body(surface: Surface, dofs: int, log: Callable[[str], None]) -> ElasticModes:
+    return SurfaceBodies(surface, thicknesses=[None], count=LOWEST, dofs=dofs, log=log).bodies[0].elastic
+
+
+def _fit_seconds(surface: Surface, true: ElasticModes) -> float:
+    """Return the seconds of a fit to the sounds of contacts on the surface, struck straight into it."""
+    contacts = true.points[farthest_points(true.points.float(), CONTACTS)]
+    gains = true.gains(contacts, -true.normals(contacts))
+    damping = 3.0 + 1e-3 * true.frequency
+    sounds = synthesize(gains, true.frequency, damping, samples=RATE, sample_rate=RATE)
+    capture = Capture("blade", Impacts.of(contacts.numpy(), sounds.numpy(), RATE), surface)
+    begun = processor_seconds()
+    avmsf.fit(capture, progress=False)
+    return processor_seconds() - begun
 
 
 def blade(along: int, across: int) -> tuple[np.ndarray, np.ndarray]:
@@ -79,63 +121,3 @@ def damaged(surface: Surface) -> Surface:
     split = [np.stack(each, axis=1) for each in ((a, b, added), (b, c, added), (c, a, added))]
     whole = np.concatenate([vertices, middle]), np.concatenate([faces[~hurt], *split])
     return Surface(torch.from_numpy(whole[0]).float(), torch.from_numpy(whole[1]))
-
-
-def scans(options: Options) -> Report:
-    """Make the body behind each mesh, and fit fields to the blade."""
-    true = elastic_modes(blade_solid(*((25, 9) if options.quick_look else (61, 25))), NOMINAL, count=24)
-    meshes: dict[str, tuple[Surface, ElasticModes | None]] = {"blade": (blade_surface(), true)}
-    meshes["blade, damaged"] = damaged(blade_surface()), true
-    for name in () if options.quick_look else SCANS:
-        meshes[name] = read_surface(shared_data() / "meshes" / name / "textured.obj"), None
-    rows: list[list[str | float]] = []
-    figures: dict[str, float] = {}
-    for name, (surface, modes) in meshes.items():
-        rows.append([name, len(surface.faces), *_measured(surface, modes)])
-        key = f"scans.{name.replace(', ', '_')}"
-        for column, value in zip(
-            ("body_seconds", "largest_error", "mean_error", "fit_seconds"), rows[-1][2:6], strict=True
-        ):
-            if isinstance(value, float) and math.isfinite(value):
-                figures[f"{key}.{column}"] = value
-        log(f"physics.scans: {name}: {rows[-1][2:]}")
-    columns = ("mesh", "triangles", "s for body", "largest error", "mean error", "s for fit", "last step")
-    return Report(CONVENTIONS, (Table("bodies behind scanned meshes", columns, rows),), figures)
-
-
-def _measured(surface: Surface, true: ElasticModes | None) -> list[str | float]:
-    """Return the seconds of the body, its errors, the seconds of the fit, and what was said last."""
-    heard: list[str] = []
-    begun = processor_seconds()
-    try:
-        made = _body(surface, 40_000, heard.append)
-        taken = processor_seconds() - begun
-        finest = true.frequency if true is not None else _body(surface, 160_000, heard.append).frequency
-    except SimulationError as error:
-        return [processor_seconds() - begun, math.nan, math.nan, math.nan, str(error)]
-    errors = (made.frequency[:LOWEST] / finest[:LOWEST] - 1.0).abs()
-    fitted = math.nan if true is None else _fitted(surface, true)
-    return [taken, float(errors.max()), float(errors.mean()), fitted, "; ".join(heard[-1:])]
-
-
-def _body(surface: Surface, dofs: int, hear: Callable[[str], None]) -> ElasticModes:
-    return SurfaceBodies(surface, thicknesses=[None], count=LOWEST, dofs=dofs, log=hear).bodies[0].elastic
-
-
-def _fitted(surface: Surface, true: ElasticModes) -> float:
-    """Return the seconds of a fit to the sounds of contacts on the surface, struck straight into it."""
-    contacts = true.points[farthest_points(true.points.float(), CONTACTS)]
-    gains = true.gains(contacts, -true.normals(contacts))
-    damping = 3.0 + 1e-3 * true.frequency
-    sounds = synthesize(gains, true.frequency, damping, samples=RATE, sample_rate=RATE)
-    capture = Capture("blade", Impacts.of(contacts.numpy(), sounds.numpy(), RATE), surface)
-    begun = processor_seconds()
-    field = avmsf.fit(capture, progress=False)
-    log(f"physics.scans: {field}")
-    return processor_seconds() - begun
-
-
-def processor_seconds() -> float:
-    """Return the processor time of this process and of those that it started and that have ended."""
-    own, others = resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN)
-    return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime

@@ -1,9 +1,9 @@
 """The small SonicGauss: its training from scratch, by one command, on simulated objects, none of which is in sim-20."""
 
+import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.simulate.recipe import SIM20, ObjectRecipe
 from avmsf.simulate.shapes.catalog import KINDS
 from avmsf.simulate.simulation import simulate_object
-from benchmarks.report import Report, Table, log
+from benchmarks.records import MissingDataError, Record, Settings, records
 
 OBJECTS = 40
 """Simulated objects, 32 recordings each."""
@@ -40,8 +40,6 @@ SPLAT = SplatConfig(steps=300, degree=1, start_points=3000, gaussians=4000, halv
 _AZIMUTHS, _PIXELS = 8, 96
 PRETRAINING = TrainingConfig(steps=1000, batch=24, rate=1e-3, warmup=100)
 """A quarter of an hour on one core."""
-_LOG_EVERY = 25
-"""Steps between words of progress."""
 _CURVE = 20
 """Points of the loss curve that is kept."""
 
@@ -68,8 +66,7 @@ def training_objects(recipes: Sequence[ObjectRecipe]) -> Iterator[tuple[Gaussian
 
     An object that cannot be simulated or splatted is left out, and the reason is told.
     """
-    for number, recipe in enumerate(recipes, 1):
-        name = f"{number} of {len(recipes)}, {recipe.kind}-{recipe.material}"
+    for recipe in recipes:
         try:
             simulation = simulate_object(recipe)
             cameras = orbit_cameras(simulation.mesh.surface, size=_PIXELS, azimuths=_AZIMUTHS)
@@ -77,16 +74,15 @@ def training_objects(recipes: Sequence[ObjectRecipe]) -> Iterator[tuple[Gaussian
             # What training reads of it.
             object_tokens(visible(cloud), count=SmallConfig().tokens)
         except (SimulationError, SceneError, EvaluationError) as error:
-            log(f"{name} is left out: {error}")
+            print(f"{recipe.kind}-{recipe.material} is left out: {error}", file=sys.stderr)
             continue
-        log(f"{name}: {len(cloud)} Gaussians")
         yield cloud, simulation.capture.impacts
 
 
 def pretrain(
     objects: Iterable[tuple[GaussianCloud, Impacts]],
     sizes: SmallConfig | None = None,
-    training: TrainingConfig = PRETRAINING,
+    config: TrainingConfig = PRETRAINING,
     *,
     seed: int = 0,
 ) -> SmallWeights:
@@ -113,17 +109,13 @@ def pretrain(
     latents = torch.cat([codec.encode(each) for each in logs])
     logs.clear()
 
-    def say(step: int, loss: float) -> None:
-        if step % _LOG_EVERY == 0:
-            log(f"step {step} of {training.steps}: loss {loss:.4f}, {time.process_time() - begun:.0f} s")
-
     loss = clip_loss(network.train(), features, owners, torch.cat(places), latents)
-    losses = train(network.parameters(), loss, len(owners), training, seed=seed, log=say)
+    losses = train(network.parameters(), loss, len(owners), config, seed=seed)
     report = {
         "objects": len(tokens),
         "clips": len(owners),
-        "steps": training.steps,
-        "batch": training.batch,
+        "steps": config.steps,
+        "batch": config.batch,
         "seed": seed,
         "losses": [round(float(part.mean()), 4) for part in np.array_split(losses, min(_CURVE, len(losses)))],
         "seconds": round(time.process_time() - begun, 1),
@@ -131,21 +123,20 @@ def pretrain(
     return SmallWeights(network.eval(), codec, report)
 
 
-def train_small(weights: Path, *, quick: bool) -> Report:
-    """Make training objects, train on them, write the weights, and return the curve of the loss."""
-    sizes, training = _QUICK if quick else (SmallConfig(), PRETRAINING)
+def training(settings: Settings) -> Iterator[Record]:
+    """Make the weights of sonicgauss-small in the file `--weights`: mean losses of the parts of training, in order.
+
+    seconds: of processor time, for making the objects and for training.
+    """
+    if settings.weights is None:
+        raise MissingDataError("sonicgauss-training: expected --weights FILE to write, got none")
+    sizes, config = _QUICK if settings.quick else (SmallConfig(), PRETRAINING)
     begun = time.process_time()
-    objects = list(training_objects(training_recipes(2 if quick else OBJECTS)))
+    objects = list(training_objects(training_recipes(2 if settings.quick else OBJECTS)))
     made = time.process_time() - begun
-    found = pretrain(objects, sizes, training)
-    found.write(weights)
-    losses = [float(value) for value in found.report["losses"]]
-    rows: list[list[str | float]] = [[f"{(place + 1) / len(losses):.0%}", value] for place, value in enumerate(losses)]
-    figures = {
-        "sonicgauss_small.objects_seconds": made,
-        "sonicgauss_small.training_seconds": float(found.report["seconds"]),
-        "sonicgauss_small.first_loss": losses[0],
-        "sonicgauss_small.last_loss": losses[-1],
-    }
-    title = f"sonicgauss-small: loss by part of {found.report['steps']} steps, {found.report['clips']} recordings"
-    return Report(tables=(Table(title, ("steps", "loss"), rows),), figures=figures)
+    found = pretrain(objects, sizes, config)
+    found.write(settings.weights)
+    losses = found.report["losses"]
+    for number, loss in enumerate(losses, 1):
+        yield from records({"loss": loss}, group=f"{number / len(losses):.0%} of the steps")
+    yield from records({"objects_seconds": made, "training_seconds": found.report["seconds"]})

@@ -1,8 +1,6 @@
-"""Whether strikes where `suggest` says are worth more than strikes spread as far apart as they go."""
+"""Whether impacts where `suggest` says are worth more than impacts spread as far apart as they go."""
 
-import tempfile
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 
 import torch
 
@@ -21,103 +19,78 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.recipe import named_recipe
 from avmsf.simulate.simulation import simulate_object
-from benchmarks.material import capture_in_place, surface_features
-from benchmarks.report import Options, Report, Table, log
+from benchmarks.objects import features_of, measured, settings_of, surface_of
+from benchmarks.records import Measurement, Record, Settings, means, records
 
 FIRST = 6
-"""Strikes to begin with."""
+"""Impacts to begin with."""
 ROUNDS = (8, 11, 15, 20)
-"""Strikes after each round, when all ways are judged."""
-JUDGING = 3
-"""One strike of so many is kept to judge by, drawn at random."""
+"""Impacts after each round, when all ways are compared."""
+HELD_OUT = 3
+"""One recording of so many is held out, drawn at random."""
 STARTS = 3
-"""First strikes, spread evenly over the table."""
-WAYS = ("suggested", "farthest", "random")
+"""First contacts, spread evenly over the table."""
 SIM20_OBJECTS = ("plate-ceramic", "mug-ceramic", "bracket-steel", "blob-polycarbonate")
-CONVENTIONS = (
-    f"error: relative STFT error, mean over one of {JUDGING} recordings, drawn with seed 0, of which no way learns; "
-    "all kernel families, no steps end to end, modes extracted and the field fitted anew for every number of strikes.",
-    f"all ways begin with the same {FIRST} strikes, spread as far apart as they go; then some more at a time, of those "
-    "recorded: those that suggest names, the farthest from all others, or any (seed: the start's number).",
-    "ratio: mean error of suggested strikes over that of farthest ones, all numbers and starts together.",
-)
 
 
-def measure(options: Options) -> Report:
-    """Return all ways' errors on the chosen parts."""
-    report = Report(CONVENTIONS)
-    for part in options.parts:
-        report += PARTS[part](options)
-    return report
+def _aircraft(settings: Settings) -> Iterator[Record]:
+    """Relative STFT error, mean over one of 3 recordings, drawn with seed 0, of which no way learns.
+
+    All kernel families, no steps end to end, modes extracted and the field fitted anew for every number of impacts. All
+    ways begin with the same 6 impacts, spread as far apart as they go; then some more at a time, of those recorded:
+    those that suggest names, the farthest from all others, or any (seed: the start's number). ratio: mean error of
+    suggested contacts over that of farthest ones, all numbers and starts together.
+    """
+    aircraft = measured("aircraft_response", settings_of("aircraft_response"))
+    return _compare({"aircraft_response": aircraft}, 0.0, settings)
 
 
-def _aircraft(options: Options) -> Report:
-    return _compare("aircraft", {"aircraft_response": capture_in_place("aircraft_response")}, 0.0, options)
+def _sim20(settings: Settings) -> Iterator[Record]:
+    """The same on four simulated objects of unknown thickness."""
+    names = settings.some(SIM20_OBJECTS)
+    return _compare({name: simulate_object(named_recipe(name), name=name).capture for name in names}, None, settings)
 
 
-def _sim20(options: Options) -> Report:
-    names = SIM20_OBJECTS[:1] if options.quick_look else SIM20_OBJECTS
-    captures = {}
-    for name in names:
-        log(f"suggest.sim20: simulating {name}")
-        captures[name] = simulate_object(named_recipe(name), name=name).capture
-    return _compare("sim20", captures, None, options)
-
-
-def _compare(key: str, captures: dict[str, Capture], wall: float | None, options: Options) -> Report:
-    rows: list[list[str | float]] = []
-    found: list[tuple[float, ...]] = []
+def _compare(captures: Mapping[str, Capture], wall: float | None, settings: Settings) -> Iterator[Record]:
+    found = []
     for name, capture in captures.items():
-        assert capture.surface is not None
-        features = surface_features(capture)
-        judging = torch.randperm(len(capture.impacts), generator=torch.Generator().manual_seed(0))
-        judging = judging[: len(judging) // JUDGING].sort().values
-        test = capture.impacts.take(judging.tolist())
-        pool = capture.impacts.take(sorted(set(range(len(capture.impacts))) - set(judging.tolist())))
+        features, count = features_of(capture), len(capture.impacts)
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(0)).tolist()
+        test = capture.impacts.take(sorted(order[: count // HELD_OUT]))
+        pool = capture.impacts.take(sorted(order[count // HELD_OUT :]))
         alignment = None if pool.before is None else align(pool)
         if alignment is not None:
             pool, test = alignment.apply(pool), alignment.apply(test)
-        with tempfile.TemporaryDirectory() as cache:
-            bodies = candidate_bodies(capture.surface, BodyConfig(wall=wall), cache=Path(cache))
-            estimator = MixtureEstimator(bodies=bodies)
-            for number in range(1 if options.quick_look else STARTS):
-                for count, errors in _paths(pool, test, features, estimator, number, options):
-                    rows.append([f"{name}, start {number}", count, *errors])
-                    found.append(errors)
-                    words = ", ".join(f"{way} {error:.3f}" for way, error in zip(WAYS, errors, strict=True))
-                    log(f"suggest.{key}: {name}, start {number}, {count} strikes: {words}")
-    means = dict(zip(WAYS, (sum(each) / len(found) for each in zip(*found, strict=True)), strict=True))
-    figures = {f"suggest.{key}.{way}": value for way, value in means.items()}
-    ratio = means["suggested"] / means["farthest"]
-    title = f"suggest.{key}: error with suggested strikes over that with farthest ones {ratio:.3f}"
-    return Report(
-        tables=(Table(title, ("object", "strikes", *WAYS), rows),), figures={f"suggest.{key}": ratio, **figures}
-    )
+        estimator = MixtureEstimator(bodies=candidate_bodies(surface_of(capture), BodyConfig(wall=wall)))
+        for number in settings.some(range(STARTS)):
+            for contacts, fields in _paths(pool, features, estimator, number, settings):
+                found.append({way: evaluate(each, test).mean()["relative_stft"] for way, each in fields.items()})
+                yield from records(found[-1], group=f"start {number}, {contacts} contacts", object=name)
+    mean = means(found)
+    yield from records(mean | {"ratio": mean["suggested"] / mean["farthest"]}, group="mean")
 
 
 def _paths(
-    pool: Impacts, test: Impacts, features: FeatureField, estimator: MixtureEstimator, number: int, options: Options
-) -> list[tuple[int, tuple[float, ...]]]:
-    """Return the numbers of strikes with the errors of each way."""
-    rounds = [count for count in ROUNDS[: 1 if options.quick_look else None] if count <= len(pool)]
+    pool: Impacts, features: FeatureField, estimator: MixtureEstimator, number: int, settings: Settings
+) -> Iterator[tuple[int, dict[str, SoundField]]]:
+    """Yield the numbers of contacts with the field of each way."""
+    rounds = [count for count in settings.some(ROUNDS) if count <= len(pool)]
     farthest = farthest_points(pool.contacts, rounds[-1], start=number * len(pool) // STARTS).tolist()
     drawn = torch.randperm(len(pool), generator=torch.Generator().manual_seed(number)).tolist()
     anywhere = farthest[:FIRST] + [row for row in drawn if row not in farthest[:FIRST]]
-    rows, found = farthest[:FIRST], []
-    suggested = _fitted(pool, rows, features, estimator)
+
+    def fitted(rows: list[int]) -> SoundField:
+        train = pool.take(rows)
+        return fit(train, features, extract_modes(train), FitConfig(steps=0), gains=estimator)
+
+    rows = farthest[:FIRST]
+    suggested = fitted(rows)
     for count in rounds:
         following = suggest(suggested, count - len(rows), candidates=pool.contacts, directions=pool.directions)
         rows = [*rows, *following.rows.tolist()]
-        suggested = _fitted(pool, rows, features, estimator)
-        others = (_fitted(pool, each[:count], features, estimator) for each in (farthest, anywhere))
-        errors = tuple(evaluate(each, test).mean()["relative_stft"] for each in (suggested, *others))
-        found.append((count, errors))
-    return found
+        suggested = fitted(rows)
+        ways = {"suggested": suggested, "farthest": fitted(farthest[:count]), "random": fitted(anywhere[:count])}
+        yield count, ways
 
 
-def _fitted(impacts: Impacts, rows: list[int], features: FeatureField, estimator: MixtureEstimator) -> SoundField:
-    train = impacts.take(rows)
-    return fit(train, features, extract_modes(train), FitConfig(steps=0), gains=estimator)
-
-
-PARTS: dict[str, Callable[[Options], Report]] = {"aircraft": _aircraft, "sim20": _sim20}
+PARTS: dict[str, Measurement] = {"aircraft": _aircraft, "sim20": _sim20}

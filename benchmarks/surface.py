@@ -1,11 +1,9 @@
 """Shapes from masks and Gaussians' depth against the simulated objects' true meshes, and under degraded views."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -15,141 +13,78 @@ from jaxtyping import Float64
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.config import SplatConfig
-from avmsf.gaussians.fit import splat
-from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface, read_surface
-from avmsf.photographs import find_foreground, read_views
+from avmsf.photographs import find_foreground
 from avmsf.photographs.cameras import View
 from avmsf.reconstruction import ObjectShape, object_surface
 from avmsf.simulate.recipe import SET, SETS
-from benchmarks.material import MissingDataError
-from benchmarks.report import Options, Report, Table, log
+from benchmarks.objects import views_and_gaussians
+from benchmarks.records import Measurement, Record, Settings, means, records
 
-SAMPLES = 8000
-RAYS = 48
+SAMPLES, RAYS = 8000, 48
 OPEN = 0.5
-"""Part of the directions, weighted by the cosine, in which a place of the outer side sees no other part."""
+"""Part of the directions, weighted by the cosine, in which a point of the outer side sees no other part."""
 DEGRADED = ("mug-ceramic", "bowl-glass", "skillet-iron", "platter-wood")
 """Objects of the degraded part: vessels with and without handles, and a body without a cavity."""
-CONVENTIONS = (
-    "The body is shell(t) at the true wall's thickness t (median of the mesh's own along the inward normals) where a "
-    "cavity was found, else as_seen(); where cavities are only supposed, the nearer of the two, "
-    "which recordings would have to tell. mean, p95: distance between the body and the true mesh in percent "
-    "of the mesh's diagonal, from 8000 places on each to the other, of those that see no other part of their mesh in "
-    "half of the directions or more. thickness: relative difference of twice the volume over the area. cavity: "
-    "relative error of the cavity's volume, which is what the body leaves of solid(). Neither says what wall the "
-    "recordings find. seconds: process time of object_surface and one shell(t). Gaussians as SplatConfig has them, of "
-    "72 views of 256 pixels, seed 0.",
-    "Degraded: the masks and cameras that shapes are made of, with Gaussians of the undegraded views seen from the "
-    "cameras at hand. upper: elevations of -6 degrees and more; twelve: each sixth view; eroded, dilated: masks by "
-    "so many pixels; found: masks found before the pictures' plain background; wrong: 5 % of the masks turned by 180 "
-    "degrees; turned: cameras by .3 degrees about random axes.",
-)
 
 
 @dataclass(frozen=True, eq=False)
 class _Truth:
-    surface: Surface
-    diagonal: float
+    mesh: trimesh.Trimesh
     wall: float
     """Meters."""
 
 
-@dataclass(frozen=True)
-class _Scores:
-    mean: float
-    p95: float
-    thickness: float
-    cavity: float
-    seconds: float
+def _objects(settings: Settings, of: str = SET) -> Iterator[Record]:
+    """Distance of the body from the true mesh, and relative errors of its thickness and cavity.
+
+    The body is shell(t) at the true wall's thickness t (median of the mesh's own along the inward normals) where a
+    cavity was found, else as_seen(); where cavities are only supposed, the nearer of the two, which recordings would
+    have to tell. mean, p95: in percent of the mesh's diagonal, from 8000 points on each to the other, of those that see
+    no other part of their mesh in half of the directions or more. thickness: of twice the volume over the area. cavity:
+    of its volume, which is what the body leaves of solid(). Neither says what wall the recordings find. seconds:
+    process time of object_surface and one shell(t). Gaussians as SplatConfig has them, of 72 views of 256 pixels.
+    """
+    rows = []
+    for name in settings.objects or settings.some(tuple(SETS[of]), 2):
+        rows.append(_scores(*_material(name, settings)))
+        yield from records(rows[-1], object=name)
+    yield from records(means(rows), group="mean")
 
 
-def measure(options: Options) -> Report:
-    """Return the figures of the chosen parts. Raises MissingDataError without the simulated objects' folder."""
-    if options.sim20 is None or not options.sim20.is_dir():
-        raise MissingDataError(
-            "surface: expected --sim-20 FOLDER with the simulated objects and their pictures; `avmsf simulate sim-20` "
-            "makes them"
-        )
-    report = Report(CONVENTIONS)
-    with TemporaryDirectory() as temporary:
-        clouds = Path(temporary) if options.clouds is None else options.clouds
-        clouds.mkdir(parents=True, exist_ok=True)
-        for part in options.parts:
-            report += PARTS[part](options.sim20, clouds, options.quick_look)
-    return report
+def _degraded(settings: Settings) -> Iterator[Record]:
+    """The same under degraded masks and cameras, means over four objects, with the Gaussians of the undegraded views.
 
-
-def _objects(folder: Path, clouds: Path, quick: bool, *, of: str = SET) -> Report:
-    rows: list[list[str | float]] = []
-    found = []
-    for name in tuple(SETS[of])[: 2 if quick else None]:
-        views, truth, cloud = _material(folder / name, clouds, quick)
-        scores = _scores(views, cloud, truth)
-        found.append(scores)
-        rows.append([name, *_cells(scores)])
-        log(f"surface: {name}: {scores}")
-    means = [_mean([getattr(each, key) for each in found]) for key in _KEYS]
-    rows.append(["mean", *means])
-    names = ("outer_mean", "outer_p95", "thickness_error", "cavity_error", "seconds")
-    prefix = "surface" if of == SET else f"surface.{of}"
-    figures = {f"{prefix}.{name}": value for name, value in zip(names, means, strict=True)}
-    return Report(tables=(Table(f"simulated objects, {of}", ("object", *_KEYS), rows),), figures=figures)
-
-
-def _degraded(folder: Path, clouds: Path, quick: bool) -> Report:
-    rows: list[list[str | float]] = []
-    figures: dict[str, float] = {}
-    materials = [_material(folder / name, clouds, quick) for name in (DEGRADED[:1] if quick else DEGRADED)]
+    upper: elevations of -6 degrees and more; twelve: each sixth view; eroded, dilated: masks by so many pixels; found:
+    masks found before the pictures' plain background; wrong: 5 % of the masks turned by 180 degrees; turned: cameras by
+    .3 degrees about random axes. failed: objects without a shape.
+    """
+    materials = [_material(name, settings) for name in settings.some(DEGRADED)]
     for name, change in CONDITIONS.items():
-        found = []
-        for views, truth, cloud in materials:
+        rows, failures = [], []
+        for views, cloud, truth in materials:
             try:
-                found.append(_scores(change(views), cloud, truth))
+                rows.append(_scores(change(views), cloud, truth))
             except SceneError as error:
-                log(f"surface: {name}: {error}")
-        means = [_mean([getattr(each, key) for each in found]) for key in _KEYS]
-        rows.append([name, *means, len(materials) - len(found)])
-        figures |= {f"surface.{name}.{key}": value for key, value in zip(_KEYS, means, strict=True)}
-        log(f"surface: {name}: {means}")
-    return Report(tables=(Table("degraded views", ("condition", *_KEYS, "failed"), rows),), figures=figures)
+                failures.append(str(error))
+        yield from records({**means(rows), "failed": len(failures)}, group=name, note="; ".join(failures))
 
 
-def _mean(values: Sequence[float]) -> float:
-    """Return the mean of what is known; NaN where nothing is."""
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.mean(known)) if known else float("nan")
+def _material(name: str, settings: Settings) -> tuple[Sequence[View], GaussianCloud, _Truth]:
+    views, cloud = views_and_gaussians(name, settings)
+    assert settings.sim20 is not None
+    mesh = _mesh(read_surface(settings.sim20 / name / "surface.ply"))
+    points, normals = _sampled(mesh)
+    outside = _openness(mesh, points, normals) >= OPEN
+    hit = _rays(mesh, points[outside], -normals[outside])
+    return views, cloud, _Truth(mesh, float(np.median(hit[np.isfinite(hit)])))
 
 
-def views_and_gaussians(folder: Path, clouds: Path, *, quick: bool) -> tuple[tuple[View, ...], GaussianCloud]:
-    """Return an object's views and its Gaussians, which are kept in the folder `clouds`."""
-    config = replace(SplatConfig(), steps=200) if quick else SplatConfig()
-    views, path = read_views(folder), clouds / f"{folder.name}{'-200-steps' if quick else ''}.ply"
-    if not path.exists():
-        write_splats(splat(views, config), path)
-    return tuple(views), read_splats(path)
-
-
-def _material(folder: Path, clouds: Path, quick: bool) -> tuple[tuple[View, ...], _Truth, GaussianCloud]:
-    views, cloud = views_and_gaussians(folder, clouds, quick=quick)
-    return views, _truth(read_surface(folder / "surface.ply")), cloud
-
-
-def _truth(surface: Surface) -> _Truth:
-    mesh = _mesh(surface)
-    places, normals = _sampled(mesh)
-    outside = _openness(mesh, places, normals) >= OPEN
-    diagonal = float(np.linalg.norm(mesh.extents))
-    hit = _rays(mesh, places[outside], -normals[outside])
-    return _Truth(surface, diagonal, float(np.median(hit[np.isfinite(hit)])))
-
-
-def _scores(views: Sequence[View], cloud: GaussianCloud, truth: _Truth) -> _Scores:
+def _scores(views: Sequence[View], cloud: GaussianCloud, truth: _Truth) -> dict[str, float]:
     render, depths = depth_of_cloud(cloud, choose_rasterizer(cloud.centers.device)), {}
     for view in views:
         depths[id(view.camera)] = render(view.camera)
@@ -157,16 +92,20 @@ def _scores(views: Sequence[View], cloud: GaussianCloud, truth: _Truth) -> _Scor
     shape = object_surface(views, lambda camera: depths[id(camera)])
     bodies = _bodies(shape, truth.wall)
     seconds = time.process_time() - start
-    true = _mesh(truth.surface)
-    found = []
+    found, diagonal = [], float(np.linalg.norm(truth.mesh.extents))
     for mesh in map(_mesh, bodies):
-        far = np.concatenate([_distances(mesh, true), _distances(true, mesh)]) / truth.diagonal * 100
+        far = np.concatenate([_distances(mesh, truth.mesh), _distances(truth.mesh, mesh)]) / diagonal * 100
         found.append((float(far.mean()), float(np.quantile(far, 0.95)), mesh))
     mean, p95, mesh = min(found, key=lambda each: each[0])
-    thickness = abs(_thickness(mesh) / _thickness(true) - 1)
-    hollow = _mesh(shape.solid()).volume - true.volume
-    cavity = abs(mesh.volume - true.volume) / hollow if shape.hollow.any() and not shape.supposed else float("nan")
-    return _Scores(mean, p95, float(thickness), float(cavity), seconds)
+    hollow = _mesh(shape.solid()).volume - truth.mesh.volume
+    seen = shape.hollow.any() and not shape.supposed
+    return {
+        "mean_percent": mean,
+        "p95_percent": p95,
+        "thickness": abs(_thickness(mesh) / _thickness(truth.mesh) - 1),
+        "cavity": abs(mesh.volume - truth.mesh.volume) / hollow if seen else float("nan"),
+        "seconds": seconds,
+    }
 
 
 def _bodies(shape: ObjectShape, wall: float) -> list[Surface]:
@@ -178,11 +117,11 @@ def _bodies(shape: ObjectShape, wall: float) -> list[Surface]:
     return [shape.as_seen(), *shell] if shape.supposed else shell
 
 
-def _distances(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> Float64[np.ndarray, " places"]:
-    """Return how far places on the outer side of one mesh lie from the other, meters."""
-    places, normals = _sampled(mesh)
-    outside = _openness(mesh, places, normals) >= OPEN
-    return ClosestPoints(np.asarray(other.triangles))(places[outside]).distances
+def _distances(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> Float64[np.ndarray, " points"]:
+    """Return how far points on the outer side of one mesh lie from the other, meters."""
+    points, normals = _sampled(mesh)
+    outside = _openness(mesh, points, normals) >= OPEN
+    return ClosestPoints(np.asarray(other.triangles))(points[outside]).distances
 
 
 def _thickness(mesh: trimesh.Trimesh) -> float:
@@ -195,37 +134,33 @@ def _mesh(surface: Surface) -> trimesh.Trimesh:
 
 def _sampled(
     mesh: trimesh.Trimesh,
-) -> tuple[Float64[np.ndarray, "places 3"], Float64[np.ndarray, "places 3"]]:
-    places, rows = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
-    return np.asarray(places, dtype=np.float64), np.asarray(mesh.face_normals[rows], dtype=np.float64)
+) -> tuple[Float64[np.ndarray, "points 3"], Float64[np.ndarray, "points 3"]]:
+    points, rows = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    return np.asarray(points, dtype=np.float64), np.asarray(mesh.face_normals[rows], dtype=np.float64)
 
 
 def _openness(
-    mesh: trimesh.Trimesh, places: Float64[np.ndarray, "places 3"], normals: Float64[np.ndarray, "places 3"]
-) -> Float64[np.ndarray, " places"]:
+    mesh: trimesh.Trimesh, points: Float64[np.ndarray, "points 3"], normals: Float64[np.ndarray, "points 3"]
+) -> Float64[np.ndarray, " points"]:
     """Return the part of the directions from each place in which nothing of the mesh lies, weighted by the cosine."""
-    generator, free = np.random.default_rng(1), np.zeros(len(places))
+    generator, free = np.random.default_rng(1), np.zeros(len(points))
     for _ in range(RAYS):
-        aside = generator.standard_normal(places.shape)
+        aside = generator.standard_normal(points.shape)
         toward = aside / np.linalg.norm(aside, axis=1, keepdims=True) + normals
-        free += ~np.isfinite(_rays(mesh, places, toward / np.linalg.norm(toward, axis=1, keepdims=True), normals))
+        free += ~np.isfinite(_rays(mesh, points, toward / np.linalg.norm(toward, axis=1, keepdims=True), normals))
     return free / RAYS
 
 
 def _rays(
     mesh: trimesh.Trimesh,
-    places: Float64[np.ndarray, "places 3"],
-    directions: Float64[np.ndarray, "places 3"],
-    normals: Float64[np.ndarray, "places 3"] | None = None,
-) -> Float64[np.ndarray, " places"]:
+    points: Float64[np.ndarray, "points 3"],
+    directions: Float64[np.ndarray, "points 3"],
+    normals: Float64[np.ndarray, "points 3"] | None = None,
+) -> Float64[np.ndarray, " points"]:
     """Return the distance to what lies in a direction, meters; rays start a little along the normals."""
     offset = 1e-4 * float(np.linalg.norm(mesh.extents))
-    starts = places + offset * (directions if normals is None else normals)
+    starts = points + offset * (directions if normals is None else normals)
     return RayCaster(np.asarray(mesh.triangles))(starts, directions, lead=0.0)[1]
-
-
-def _cells(scores: _Scores) -> list[float]:
-    return [getattr(scores, key) for key in _KEYS]
 
 
 def _grown(pixels: int) -> Callable[[Sequence[View]], Sequence[View]]:
@@ -268,7 +203,6 @@ def _found(views: Sequence[View]) -> Sequence[View]:
     return find_foreground([replace(view, mask=None) for view in views])
 
 
-_KEYS = ("mean", "p95", "thickness", "cavity", "seconds")
 CONDITIONS: dict[str, Callable[[Sequence[View]], Sequence[View]]] = {
     "as_taken": lambda views: views,
     "upper": _upper,
@@ -281,7 +215,7 @@ CONDITIONS: dict[str, Callable[[Sequence[View]], Sequence[View]]] = {
     "wrong": _wrong,
     "turned": _turned,
 }
-PARTS: dict[str, Callable[[Path, Path, bool], Report]] = {
+PARTS: dict[str, Measurement] = {
     "objects": _objects,
     "held-out": partial(_objects, of="held-out"),
     "degraded": _degraded,

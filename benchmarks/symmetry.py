@@ -1,7 +1,8 @@
 """How well the symmetries of known shapes and scanned objects are found: clean, noisy, and thinned."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,19 +11,16 @@ import torch
 import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
+from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
 from avmsf.simulate.recipe import named_recipe
 from avmsf.simulate.shapes import make_shape
 from avmsf.symmetry.find import find_symmetries
-from avmsf.symmetry.symmetries import Symmetries
-from benchmarks.material import shared_data
-from benchmarks.report import Options, Report, Table, log
+from benchmarks.objects import shared_data
+from benchmarks.records import Record, Settings, records
 
-PARTS = ("made", "scanned", "held-out")
-POINTS = 8000
-POSES = 2
+POINTS, POSES = 8000, 2
 _FIRST_SEED = 200
 """The settings were chosen on poses and noise of other seeds."""
 _NEAR_DEGREES, _NEAR_GAP = 5.0, 0.05
@@ -40,6 +38,9 @@ class Element:
     order: int | None = None
     mirror: bool = False
 
+    def __str__(self) -> str:
+        return "plane" if self.mirror else "any turn" if self.order is None else f"{self.order}-fold"
+
 
 @dataclass(frozen=True, eq=False)
 class Shape:
@@ -49,25 +50,113 @@ class Shape:
     elements: tuple[Element, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Score:
-    """What was found of one cloud."""
+def symmetry(settings: Settings) -> Iterator[Record]:
+    """Found axes and planes of 17 made shapes and 6 scans: right ones of those found, and of the true ones.
 
-    right: int
-    found: int
-    true: int
-    degrees: tuple[float, ...]
-    """Angles between true axes or normals and those found for them."""
-    fault: str = ""
-
-    @property
-    def exact(self) -> bool:
-        """Whether all was found, and nothing else."""
-        return self.right == self.found == self.true
+    8000 points drawn from each surface, turned, scaled and shifted by chance, anew for every condition and pose. An
+    axis counts as found if the order is right, to within 5 degrees and 5 % of the diagonal. A continuous axis stands
+    for the planes that contain it and for the half turns across it. noise: 1 % of the diagonal, normal, on every
+    coordinate. thinned: 30 % dropped, next to none at one end and most at the other.
+    """
+    return _measure(
+        MADE | {name: Shape(partial(_scan, name), elements) for name, elements in SCANNED.items()}, settings
+    )
 
 
-def _clean(points: Points, _: np.random.Generator) -> Points:
-    return points
+def held_out(settings: Settings) -> Iterator[Record]:
+    """The same of five simulated shapes of kinds that no setting was chosen on."""
+    return _measure({name: Shape(partial(_made, name), elements) for name, elements in HELD_OUT.items()}, settings)
+
+
+def _measure(shapes: Mapping[str, Shape], settings: Settings) -> Iterator[Record]:
+    found: dict[str, list[tuple[Counter[str], list[float]]]] = {}
+    chosen = settings.some(list(shapes.items()), 3)
+    for number, (name, shape) in enumerate(chosen):
+        mesh = shape.mesh()
+        for kind, (condition, change) in enumerate(CONDITIONS.items()):
+            for pose in settings.some(range(POSES)):
+                seed = _FIRST_SEED + 1000 * number + 100 * kind + pose
+                counts, degrees, fault = _score(mesh, shape.elements, change, seed=seed)
+                found.setdefault(condition, []).append((counts, degrees))
+                group = f"{condition}.pose {pose}"
+                yield from records(counts, group=group, object=name, seed=seed, note=fault)
+    for condition, scores in found.items():
+        yield from records(_totals(scores), group=condition)
+    yield from records(_totals([each for scores in found.values() for each in scores]))
+
+
+def _totals(scores: Sequence[tuple[Counter[str], list[float]]]) -> dict[str, float]:
+    counts = sum((counts for counts, _ in scores), Counter[str]())
+    degrees = [angle for _, angles in scores for angle in angles]
+    return {
+        # Where nothing was claimed, nothing was wrong.
+        "precision": counts["right"] / counts["found"] if counts["found"] else 1.0,
+        "recall": counts["right"] / counts["true"] if counts["true"] else 1.0,
+        "axis_degrees": sum(degrees) / len(degrees) if degrees else math.nan,
+        "axis_degrees_worst": max(degrees, default=math.nan),
+    }
+
+
+def _score(
+    mesh: trimesh.Trimesh,
+    elements: Sequence[Element],
+    change: Callable[[Points, np.random.Generator], Points],
+    *,
+    seed: int,
+) -> tuple[Counter[str], list[float], str]:
+    """Draw a cloud, change it, pose and scale it by chance, and compare what is found with the truth.
+
+    Returns the counts, the angles between true axes or normals and those found for them, and what went wrong.
+    """
+    random = np.random.default_rng(seed)
+    points = change(np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=seed)[0]), random)
+    turn = Rotation.random(random_state=seed)
+    size, shift = random.uniform(0.1, 3.0), random.normal(size=3)
+    found = find_symmetries(torch.from_numpy(size * turn.apply(points) + shift), seed=seed)
+    claims = [Element(tuple(r.axis.tolist()), tuple(r.point.tolist()), r.order) for r in found.rotations]
+    claims += [Element(tuple(m.normal.tolist()), tuple(m.point.tolist()), mirror=True) for m in found.mirrors]
+    missed = [
+        Element(
+            tuple(turn.apply(each.direction)), tuple(size * turn.apply(each.point) + shift), each.order, each.mirror
+        )
+        for each in elements
+    ]
+    middle = size * turn.apply(mesh.bounds.mean(axis=0)) + shift
+    nearest = _NEAR_GAP * float(np.linalg.norm(mesh.extents)) * size
+    degrees, wrong = [], []
+    for claim in claims:
+        fitting = []
+        for each in missed:
+            angle, gap = _apart(claim, each, middle)
+            alike = (each.mirror, each.order) == (claim.mirror, claim.order)
+            if alike and angle < _NEAR_DEGREES and gap < nearest:
+                fitting.append((angle, each))
+        if fitting:
+            angle, each = min(fitting, key=lambda pair: pair[0])
+            missed.remove(each)
+            degrees.append(angle)
+        else:
+            wrong.append(claim)
+    faults = {"missed": Counter(map(str, missed)), "wrong": Counter(map(str, wrong))}
+    words = [f"{what} {', '.join(f'{n} {name}' for name, n in each.items())}" for what, each in faults.items() if each]
+    return Counter(right=len(degrees), found=len(claims), true=len(elements)), degrees, "; ".join(words)
+
+
+def _apart(one: Element, other: Element, middle: Float[np.ndarray, " 3"]) -> tuple[float, float]:
+    """Return the angle between two axes or planes, degrees, and how far apart they pass the middle."""
+    feet = []
+    for each in (one, other):
+        direction = np.asarray(each.direction) / np.linalg.norm(each.direction)
+        offset = middle - np.asarray(each.point)
+        along = (offset @ direction) * direction
+        feet.append((direction, along if each.mirror else offset - along))
+    cosine = min(1.0, abs(float(feet[0][0] @ feet[1][0])))
+    return math.degrees(math.acos(cosine)), float(np.linalg.norm(feet[0][1] - feet[1][1]))
+
+
+def _direction(random: np.random.Generator) -> Float[np.ndarray, " 3"]:
+    direction = random.normal(size=3)
+    return direction / np.linalg.norm(direction)
 
 
 def _noisy(points: Points, random: np.random.Generator) -> Points:
@@ -82,11 +171,24 @@ def _thinned(points: Points, random: np.random.Generator) -> Points:
     return points[random.random(len(points)) < kept]
 
 
-CONDITIONS = {
-    "clean": _clean,
+CONDITIONS: dict[str, Callable[[Points, np.random.Generator], Points]] = {
+    "clean": lambda points, _: points,
     "1 % noise": _noisy,
     "thinned": _thinned,
 }
+
+
+def _scan(name: str) -> trimesh.Trimesh:
+    return _mesh(read_surface(shared_data() / "meshes" / name / "textured.obj"))
+
+
+def _made(name: str) -> trimesh.Trimesh:
+    recipe = named_recipe(name)
+    return _mesh(make_shape(recipe.kind, seed=recipe.seed).surface)
+
+
+def _mesh(surface: Surface) -> trimesh.Trimesh:
+    return trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
 
 
 def _prism(sides: int) -> Shape:
@@ -129,7 +231,7 @@ def _propeller() -> trimesh.Trimesh:
         blades.append(trimesh.Trimesh(turned, blade.faces))
     shaft = trimesh.creation.cylinder(0.2, 1.0, sections=96)
     shaft.apply_translation((0.0, 0.0, 0.25))
-    return _joined([*blades, shaft])
+    return trimesh.util.concatenate([*blades, shaft])
 
 
 def _can() -> trimesh.Trimesh:
@@ -143,7 +245,7 @@ def _handled_can() -> trimesh.Trimesh:
     ring = trimesh.creation.torus(0.3, 0.06)
     upright = trimesh.Trimesh(ring.vertices[:, [0, 2, 1]] + np.array([0.55, 0.0, 0.0]), ring.faces)
     outside = np.hypot(*upright.triangles_center[:, :2].T) > 0.5
-    return _joined([_can(), trimesh.Trimesh(upright.vertices, upright.faces[outside])])
+    return trimesh.util.concatenate([_can(), trimesh.Trimesh(upright.vertices, upright.faces[outside])])
 
 
 def _bracket() -> trimesh.Trimesh:
@@ -151,13 +253,7 @@ def _bracket() -> trimesh.Trimesh:
     floor, wall, rib = (trimesh.creation.box(size) for size in ((1.0, 0.6, 0.1), (0.1, 0.6, 0.7), (0.4, 0.08, 0.3)))
     wall.apply_translation((-0.45, 0.0, 0.4))
     rib.apply_translation((-0.2, 0.15, 0.2))
-    return _joined([floor, wall, rib])
-
-
-def _joined(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
-    return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)
+    return trimesh.util.concatenate([floor, wall, rib])
 
 
 _COORDINATES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
@@ -229,172 +325,3 @@ HELD_OUT = {
     "channel-steel": (Element((1, 0, 0), mirror=True), Element((0, 1, 0), mirror=True), Element((0, 0, 1), order=2)),
     "scallop-polycarbonate": (Element((0, 1, 0), mirror=True),),
 }
-
-
-def measure_symmetry(options: Options) -> Report:
-    """Return precision, recall and angles over all shapes, conditions and poses."""
-    shapes: dict[str, Shape] = {}
-    if "made" in options.parts:
-        shapes |= MADE
-    if "scanned" in options.parts:
-        shapes |= {name: Shape(_scan(name), elements) for name, elements in SCANNED.items()}
-    if "held-out" in options.parts:
-        shapes |= {name: Shape(partial(_held_out, name), elements) for name, elements in HELD_OUT.items()}
-    poses = 1 if options.quick_look else POSES
-    if options.quick_look:
-        shapes = dict(list(shapes.items())[:: max(1, len(shapes) // 3)])
-    scores: dict[tuple[str, str], list[Score]] = {}
-    for number, (name, shape) in enumerate(shapes.items()):
-        log(f"symmetry: {name}")
-        mesh = shape.mesh()
-        for kind, (condition, change) in enumerate(CONDITIONS.items()):
-            scores[name, condition] = [
-                score_cloud(mesh, shape.elements, change, seed=_FIRST_SEED + 1000 * number + 100 * kind + pose)
-                for pose in range(poses)
-            ]
-    return _report(scores, shapes)
-
-
-measure = measure_symmetry
-
-
-def score_cloud(
-    mesh: trimesh.Trimesh,
-    elements: Sequence[Element],
-    change: Callable[[Points, np.random.Generator], Points],
-    *,
-    seed: int,
-) -> Score:
-    """Draw a cloud, change it, pose and scale it by chance, and compare what is found with the truth."""
-    random = np.random.default_rng(seed)
-    points = change(np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=seed)[0]), random)
-    turn = Rotation.random(random_state=seed)
-    size, shift = random.uniform(0.1, 3.0), random.normal(size=3)
-    posed = torch.from_numpy(size * turn.apply(points) + shift)
-    found = find_symmetries(posed, seed=seed)
-    true = [
-        Element(
-            tuple(turn.apply(each.direction)), tuple(size * turn.apply(each.point) + shift), each.order, each.mirror
-        )
-        for each in elements
-    ]
-    diagonal = float(np.linalg.norm(mesh.extents)) * size
-    return _compare(found, true, middle=size * turn.apply(mesh.bounds.mean(axis=0)) + shift, diagonal=diagonal)
-
-
-def _compare(found: Symmetries, true: list[Element], *, middle: Float[np.ndarray, " 3"], diagonal: float) -> Score:
-    claims = [Element(tuple(r.axis.tolist()), tuple(r.point.tolist()), r.order) for r in found.rotations]
-    claims += [Element(tuple(m.normal.tolist()), tuple(m.point.tolist()), mirror=True) for m in found.mirrors]
-    open_, degrees, wrong = list(true), [], []
-    for claim in claims:
-        fitting = []
-        for each in open_:
-            angle, gap = _apart(claim, each, middle)
-            alike = (each.mirror, each.order) == (claim.mirror, claim.order)
-            if alike and angle < _NEAR_DEGREES and gap < _NEAR_GAP * diagonal:
-                fitting.append((angle, each))
-        if fitting:
-            angle, each = min(fitting, key=lambda pair: pair[0])
-            open_.remove(each)
-            degrees.append(angle)
-        else:
-            wrong.append(_name(claim))
-    fault = "; ".join(
-        f"{what} {_counted(names)}" for what, names in (("missed", [*map(_name, open_)]), ("wrong", wrong)) if names
-    )
-    return Score(len(degrees), len(claims), len(true), tuple(degrees), fault)
-
-
-def _apart(one: Element, other: Element, middle: Float[np.ndarray, " 3"]) -> tuple[float, float]:
-    """Return the angle between two axes or planes, degrees, and how far apart they pass the middle."""
-    feet = []
-    for each in (one, other):
-        direction = np.asarray(each.direction) / np.linalg.norm(each.direction)
-        offset = middle - np.asarray(each.point)
-        along = (offset @ direction) * direction
-        feet.append((direction, along if each.mirror else offset - along))
-    cosine = min(1.0, abs(float(feet[0][0] @ feet[1][0])))
-    return math.degrees(math.acos(cosine)), float(np.linalg.norm(feet[0][1] - feet[1][1]))
-
-
-def _name(element: Element) -> str:
-    if element.mirror:
-        return "plane"
-    return "any turn" if element.order is None else f"{element.order}-fold"
-
-
-def _counted(names: list[str]) -> str:
-    return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names))
-
-
-def _direction(random: np.random.Generator) -> Float[np.ndarray, " 3"]:
-    direction = random.normal(size=3)
-    return direction / np.linalg.norm(direction)
-
-
-def _scan(name: str) -> Callable[[], trimesh.Trimesh]:
-    def read() -> trimesh.Trimesh:
-        surface = read_surface(shared_data() / "meshes" / name / "textured.obj")
-        vertices: Tensor = surface.vertices.double()
-        return trimesh.Trimesh(vertices.numpy(), surface.faces.numpy(), process=False)
-
-    return read
-
-
-def _held_out(name: str) -> trimesh.Trimesh:
-    recipe = named_recipe(name)
-    surface = make_shape(recipe.kind, seed=recipe.seed).surface
-    return trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
-
-
-def _report(scores: dict[tuple[str, str], list[Score]], shapes: dict[str, Shape]) -> Report:
-    everything = [score for each in scores.values() for score in each]
-    rows: list[list[str | float]] = [
-        [name, len(shapes[name].elements), *(_cell(scores[name, condition]) for condition in CONDITIONS)]
-        for name in shapes
-    ]
-    totals: list[list[str | float]] = [
-        [condition, *_totals([score for (_, each), made in scores.items() for score in made if each == condition])]
-        for condition in CONDITIONS
-    ]
-    totals.append(["all", *_totals(everything)])
-    faults: list[list[str | float]] = []
-    for (name, condition), made in scores.items():
-        for pose, score in enumerate(made):
-            if not score.exact:
-                faults.append([score.fault, f"{name}, {condition}, pose {pose}"])
-    precision, recall, mean, worst = _totals(everything)[:4]
-    figures = {
-        "symmetry.precision": precision,
-        "symmetry.recall": recall,
-        "symmetry.axis_degrees": mean,
-        "symmetry.axis_degrees_worst": worst,
-    }
-    return Report(
-        (
-            f"symmetry: {POINTS} points drawn from each surface, turned, scaled and shifted by chance, anew for every "
-            "cell. An axis counts as found if the order is right, to within 5 degrees and 5 % of the diagonal. A "
-            "continuous axis stands for the planes that contain it and for the half turns across it.",
-            "noise: 1 % of the diagonal, normal, on every coordinate. thinned: 30 % dropped, next to none at one end "
-            "and most at the other.",
-        ),
-        (
-            Table("symmetries: right/found of the true ones, over all poses", ("shape", "true", *CONDITIONS), rows),
-            Table("in all", ("", "precision", "recall", "mean degrees", "worst degrees"), totals),
-            Table("what went wrong", ("fault", "cloud"), faults),
-        ),
-        figures,
-    )
-
-
-def _cell(scores: list[Score]) -> str:
-    return f"{sum(score.right for score in scores)}/{sum(score.found for score in scores)}"
-
-
-def _totals(scores: list[Score]) -> tuple[float, float, float, float]:
-    right, found, true = (sum(getattr(score, name) for score in scores) for name in ("right", "found", "true"))
-    degrees = [angle for score in scores for angle in score.degrees]
-    # Where nothing was claimed, nothing was wrong.
-    precision = right / found if found else 1.0
-    mean = sum(degrees) / len(degrees) if degrees else math.nan
-    return precision, right / true if true else 1.0, mean, max(degrees, default=math.nan)

@@ -9,7 +9,7 @@ from avmsf.field import losses
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.training import TrainingRun
 from avmsf.modal.spectra import magnitude_stft
-from benchmarks.step import STEPS, PlainRun, full_setting, start
+from oracles.plain_training import STEPS, PlainRun, full_setting, start
 
 SIZES, HOPS = (256, 64, 30), (64, 16, 7)
 

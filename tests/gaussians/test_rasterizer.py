@@ -14,8 +14,8 @@ from avmsf.gaussians.rasterizer.devices import NumbaRasterizer, choose_rasterize
 from avmsf.gaussians.rasterizer.projection import project
 from avmsf.gaussians.rasterizer.protocol import Rendering
 from avmsf.photographs.cameras import Camera
-from benchmarks.rasterizers import render_everywhere, splats
 from factories.raising import raises
+from oracles.gaussian_image import render_everywhere, splats
 
 NAMES = tuple(each.name for each in fields(GaussianCloud))
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.robustness import files
-from benchmarks.robustness.seeds import write_seeds
+from factories import damaged_files as files
+from factories.valid_files import write_seeds
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from avmsf.modal.extraction.quality import ModeQuality, measure_quality
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from benchmarks.modes import AIRCRAFT, count_modes, tree_frequencies
+from oracles.known_modes import AIRCRAFT, count_modes, tree_frequencies
 
 RATE = 8000.0
 SAMPLES = 8000
@@ -152,7 +152,7 @@ def test_a_pole_that_is_not_there_is_stable_at_no_order() -> None:
 
 @pytest.mark.slow
 def test_all_known_modes_of_measured_objects_are_found_and_called_modes(shared: Path) -> None:
-    for name, known in (("aircraft_response", AIRCRAFT), ("tree43", tree_frequencies())):
+    for name, known in (("aircraft_response", AIRCRAFT), ("tree43", tree_frequencies(shared))):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CaptureWarning)
             impacts = read_capture(shared / name, CaptureSettings()).impacts

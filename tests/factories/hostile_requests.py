@@ -1,20 +1,14 @@
-"""Requests that no page would send, to a studio in a process of its own: the answers, their time and its memory."""
+"""Requests to a studio that no page would send, each from a seed, and what comes of them."""
 
 import http.client
 import io
 import json
 import math
-import re
-import signal
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import soundfile
@@ -24,54 +18,24 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from benchmarks.robustness.seeds import mixture_gains
+
+from .valid_files import mixture_gains
 
 RATE = 8000
-INPUTS = 3000
-QUICK_INPUTS = 100
 _BODY_BYTES = 1 << 18
 _NUMBERS = (
     *("NaN", "Infinity", "1e400", "1e308", "-1e308", "5e-324", "0", "-0.0", "-1", "1e-3", "1e3", "999.9", "1.5"),
     *("40", "-40", "120", "-120", "9" * 400, "9" * 5000, "true", "null", '"2"', '"\\ud800"', "[]", "{}", "[[1]]"),
 )
 _NAMES = (
-    *(
-        "bowl",
-        "../x",
-        "con",
-        "a" * 300,
-        "\u202egnp",
-        "\u00e4" * 90,
-        "x\0y",
-        ".",
-        "",
-        "a/b",
-        "C:\\x",
-        "\ud800",
-        "\x1b[2J",
-    ),
-    *("ceramic", "steel", "wood", "STEEL", "cheese", "displacement", "acceleration", "paper"),
+    *("bowl", "../x", "con", "a" * 300, "\u202egnp", "\u00e4" * 90, "x\0y", ".", "", "a/b", "C:\\x", "\ud800"),
+    *("\x1b[2J", "ceramic", "steel", "wood", "STEEL", "cheese", "displacement", "acceleration", "paper"),
 )
 _PATHS = (
-    *(
-        "",
-        "manifest.json",
-        "capture",
-        "field.bin",
-        "revisions/1/field.bin",
-        "revisions/99/x",
-        "page/main.js",
-        "modules/x",
-    ),
-    *(
-        "strikes/0.wav",
-        "capture/strikes/a.wav",
-        "capture/strikes/%00.wav",
-        "capture/strikes/%ff",
-        "object.glb",
-        "jobs/x",
-    ),
-    *("jobs/x/events", "page/%2e%2e/routes.py", "page/" + "a" * 5000, "%ed%a0%80", "undo", "edit", "save", "locate"),
+    *("", "manifest.json", "capture", "field.bin", "revisions/1/field.bin", "revisions/99/x", "page/main.js"),
+    *("modules/x", "strikes/0.wav", "capture/strikes/a.wav", "capture/strikes/%00.wav", "capture/strikes/%ff"),
+    *("object.glb", "jobs/x", "jobs/x/events", "page/%2e%2e/routes.py", "page/" + "a" * 5000, "%ed%a0%80", "undo"),
+    *("edit", "save", "locate"),
 )
 _METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE")
 
@@ -214,31 +178,6 @@ def fuzz(ask: Ask, *, count: int, seed: int = 0) -> dict[str, float]:
     }
 
 
-def run(*, quick_look: bool = False, seed: int = 0) -> dict[str, float]:
-    """Start a studio on a small field and capture, send it `INPUTS` requests, and return the counts of `fuzz`.
-
-    And how many tracebacks it printed, and its largest memory in MiB (NaN where the system does not say).
-    """
-    with tempfile.TemporaryDirectory() as name:
-        home = Path(name)
-        path = write_object(home / "object")
-        words = "import sys; from avmsf.cli import main; sys.exit(main())"
-        command = [sys.executable, "-c", words, "studio", str(path), "--no-browser", "--port", "0"]
-        with open(home / "said", "w") as said:
-            process = subprocess.Popen([*command, "--capture", str(path.parent)], stderr=said)
-        try:
-            port, token = _address(home / "said", process)
-            counts = fuzz(
-                lambda request: _ask(port, token, request), count=QUICK_INPUTS if quick_look else INPUTS, seed=seed
-            )
-            memory = _peak_memory(process.pid)
-        finally:
-            process.send_signal(signal.SIGTERM)
-            process.wait(60)
-        tracebacks = (home / "said").read_text(errors="replace").count("Traceback (most recent call last)")
-    return {**counts, "tracebacks": float(tracebacks), "worst_mebibytes": memory}
-
-
 def write_object(folder: Path) -> Path:
     """Write a capture folder of three strikes and a field of five modes into it, and return the field's file."""
     folder.mkdir(parents=True)
@@ -257,34 +196,3 @@ def write_object(folder: Path) -> Path:
     (folder / "impacts.csv").write_text("\n".join([*rows, ""]))
     save(made, folder / "plate.safetensors")
     return folder / "plate.safetensors"
-
-
-def _ask(port: int, token: str, request: Request) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
-    try:
-        path = quote(request.path, safe="/%?=&")
-        headers = {name: quote(value) for name, value in request.headers.items()}
-        connection.request(request.method, f"/{token}/{path}", request.body, headers)
-        answer = connection.getresponse()
-        return answer.status, answer.read()
-    finally:
-        connection.close()
-
-
-def _address(said: Path, process: "subprocess.Popen[bytes]") -> tuple[int, str]:
-    """Return the port and the secret of a studio once it answers."""
-    for _ in range(1200):
-        found = re.search(r"http://127\.0\.0\.1:(\d+)/([\w-]{32})/", text := said.read_text())
-        if found is not None:
-            return int(found[1]), found[2]
-        if process.poll() is not None:
-            raise RuntimeError(f"the studio did not start: {text}")
-        time.sleep(0.1)
-    raise RuntimeError(f"the studio did not start within 120 s: {text}")
-
-
-def _peak_memory(process: int) -> float:
-    path = Path(f"/proc/{process}/status")
-    if not path.is_file():
-        return math.nan
-    return int(re.findall(r"VmHWM:\s*(\d+) kB", path.read_text())[0]) / 1024

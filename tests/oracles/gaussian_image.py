@@ -1,9 +1,6 @@
-"""Rasterizers in plain torch, their gradients by autograd: one to be right, one to be as fast as torch alone is.
+"""The image of Gaussians in plain torch, gradients by autograd: every Gaussian at every pixel, in any precision.
 
-Both are written from the definitions of 3D Gaussian Splatting (Kerbl et al. 2023) and share no line with the package's.
-`render_everywhere` puts every Gaussian at every pixel, in whatever precision the cloud comes in: the oracle.
-`render_padded` lists Gaussians tile by tile, pads the lists to one length and treats all tiles at once, as renderers in
-plain torch do.
+Written from the definitions of 3D Gaussian Splatting (Kerbl et al. 2023); it shares no line with the package's.
 """
 
 import math
@@ -121,75 +118,6 @@ def _coverage(seen: Splats, pixels: Float[Tensor, "pixels 2"]) -> Float[Tensor, 
     offsets = pixels[None] - seen.screen[:, None]
     squared = torch.einsum("npi,nij,npj->np", offsets, torch.linalg.inv(seen.covariances), offsets)
     return (seen.opacities[:, None] * torch.exp(-squared / 2)).clamp(max=_OPAQUE)
-
-
-def render_padded(
-    cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"], side: int = 16
-) -> Rendering:
-    """Return what the camera sees, all tiles of `side` pixels at once, their lists padded to the longest of them."""
-    every = splats(cloud, camera)
-    with torch.no_grad():
-        rows, tiles, radii = _touched(every, camera, side)
-        across, down = math.ceil(camera.width / side), math.ceil(camera.height / side)
-        counts = torch.bincount(tiles, minlength=across * down)
-        busy = torch.nonzero(counts).flatten()
-        rank = torch.arange(len(rows)) - (counts.cumsum(0) - counts)[tiles]
-        place = torch.zeros_like(counts)
-        place[busy] = torch.arange(len(busy))
-        # The row after the last stands for nothing: its opacity is zero.
-        lists = torch.full((len(busy), int(counts.max())), len(every.depths))
-        lists[place[tiles], rank] = rows
-        one = torch.arange(side) + 0.5
-        within = torch.stack(torch.meshgrid(one, one, indexing="ij")[::-1], -1).reshape(1, -1, 2)
-        pixels = within + side * torch.stack([busy % across, busy // across], 1)[:, None]
-    conics = torch.linalg.inv(every.covariances)
-    numbers = [
-        every.screen,
-        conics[:, 0],
-        conics[:, 1, 1:],
-        every.opacities[:, None],
-        every.colors,
-        every.depths[:, None],
-    ]
-    packed = torch.nn.functional.pad(torch.cat(numbers, 1), (0, 0, 0, 1))[lists]
-    x = pixels[:, None, :, 0] - packed[..., 0, None]
-    y = pixels[:, None, :, 1] - packed[..., 1, None]
-    exponent = packed[..., 2, None] * x * x + 2 * packed[..., 3, None] * x * y + packed[..., 4, None] * y * y
-    covered = (packed[..., 5, None] * torch.exp(-exponent / 2)).clamp(max=_OPAQUE)
-    covered = torch.where(covered >= _FAINTEST, covered, 0.0)
-    left = torch.cumprod(1 - covered, 1)
-    goes_on = left > _LEAST
-    weights = covered * torch.nn.functional.pad(left[:, :-1], (0, 0, 1, 0), value=1.0) * goes_on
-    sums = weights.mT @ packed[..., 6:]
-    rest = torch.where(goes_on, left, 1.0).amin(1)
-    blended = torch.cat([sums[..., :3] + rest[..., None] * background, 1 - rest[..., None], sums[..., 3:]], -1)
-    image = torch.cat([background, background.new_zeros(2)]).repeat(across * down, side * side, 1)
-    image = image.index_copy(0, busy, blended).reshape(down, across, side, side, 5).transpose(1, 2)
-    image = image.reshape(down * side, across * side, 5)[: camera.height, : camera.width]
-    alpha = image[..., 3]
-    depth = torch.where(alpha > 0, image[..., 4] / alpha.clamp(min=1e-10), 0.0)
-    return Rendering(image[..., :3], alpha, depth, every.screen, radii)
-
-
-def _touched(
-    every: Splats, camera: Camera, side: int
-) -> tuple[Int[Tensor, " pairs"], Int[Tensor, " pairs"], Float[Tensor, " points"]]:
-    """Return pairs of Gaussian and tile whose rectangles meet, by tile and then by depth, and the Gaussians' reach."""
-    reach = (2 * torch.log((every.opacities / _FAINTEST).clamp(min=1.0))).sqrt()
-    extent = reach[:, None] * torch.diagonal(every.covariances, dim1=1, dim2=2).sqrt()
-    limits = torch.tensor([math.ceil(camera.width / side), math.ceil(camera.height / side)])
-    first = ((every.screen - extent) / side).floor().clamp(min=0).long()
-    last = torch.minimum(((every.screen + extent) / side).floor().clamp(min=-1).long(), limits - 1)
-    sizes = (last - first + 1).clamp(min=0) * (reach > 0)[:, None]
-    numbers = sizes.prod(1)
-    order = torch.argsort(every.depths, stable=True)
-    rows = torch.repeat_interleave(order, numbers[order])
-    passed = torch.repeat_interleave(numbers[order].cumsum(0) - numbers[order], numbers[order])
-    rank = torch.arange(len(rows)) - passed
-    column = first[rows, 0] + rank % sizes[rows, 0]
-    row = first[rows, 1] + rank // sizes[rows, 0]
-    tiles, sorting = torch.sort(row * limits[0] + column, stable=True)
-    return rows[sorting], tiles, extent.amax(1) * (numbers > 0)
 
 
 def _matrices(rotations: Float[Tensor, "points 4"]) -> Float[Tensor, "points 3 3"]:

@@ -14,7 +14,7 @@ import soundfile
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
-from benchmarks.robustness.seeds import RATE
+from tests.factories.valid_files import RATE
 
 Bomb = Callable[[Path], tuple[str, Path]]
 

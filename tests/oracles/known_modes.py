@@ -2,17 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from scipy.optimize import linear_sum_assignment
-from torch import Tensor
 
 from avmsf.capture import Impacts
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import measure_quality
-from benchmarks.material import shared_data
 
 AIRCRAFT = (18.85, 40.14, 87.81, 89.63, 97.07, 105.18, 117.99, 125.57, 125.96, 130.0, 135.3, 143.3, 166.23)
 """The modes of `aircraft_response` between 18.8 and 166 Hz, Hz. The published analysis gives their number and range
@@ -29,12 +27,12 @@ LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class ModeCount:
-    """Modes found in recordings beside those that the object is known to have."""
+    """Modes found in recordings, compared with those that the object is known to have."""
 
     found: int
     """Known modes that are found."""
     extra: int
-    """Modes found besides, in the known ones' range."""
+    """Other modes in the known ones' range."""
 
 
 def count_modes(
@@ -47,17 +45,6 @@ def count_modes(
     """
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
     frequency, share = extraction.bank.frequency[quality.is_mode], quality.energy_share[quality.is_mode]
-    return match_modes(frequency, share, known, least_share=least_share)
-
-
-def match_modes(
-    frequency: Float64[Tensor, " modes"],
-    share: Float64[Tensor, " modes"],
-    known: Sequence[float],
-    *,
-    least_share: float = 0.0,
-) -> ModeCount:
-    """Return what `count_modes` does, of modes with these frequencies (Hz) and parts of the energy."""
     truth = np.asarray(known)
     distance = np.abs(frequency.numpy()[:, None] / truth[None, :] - 1)
     # What is too far counts as just too far, so that it never takes a nearer partner from another.
@@ -69,7 +56,7 @@ def match_modes(
     return ModeCount(len(rows), int((other & inside & (share >= least_share)).sum()))
 
 
-def tree_frequencies() -> list[float]:
-    """Return the 24 frequencies of `tree43`, Hz."""
-    with np.load(shared_data() / "tree43" / "truth.npz") as truth:
+def tree_frequencies(data: Path) -> list[float]:
+    """Return the 24 frequencies of `tree43` in a folder of measured data, Hz."""
+    with np.load(data / "tree43" / "truth.npz") as truth:
         return [float(each) for each in truth["frequency"]]

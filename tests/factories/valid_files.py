@@ -1,4 +1,4 @@
-"""Small valid files of every kind that the package reads, for `files` to damage: all within one folder, in a second."""
+"""Small valid files of every kind that the package reads, to be damaged: all within one folder, in a second."""
 
 import json
 import math
