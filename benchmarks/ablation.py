@@ -37,39 +37,21 @@ from tests.oracles.block import block
 from tests.oracles.known_gains import known_gains
 
 DEFAULT = "default"
-_ALONE = tuple(f"{kind} alone" for kind in FAMILIES)
-_LESS_KNOWN = ("positions alone", "positions and symmetry", "noisy mesh")
-"""Variants that know less of the object: not settings among which one would choose."""
 
 
 def ablation(settings: Settings) -> Iterator[Record]:
     """Errors without each part of the default model, or with what was dropped; one split of each object.
 
-    over the default: geometric mean of the ratios. half: the setting that is best on one half of the cases, there and
-    on the other half; a case where a setting is no different, such as updating without a body, counts as the default.
+    over the default: geometric mean of the ratios.
     """
     found: dict[str, dict[str, float]] = defaultdict(dict)
     for name, case in _ablated(settings):
         for variant, error in _variants(case, settings):
             found[variant][name] = error
             yield from records({"error": error}, group=variant, object=name)
-    logs = {
-        variant: {name: float(np.log(error / found[DEFAULT][name])) for name, error in errors.items()}
-        for variant, errors in found.items()
-    }
-    for variant, each in logs.items():
-        yield from records({"over the default": float(np.exp(np.mean(list(each.values()))))}, group=variant)
-    choices = [each for each in logs if each not in (*_ALONE, *_LESS_KNOWN)]
-    cases = list(found[DEFAULT])
-
-    def ratio(variant: str, names: list[str]) -> float:
-        return float(np.exp(np.mean([logs[variant].get(name, 0.0) for name in names]))) if names else float("nan")
-
-    for number in range(2):
-        chosen_on, others = cases[number::2], cases[1 - number :: 2]
-        best = min(choices, key=lambda variant: ratio(variant, chosen_on))
-        ratios = {"chosen on": ratio(best, chosen_on), "the others": ratio(best, others)}
-        yield from records(ratios, group=f"half {number + 1}", note=f"{best}, chosen on {', '.join(chosen_on)}")
+    for variant, errors in found.items():
+        ratios = [error / found[DEFAULT][name] for name, error in errors.items()]
+        yield from records({"over the default": float(np.exp(np.log(ratios).mean()))}, group=variant)
 
 
 def _ablated(settings: Settings) -> Iterator[tuple[str, SplitCase]]:
@@ -97,10 +79,10 @@ def _variants(case: SplitCase, settings: Settings) -> Iterator[tuple[str, float]
     yield "no spread within hypotheses", case.error(less)
     if case.bodies is not None:
         yield "no updating", case.error(case.fit(MixtureEstimator(bodies=case.bodies, update=False)))
-    for kind, label in zip(FAMILIES, _ALONE, strict=True):
+    for kind in FAMILIES:
         if (kind != Symmetric.kind or case.symmetries) and (kind != Elastic.kind or case.bodies):
             alone = MixtureEstimator((kind,), bodies=case.bodies, symmetries=case.symmetries)
-            yield label, case.error(case.fit(alone, quick=True))
+            yield f"{kind} alone", case.error(case.fit(alone, quick=True))
     yield "positions alone", case.error(case.fit(MixtureEstimator((Smooth.kind, ThinPlate.kind))))
     yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries)))
     if case.surface is not None:

@@ -1,6 +1,6 @@
 """Small files that unfold to large ones or claim to be: each once took seconds to minutes, gigabytes, or a traceback.
 
-Each bomb puts one file into a copy of the seeds and returns the family that reads it, and its path.
+Each bomb puts one file into a copy of the valid files and returns the family that reads it, and its path.
 """
 
 import json
@@ -19,18 +19,27 @@ from tests.factories.valid_files import RATE
 Bomb = Callable[[Path], tuple[str, Path]]
 
 
-def _sound(samples: np.ndarray) -> Bomb:
+def _file(family: str, name: str, content: Callable[[], str | bytes]) -> Bomb:
+    """Return a bomb that writes one file."""
+
     def put(folder: Path) -> tuple[str, Path]:
-        soundfile.write(folder / "capture" / "1.wav", samples, RATE, subtype="DOUBLE")
-        return "wav", folder / "capture" / "1.wav"
+        made = content()
+        (folder / name).write_bytes(made.encode() if isinstance(made, str) else made)
+        return family, folder / name
 
     return put
 
 
-def _click(height: float = 1.0) -> np.ndarray:
-    samples = np.zeros(RATE)
-    samples[0] = height
-    return samples
+def _click(height: float) -> Bomb:
+    """Return a second of digital silence after one sample."""
+
+    def put(folder: Path) -> tuple[str, Path]:
+        samples = np.zeros(RATE)
+        samples[0] = height
+        soundfile.write(folder / "capture" / "1.wav", samples, RATE, subtype="DOUBLE")
+        return "wav", folder / "capture" / "1.wav"
+
+    return put
 
 
 def _compressed_sound(folder: Path) -> tuple[str, Path]:
@@ -51,99 +60,66 @@ def _misspelt_rows(folder: Path) -> tuple[str, Path]:
     return "csv", path
 
 
-def _many_rows(folder: Path) -> tuple[str, Path]:
-    path = folder / "capture" / "impacts.csv"
-    path.write_text("file,x,y,z\n" + "".join(f"{number}.wav,{number / 1e7},0,0\n" for number in range(300_000)))
-    return "csv", path
+def _many_rows() -> str:
+    return "file,x,y,z\n" + "".join(f"{number}.wav,{number / 1e7},0,0\n" for number in range(300_000))
 
 
-def _nested(name: str, family: str, text: str) -> Bomb:
-    def put(folder: Path) -> tuple[str, Path]:
-        (folder / name).write_text(text)
-        return family, folder / name
+def _frames(names: Callable[[], list[str]]) -> Bomb:
+    """Return a record of cameras with so many pictures."""
 
-    return put
-
-
-def _frames(count: int, *, equal: bool) -> Bomb:
     def put(folder: Path) -> tuple[str, Path]:
         path = folder / "transforms" / "transforms.json"
         record = json.loads(path.read_text())
         first = record["frames"][0]
-        names = ["images/0.png" if equal else f"images/none_{number}.png" for number in range(count)]
-        path.write_text(json.dumps(record | {"frames": [first | {"file_path": name} for name in names]}))
+        path.write_text(json.dumps(record | {"frames": [first | {"file_path": name} for name in names()]}))
         return "transforms", path
 
     return put
 
 
-def _picture(name: str, side: int) -> Bomb:
+def _picture() -> bytes:
     """Return a square PNG of one bit a pixel, all black."""
+    side = 30_016
 
-    def put(folder: Path) -> tuple[str, Path]:
-        def chunk(kind: bytes, data: bytes) -> bytes:
-            return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-        packer = zlib.compressobj(9)
-        row = bytes(1 + (side + 7) // 8)
-        data = b"".join(packer.compress(row) for _ in range(side)) + packer.flush()
-        header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0))
-        path = folder / "transforms" / name
-        path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", data) + chunk(b"IEND", b""))
-        return "pictures", path
-
-    return put
+    packer = zlib.compressobj(9)
+    row = bytes(1 + (side + 7) // 8)
+    data = b"".join(packer.compress(row) for _ in range(side)) + packer.flush()
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-def _surface(suffix: str, content: Callable[[], bytes]) -> Bomb:
-    def put(folder: Path) -> tuple[str, Path]:
-        (folder / f"surface{suffix}").write_bytes(content())
-        return suffix[1:], folder / f"surface{suffix}"
-
-    return put
-
-
-def _glb(record: dict[str, object], binary: bytes = bytes(64)) -> bytes:
-    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, **record}).encode()
+def _glb(nodes: int, accessor: dict[str, object], binary: bytes) -> bytes:
+    """Return a container with so many nodes of one mesh, whose positions are the accessor's."""
+    record = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(nodes))}],
+        "nodes": [{"mesh": 0, "name": f"n{number}"} for number in range(nodes)],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
+        "accessors": [{"componentType": 5126, "type": "VEC3", **accessor}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(binary)}],
+        "buffers": [{"byteLength": len(binary)}],
+    }
+    text = json.dumps(record).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def _many_nodes() -> bytes:
-    corners = np.eye(3, dtype="<f4").tobytes()
-    accessor = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
-    return _glb(
-        {
-            "scenes": [{"nodes": list(range(20_000))}],
-            "nodes": [{"mesh": 0, "name": f"n{number}"} for number in range(20_000)],
-            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
-            "accessors": [accessor],
-            "bufferViews": [{"buffer": 0, "byteLength": len(corners)}],
-            "buffers": [{"byteLength": len(corners)}],
-        },
-        corners,
-    )
+    return _glb(20_000, {"bufferView": 0, "count": 3}, np.eye(3, dtype="<f4").tobytes())
 
 
-def _empty_accessor() -> bytes:
-    return _glb(
-        {
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
-            "accessors": [{"componentType": 5126, "count": 100_000_000, "type": "VEC3"}],
-            "buffers": [{"byteLength": 64}],
-        }
-    )
-
-
-def _wrong_index(index: int) -> Callable[[], bytes]:
-    return lambda: (
+def _wrong_index(index: int) -> Bomb:
+    text = (
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
         "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
         f"0 0 0\n0.1 0 0\n0 0.1 0\n3 0 1 2\n3 0 1 {index}\n"
-    ).encode()
+    )
+    return _file("ply", "surface.ply", lambda: text)
 
 
 def _field(name: str, value: float) -> Bomb:
@@ -164,26 +140,25 @@ def _field(name: str, value: float) -> Bomb:
     return put
 
 
-_TOML = "a = " + "[" * 3000 + "]" * 3000
 BOMBS: dict[str, Bomb] = {
-    "click, then digital silence": _sound(_click()),
-    "peak of 1e200": _sound(_click(1e200)),
-    "peak of 1e-300": _sound(_click(1e-300)),
-    "peak of 1e40": _sound(_click(1e40)),
+    "click, then digital silence": _click(1.0),
+    "peak of 1e200": _click(1e200),
+    "peak of 1e-300": _click(1e-300),
+    "peak of 1e40": _click(1e40),
     "two hours of 8 channels in a megabyte": _compressed_sound,
     "8000 misspelt names among 1000 files": _misspelt_rows,
-    "300,000 rows": _many_rows,
-    "TOML 3000 levels deep": _nested("capture/capture.toml", "toml", _TOML),
-    "TOML with a key of 60,000 parts": _nested("capture/capture.toml", "toml", ".".join("a" * 60_000) + " = 1"),
-    "JSON 100,000 levels deep": _nested("transforms/transforms.json", "transforms", "[" * 100_000),
-    "40,000 missing frames": _frames(40_000, equal=False),
-    "100,000 equal frames": _frames(100_000, equal=True),
-    "picture of 30016 x 30016": _picture("images/0.png", 30_016),
-    "mask of 30016 x 30016": _picture("masks/0.png", 30_016),
-    "glb with 20,000 nodes": _surface(".glb", _many_nodes),
-    "glb accessor of 1e8 without data": _surface(".glb", _empty_accessor),
-    "ply face beyond its vertices": _surface(".ply", _wrong_index(99)),
-    "ply face of a negative vertex": _surface(".ply", _wrong_index(-9)),
+    "300,000 rows": _file("csv", "capture/impacts.csv", _many_rows),
+    "TOML 3000 levels deep": _file("toml", "capture/capture.toml", lambda: "a = " + "[" * 3000 + "]" * 3000),
+    "TOML with a key of 60,000 parts": _file("toml", "capture/capture.toml", lambda: ".".join("a" * 60_000) + " = 1"),
+    "JSON 100,000 levels deep": _file("transforms", "transforms/transforms.json", lambda: "[" * 100_000),
+    "40,000 missing frames": _frames(lambda: [f"images/none_{number}.png" for number in range(40_000)]),
+    "100,000 equal frames": _frames(lambda: ["images/0.png"] * 100_000),
+    "picture of 30016 x 30016": _file("pictures", "transforms/images/0.png", _picture),
+    "mask of 30016 x 30016": _file("pictures", "transforms/masks/0.png", _picture),
+    "glb with 20,000 nodes": _file("glb", "surface.glb", _many_nodes),
+    "glb accessor of 1e8 without data": _file("glb", "surface.glb", lambda: _glb(1, {"count": 10**8}, bytes(64))),
+    "ply face beyond its vertices": _wrong_index(99),
+    "ply face of a negative vertex": _wrong_index(-9),
     "field metadata 100,000 levels deep": _field("nested", 0),
     "field of 1e9 samples": _field("samples", 10**9),
     "field of 1e12 samples": _field("samples", 10**12),

@@ -1,15 +1,13 @@
-"""Evaluation of material edits: the paper's protocol, its baselines, and one without prompts (supplement).
+"""Methods that edit an object's material, towards a prompt or recordings, and their scores (supplement).
 
-An object of one material is edited towards another, by a prompt or by recordings of objects of that material. Scores
-are the distance of its modes from those of labelled objects (`benchmarks.mode_embedding`), of its sounds from the
-reference's, and, for prompts, the CLAP score; they are compared with those of the unedited object.
+Scores are the distance of the modes from those of labelled objects (`benchmarks.mode_embedding`), of the sounds from
+the reference's, and, for prompts, the CLAP score; they are compared with those of the unedited object.
 """
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -38,11 +36,10 @@ from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError, AvmsfWarning, EvaluationError
 from avmsf.evaluation.clap import Clap
 from avmsf.evaluation.metrics import relative_stft_error
-from avmsf.evaluation.results import write_json
 from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_sounds
-from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
+from avmsf.modal.extraction.finders import HighResolution, ShortTime
 from avmsf.modal.modes import ModalBank
 from benchmarks.editing_objects import KnownObject, audible_modes
 from benchmarks.mode_embedding import MaterialSpace
@@ -63,17 +60,8 @@ PROMPTS: Mapping[str, tuple[str, str]] = {
     "ceramic": ("a single tap on a ceramic cup, a short bright clink", "a porcelain bowl is struck once with a stick"),
 }
 """Two prompts for each target material. The paper has two a transition and prints none: these are ours."""
-
-
 Transition = tuple[str, str]
 """From one material to another."""
-RECORDED_TRANSITIONS: tuple[Transition, ...] = (
-    ("ceramic", "wood"),
-    ("wood", "ceramic"),
-    ("wood", "glass"),
-    ("glass", "metal"),
-)
-"""Contrasting pairs for the 26 objects. The paper shows the first two and calls the others contrastive: ours."""
 _Goal = TypeVar("_Goal")
 
 
@@ -95,13 +83,12 @@ class EditTask:
         """Contacts of the rendered sounds."""
         return self.object.impacts.contacts[:_MAX_STORED_SOUNDS]
 
-    def expect(self, goal: _Goal | None, name: str) -> _Goal:
-        """Return the task's prompt or reference. Raises EvaluationError where it has none."""
-        if goal is None:
-            raise EvaluationError.expected(
-                f"one for {self.object.name} to {self.target}", name=name, advice="give the task one"
-            )
-        return goal
+
+def _expect(goal: _Goal | None, name: str) -> _Goal:
+    """Return a task's prompt or reference. Raises EvaluationError where it has none."""
+    if goal is None:
+        raise EvaluationError.expected("one for each task", name=name, advice="give the task one")
+    return goal
 
 
 def prompted_tasks(
@@ -187,39 +174,32 @@ GENERATED = 3.0
 """Seconds of a sound that is generated from a prompt only."""
 
 
-def generation(model: StableAudio, seconds: float = GENERATED, finder: ModeFinder | None = None) -> EditMethod:
-    """Return direct generation (the paper's baseline): no object at all, and the modes found in what is made.
-
-    Sounds are taken from their onset on. Raises as preparing and extracting do.
-    """
+def generation(model: StableAudio, seconds: float = GENERATED, *, paper: bool = False) -> EditMethod:
+    """Return direct generation (the paper's baseline): no object at all, and the modes found from the onset on."""
 
     def edit(task: EditTask) -> Edited:
-        rate, prompt = model.sample_rate, task.expect(task.prompt, "prompt")
+        rate, prompt = model.sample_rate, _expect(task.prompt, "prompt")
         made = model.generate(prompt, seconds=seconds, seed=task.seed).double().cpu()
         recording = Recording(f"generated from {prompt!r}", made[None].numpy(), rate, "FLOAT")
         sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))[None]
-        modes = extract_sounds(sound, sample_rate=rate, method=finder or HighResolution())
+        modes = extract_sounds(sound, sample_rate=rate, method=ShortTime() if paper else HighResolution())
         return Edited(audible_modes(modes.bank, modes.gains.abs()), sound.float(), rate)
 
     return EditMethod("generation", edit)
 
 
 def towards_reference(settings: Mapping[str, Any] | None = None, *, paper: bool = False) -> tuple[EditMethod, ...]:
-    """Return the methods of the protocol without words.
-
-    As it was; every mode by itself; ours, or the `paper`'s parameters; and the laws of elasticity.
-    """
-    parameters = PUBLISHED if paper else HIERARCHICAL
+    """Return the methods without words: before, every mode by itself, ours or the `paper`'s parameters, and physics."""
 
     def guide(task: EditTask) -> Guide:
-        return task.expect(task.reference, "reference")
+        return _expect(task.reference, "reference")
 
-    return (
-        UNTOUCHED,
+    parameters = PUBLISHED if paper else HIERARCHICAL
+    single, ours = (
         guided("unconstrained", guide, INDEPENDENT, settings),
         guided(parameters.name, guide, parameters, settings),
-        PHYSICS,
     )
+    return UNTOUCHED, single, ours, PHYSICS
 
 
 def towards_words(
@@ -230,23 +210,19 @@ def towards_words(
     generated: float = GENERATED,
     paper: bool = False,
 ) -> tuple[EditMethod, ...]:
-    """Return the methods of the paper's table: as it was, generation, Audio-SDS, and ours.
+    """Return the methods of the paper's table: before, generation, Audio-SDS, and ours.
 
-    `settings` are those of `GuidedEditConfig`; `generated` is how many seconds direct generation makes. The `paper`'s
-    form has its parameters of an edit, and its extraction from generated sounds.
+    `generated` is how many seconds direct generation makes. The `paper`'s form has its parameters of an edit, and its
+    extraction from generated sounds.
     """
-    parameters = PUBLISHED if paper else HIERARCHICAL
 
     def guide(task: EditTask) -> Guide:
         rate = task.object.sound_field.sample_rate
-        return DecoderDistillation(model, task.expect(task.prompt, "prompt"), sample_rate=rate, config=distillation)
+        return DecoderDistillation(model, _expect(task.prompt, "prompt"), sample_rate=rate, config=distillation)
 
-    return (
-        UNTOUCHED,
-        generation(model, generated, ShortTime() if paper else None),
-        guided("audio-sds", guide, INDEPENDENT, settings),
-        guided(parameters.name, guide, parameters, settings),
-    )
+    parameters = PUBLISHED if paper else HIERARCHICAL
+    direct, single = generation(model, generated, paper=paper), guided("audio-sds", guide, INDEPENDENT, settings)
+    return UNTOUCHED, direct, single, guided(parameters.name, guide, parameters, settings)
 
 
 @dataclass(frozen=True)
@@ -270,7 +246,7 @@ class EditScore:
     clap: float | None = None
     """Mean cosine of the sounds and the prompt."""
     clap_curve: tuple[tuple[int, float], ...] = ()
-    """Steps of the edit and the CLAP score after each, at one contact; step 0 is the unedited object."""
+    """The same after some steps, at one contact; step 0 is the unedited object."""
 
 
 def score_edits(
@@ -279,14 +255,12 @@ def score_edits(
     spaces: Mapping[str, MaterialSpace],
     *,
     clap: Clap | None = None,
-    progress: Callable[[EditScore], None] | None = None,
-) -> tuple[EditScore, ...]:
-    """Return every method's scores in every task. The time of fitting an object's field does not count.
+) -> Iterator[EditScore]:
+    """Yield every method's scores in every task. The time of fitting an object's field does not count.
 
     A sound without an impact or without modes, and a method that fails, have no score, and a warning says so: a
     generative model may return anything.
     """
-    scores = []
     for task in tasks:
         _ = task.object.sound_field
         for method in methods:
@@ -298,13 +272,11 @@ def score_edits(
                 attributes = {**error.attributes, "name": name}
                 warnings.warn(AvmsfWarning(f"{name}: no score, since {error}", **attributes), stacklevel=2)
                 continue
-            scores.append(_score(task, method.name, made, spaces, time.perf_counter() - begun))
+            score = _score(task, method.name, made, spaces, time.perf_counter() - begun)
             if clap is not None and task.prompt is not None:
                 cosine = float(clap.score(made.sounds, [task.prompt], sample_rate=made.sample_rate).mean())
-                scores[-1] = replace(scores[-1], clap=cosine, clap_curve=_clap_curve(made, task.prompt, clap))
-            if progress is not None:
-                progress(scores[-1])
-    return tuple(scores)
+                score = replace(score, clap=cosine, clap_curve=_clap_curve(made, task.prompt, clap))
+            yield score
 
 
 def _score(task: EditTask, method: str, made: Edited, spaces: Mapping[str, MaterialSpace], seconds: float) -> EditScore:
@@ -330,12 +302,6 @@ def _clap_curve(made: Edited, prompt: str, clap: Clap) -> tuple[tuple[int, float
         return ()
     scores = clap.score(torch.stack([sound for _, sound in previews]), [prompt], sample_rate=made.sample_rate)
     return tuple((step, float(score)) for (step, _), score in zip(previews, scores, strict=True))
-
-
-def write_scores(scores: Sequence[EditScore], spaces: Mapping[str, MaterialSpace], path: Path) -> None:
-    """Write scores and the embeddings that they rest on to one JSON file. Raises EvaluationError where it cannot."""
-    found = {"scores": [asdict(score) for score in scores]}
-    write_json(path, {**found, "spaces": {name: space.record() for name, space in spaces.items()}})
 
 
 def spectral_distance(made: Edited, reference: Reference) -> float:

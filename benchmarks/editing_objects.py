@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -33,9 +32,7 @@ _METAL = ("17_IronSkillet", "43_IronMortar", "67_IronPlate", "86_MetalHoledSpoon
 _PLASTIC = ("48_PlasticBowl", "49_PlasticBowl", "50_PlasticBowl", "97_PlasticScoop")
 _GLASS = ("94_GlassGoblet",)
 _LISTED = {"ceramic": _CERAMIC, "wood": _WOOD, "metal": _METAL, "plastic": _PLASTIC, "glass": _GLASS}
-REALIMPACT_26: Mapping[str, str] = MappingProxyType(
-    {name: material for material, names in _LISTED.items() for name in names}
-)
+REALIMPACT_26: Mapping[str, str] = {name: material for material, names in _LISTED.items() for name in names}
 """Materials of 26 objects of RealImpact by their names. The paper evaluates on 26 and names none: the choice is ours.
 
 Those whose name contains the material, the first seven of each by number, iron and metal as one, without
@@ -92,9 +89,8 @@ class KnownObject:
 def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = math.inf) -> ModalBank:
     """Return the modes below half the sample rate (Hz) that are within 60 dB of the loudest, in energy.
 
-    `amplitudes` [contacts, modes] are complex or real; a mode's energy is their mean square over 4 d. A mode that an
-    edit has silenced or moved out of the band says nothing about a material. Raises EvaluationError where none is
-    audible.
+    `amplitudes` [contacts, modes] are complex or real; a mode's energy is their mean square over 4 d. Raises
+    EvaluationError where none is audible.
     """
     energy = amplitudes.abs().double().square().mean(dim=0) / (4.0 * bank.damping)
     energy = torch.where(bank.frequency < 0.5 * sample_rate, energy, 0.0)

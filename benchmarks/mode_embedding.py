@@ -2,13 +2,8 @@
 
 The points are labelled objects' sets of modes, embedded by UMAP (umap-learn, extra `eval`); an edited object is placed
 among them, and its score is the distance to the mean of the points of its target material, in the embedding's units,
-lower is better. The paper gives neither UMAP's settings nor how a set becomes a vector, so
-that its values and these cannot be compared.
-
-UMAP always places a new point near known points, however far away it is.
-
-Here a set of any size becomes a vector whose Euclidean length is in octaves: a set with all frequencies doubled lies at
-a distance of 1 from the one it was made of. The order of the modes does not matter, and neither does their number.
+lower is better. The paper gives neither UMAP's settings nor how a set becomes a vector: its values and these cannot be
+compared. UMAP places a new point near known points, however far away it is.
 """
 
 import math

@@ -22,7 +22,6 @@ from avmsf.simulate.simulation import simulate_object
 from benchmarks.objects import SplitCase, bodies_of, features_of, surface_of
 from benchmarks.processes import apart, peak_gigabytes, processor_seconds, timed
 from benchmarks.records import Measurement, Record, Settings, means, records
-from benchmarks.scans import scans
 
 COSTED = "skillet-iron"
 COSTED_SIZE, COSTED_MODES = 0.5, 170
@@ -115,4 +114,4 @@ def _frequencies(settings: Settings) -> Iterator[Record]:
     yield from records({"frequency_error": max(row["largest"] for row in rows)}, group="worst")
 
 
-PARTS: dict[str, Measurement] = {"cost": _cost, "coverage": _coverage, "frequencies": _frequencies, "scans": scans}
+PARTS: dict[str, Measurement] = {"cost": _cost, "coverage": _coverage, "frequencies": _frequencies}

@@ -1,7 +1,6 @@
 """What the exports weigh and how near their own readers come to the field."""
 
 import json
-import math
 import shutil
 import struct
 import subprocess
@@ -22,6 +21,7 @@ from avmsf.export.samples import write_grid
 from avmsf.export.uff import write_universal
 from benchmarks.processes import processor_seconds
 from benchmarks.records import REPOSITORY, Record, Settings, records
+from tests.factories.demo_layout import read_arrays
 
 DRIVER = REPOSITORY / "tests" / "export" / "faust_driver.c"
 _MODES, _RATE = 128, 44100.0
@@ -115,16 +115,8 @@ def _gltf_sounds(path: Path, field: SampledField, rows: torch.Tensor) -> Array:
 
 def _demo_sounds(folder: Path, field: SampledField, rows: torch.Tensor) -> Array:
     """Return what the demo's player makes of the folder: cosines, by offsets and counts alone."""
-    sound = json.loads((folder / "original" / "manifest.json").read_text())
-    content = (folder / "original" / "modal.bin").read_bytes()
-
-    def numbers(name: str) -> Array:
-        array = sound["arrays"][name]
-        values = np.frombuffer(content, "<f4", math.prod(array["shape"]), array["offset"])
-        return values.reshape(array["shape"]).astype(np.float64)
-
-    gains = numbers("gains")[rows.numpy()]
-    return _summed(field, gains, numbers("frequencies"), numbers("dampings"), np.cos)
+    arrays = {name: array.double().numpy() for name, array in read_arrays(folder / "original").items()}
+    return _summed(field, arrays["gains"][rows.numpy()], arrays["frequencies"], arrays["dampings"], np.cos)
 
 
 def _faust(field: SampledField, folder: Path) -> dict[str, float]:
