@@ -41,11 +41,10 @@ def _diffsound(settings: Settings) -> Iterator[Record]:
         clips, curve = _clips(family, thickness, material)
         begun = processor_seconds()
         found = fit_material(clip_spectra(clips), curve, family)
-        walled = thickness is not None and found.thickness is not None
         rows.append(
             {
                 "stiffness_error": found.stiffness / (material.young / material.density) - 1.0,
-                "thickness_error": found.thickness / thickness - 1.0 if walled else math.nan,
+                "thickness_error": (found.thickness or math.nan) / (thickness or math.nan) - 1.0,
                 "poisson_error": found.poisson - material.poisson,
                 "bodies_seconds": bodies,
                 "seconds": processor_seconds() - begun,

@@ -231,7 +231,7 @@ def _propeller() -> trimesh.Trimesh:
         blades.append(trimesh.Trimesh(turned, blade.faces))
     shaft = trimesh.creation.cylinder(0.2, 1.0, sections=96)
     shaft.apply_translation((0.0, 0.0, 0.25))
-    return trimesh.util.concatenate([*blades, shaft])
+    return _joined([*blades, shaft])
 
 
 def _can() -> trimesh.Trimesh:
@@ -245,7 +245,7 @@ def _handled_can() -> trimesh.Trimesh:
     ring = trimesh.creation.torus(0.3, 0.06)
     upright = trimesh.Trimesh(ring.vertices[:, [0, 2, 1]] + np.array([0.55, 0.0, 0.0]), ring.faces)
     outside = np.hypot(*upright.triangles_center[:, :2].T) > 0.5
-    return trimesh.util.concatenate([_can(), trimesh.Trimesh(upright.vertices, upright.faces[outside])])
+    return _joined([_can(), trimesh.Trimesh(upright.vertices, upright.faces[outside])])
 
 
 def _bracket() -> trimesh.Trimesh:
@@ -253,7 +253,13 @@ def _bracket() -> trimesh.Trimesh:
     floor, wall, rib = (trimesh.creation.box(size) for size in ((1.0, 0.6, 0.1), (0.1, 0.6, 0.7), (0.4, 0.08, 0.3)))
     wall.apply_translation((-0.45, 0.0, 0.4))
     rib.apply_translation((-0.2, 0.15, 0.2))
-    return trimesh.util.concatenate([floor, wall, rib])
+    return _joined([floor, wall, rib])
+
+
+def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(parts)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
 
 
 _COORDINATES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))

@@ -14,7 +14,7 @@ from avmsf.errors import StudioError
 from avmsf.studio.opening import open_target
 from avmsf.studio.server import serve
 from avmsf.studio.session import Session
-from benchmarks.robustness.studio import Request, fuzz, write_object
+from factories.hostile_requests import Request, fuzz, write_object
 from factories.capture_folder import fill
 from factories.raising import raises
 from opened_plate import blow, open_plate, wav
