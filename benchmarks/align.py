@@ -160,7 +160,7 @@ def _jitter(settings: Settings) -> Iterator[Record]:
     plate = STRUCK.strikes(20 if settings.quick else 40, seconds=1.0)
     # The plate's files: silence before the impact, which begins at their last sample.
     silence = torch.zeros(len(plate), 2 * margin_length(plate.sample_rate))
-    body = BodyConfig(dofs=3000) if settings.quick else BodyConfig()
+    body = BodyConfig(dofs=5000) if settings.quick else BodyConfig()
     mug = MixtureEstimator(bodies=candidate_bodies(surface_of(capture), body, impacts=capture.impacts))
     flat = solid_estimator(slab(STRUCK.plate), settings)
     cases = {

@@ -196,7 +196,7 @@ def features_of(capture: Capture) -> FeatureField:
 
 def bodies_of(surface: Surface | ObjectShape, settings: Settings) -> CandidateBodies:
     """Return the bodies of unknown thickness behind a surface, coarse for a quick look."""
-    return candidate_bodies(surface, BodyConfig(shapes=12, dofs=3000) if settings.quick else BodyConfig())
+    return candidate_bodies(surface, BodyConfig(shapes=12, dofs=5000) if settings.quick else BodyConfig())
 
 
 def solid_estimator(surface: Surface, settings: Settings) -> MixtureEstimator:

@@ -14,8 +14,8 @@ from avmsf.errors import StudioError
 from avmsf.studio.opening import open_target
 from avmsf.studio.server import serve
 from avmsf.studio.session import Session
-from factories.hostile_requests import Request, fuzz, write_object
 from factories.capture_folder import fill
+from factories.hostile_requests import Request, fuzz, write_object
 from factories.raising import raises
 from opened_plate import blow, open_plate, wav
 from served import Answer, Served, served
