@@ -1,33 +1,9 @@
-"""Figures of edits: the places of objects, arrows and curves are read back from the figure."""
+"""Figures of edits: curves are read back from the figure."""
 
 import numpy as np
 import pytest
-from matplotlib.text import Annotation
 
 from avmsf.plotting.edits import draw_clap_curves
-from benchmarks.editingfigures import draw_embedding
-
-POINTS = np.array([[0.0, 0.0], [1.0, 0.0], [5.0, 5.0], [5.0, 7.0]])
-MATERIALS = ("wood", "wood", "glass", "glass")
-
-
-def test_objects_and_edits_are_drawn_at_their_places() -> None:
-    moves = {"ours": [((0.5, 0.0), (4.0, 4.0)), ((1.0, 1.0), (5.0, 6.5))], "other": [((0.5, 0.0), (0.0, 1.0))]}
-    figure = draw_embedding(POINTS, MATERIALS, moves, target="glass", title="wood to glass")
-    assert [axes.get_title() for axes in figure.axes] == ["ours", "other"]
-    for axes in figure.axes:
-        assert {each.get_label(): np.asarray(each.get_offsets()).tolist() for each in axes.collections} == {
-            "glass": POINTS[2:].tolist(),
-            "wood": POINTS[:2].tolist(),
-        }
-        changes = moves[axes.get_title()]
-        lines = {str(line.get_label()): np.asarray(line.get_xydata()).tolist() for line in axes.lines}
-        assert lines["before the edit"] == [list(before) for before, _ in changes]
-        assert lines["after the edit"] == [list(after) for _, after in changes]
-        # The UMAP distance is measured from here.
-        assert lines["mean of glass"] == [[5.0, 6.0]]
-        arrows = [text for text in axes.texts if isinstance(text, Annotation)]
-        assert [(each.xyann, each.xy) for each in arrows] == changes
 
 
 def test_curves_have_a_line_for_each_edit_and_the_mean_of_each_method() -> None:

@@ -102,12 +102,10 @@ def draw(folder: Path, before: _FieldAt, after: _FieldAt, last: dict[str, Any]) 
     pictures = {
         "modes.png": draw_edit(*levels, sample_rate=rate, title=f"modes of {name}, edited"),
         "spectrograms.png": draw_spectrograms(
-            *sounds[:, None],
+            {"": {"before": sounds[0], "after": sounds[1]}},
+            ("before", "after"),
             sample_rate=rate,
-            names=[""],
             title=f"an impact at {name}, edited",
-            columns=("before", "after"),
-            shared_scale=False,
         ),
     }
     if CLAP in last:

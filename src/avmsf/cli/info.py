@@ -140,11 +140,13 @@ def _draw_field(
     }
     if recorded is not None:
         chosen = recorded.take(farthest_points(recorded.contacts, min(_DRAWN_CONTACTS, len(recorded))).tolist())
+        sounds = field.render(chosen.contacts, directions=chosen.directions, samples=chosen.sounds.shape[1])
+        pairs = zip(chosen.names, chosen.sounds, sounds, strict=True)
         pictures["spectrograms"] = draw_spectrograms(
-            chosen.sounds,
-            field.render(chosen.contacts, directions=chosen.directions, samples=chosen.sounds.shape[1]),
+            {recording: {"recorded": one, "rendered": other} for recording, one, other in pairs},
+            ("recorded", "rendered"),
             sample_rate=field.sample_rate,
-            names=chosen.names,
+            normalize=False,
             title=f"{name}: recorded and rendered",
         )
     if has_posterior(field):

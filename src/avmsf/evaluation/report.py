@@ -21,7 +21,7 @@ from avmsf.evaluation.summary import missing_of, summarize, times_of
 from avmsf.export.web import report_directives, with_policy
 from avmsf.plotting.contacts import draw_contact
 from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.spectrograms import RANGE_DB, draw_method_spectrograms
+from avmsf.plotting.spectrograms import RANGE_DB, draw_spectrograms
 
 SUMMARY, TIMES, TABLES, PAGE = "summary.json", "times.json", "report.md", "report.html"
 """The files next to `protocol.json` and the folder `objects`."""
@@ -160,7 +160,7 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
             continue
         methods = list(dict.fromkeys(method for row in rows.values() for method in row))
         title = f"{record.identifier}: {label}"
-        figure = draw_method_spectrograms(
+        figure = draw_spectrograms(
             rows, methods, sample_rate=sound.sample_rate, highest=0.5 * record.sample_rate, title=title
         )
         name = record.identifier if len(labels) == 1 else f"{record.identifier} {file_word(label)}"

@@ -4,7 +4,7 @@ In go plain values of the other packages: tensors of sounds and points, `ModalBa
 `SpectrumBand`. Out comes a `matplotlib.figure.Figure`, never a window, which `save_picture` writes as png, pdf or svg.
 Every figure has one style (`style.styled`), with colors that color-blind people tell apart.
 
-- `spectrograms`: short-time spectra of recordings and renderings, with linear or logarithmic frequency.
+- `spectrograms`: short-time spectra of recordings and renderings, with logarithmic frequency.
 - `pictures`: modes as stems of level and decay time (T60); gains of modes over the object.
 - `clouds`, `surfaces`: an object from several sides, with features, symmetries and cuts.
 - `contacts`, `uncertainty`: the posterior of a contact; the standard deviation of gains and the credible band of a

@@ -1,4 +1,4 @@
-"""Pictures of modes, gains and scores: functions from values to a matplotlib figure, and one that writes it."""
+"""Pictures of modes and gains, and a function that writes a figure."""
 
 import io
 import math
