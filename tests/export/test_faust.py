@@ -94,14 +94,6 @@ def test_the_library_holds_the_same_sound_without_controls(tmp_path):
     assert apart(sounded(tmp_path / "mine.dsp", (0, 1.0, 0.0, 0)), struck(field, 6)) < 2e-6
 
 
-@compiled
-def test_silence_before_the_first_blow(tmp_path):
-    write_faust(table(noisy=True), tmp_path / "thing.dsp")
-    heard = sounded(tmp_path / "thing.dsp", (1, 1.0, 0.0, 3 * BLOCK))
-    assert not heard[: 3 * BLOCK].any()
-    assert heard[3 * BLOCK :].any()
-
-
 def test_the_name_cannot_break_out_of_its_string():
     named = replace(table(), name='a"; process = _; // \n b\\')
     lines = faust_library(named, noise=False).splitlines()
@@ -126,11 +118,3 @@ def test_the_table_has_each_contacts_place(tmp_path):
         rows = list(csv.DictReader(file))
     assert [int(row["contact"]) for row in rows] == list(range(POINTS))
     assert torch.equal(torch.tensor([[float(row[axis]) for axis in "xyz"] for row in rows]), field.points)
-    # Where a table exists, the program is not written either.
-    path.unlink()
-    place.write_text("contact,who\n")
-    with raises(ExportError, file=place, name="--overwrite"):
-        write_faust(field, path)
-    assert not path.exists()
-    write_faust(field, path, overwrite=True)
-    assert len(place.read_text().splitlines()) == 1 + POINTS

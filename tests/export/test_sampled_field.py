@@ -62,31 +62,23 @@ def test_the_formula_holds_in_plain_sums():
     torch.testing.assert_close(sound, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
-def test_modes_above_half_the_rate_are_left_out():
-    sound_field = replace(sounding("positional"), sample_rate=2700.0)
-    table = SampledField.of(sound_field)
-    assert table.frequency.tolist() == BANK.frequency[:3].tolist()
-    expected = sound_field.render(table.points[:3])
-    torch.testing.assert_close(table.render(torch.arange(3)), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
-
-
 @pytest.mark.parametrize("scaled", [False, True])
 def test_normals_of_an_elastic_model_are_its_bodys(scaled):
     table = SampledField.of(sounding("elastic", scaled=scaled))
     torch.testing.assert_close(table.normals, plate().normals(elastic().points).float())
 
 
-def test_given_points_and_normals_are_kept():
-    chosen = places(5, seed=9)
-    normals = torch.tensor([[0.0, 0.0, 2.0]]).expand(5, 3)
-    table = SampledField.of(sounding("positional"), chosen, normals)
-    assert torch.equal(table.points, chosen)
-    torch.testing.assert_close(table.normals, normals / 2)
-    assert table.name == "plate"
-    assert table.per_newton
-
-
-def test_fewer_points_are_spread_out_and_are_the_fields_own():
+def test_given_points_are_kept_and_fewer_are_the_fields_own_spread_out():
+    chosen, normals = places(5, seed=9), torch.tensor([[0.0, 0.0, 2.0]]).expand(5, 3)
+    given = SampledField.of(sounding("positional"), chosen, normals)
+    assert torch.equal(given.points, chosen)
+    torch.testing.assert_close(given.normals, normals / 2)
+    assert (given.name, given.per_newton) == ("plate", True)
+    table = SampledField.of(sounding("attention with dampings"))
+    few = table.take(table.spread(9))
+    rows = table.nearest(few.points)
+    torch.testing.assert_close(few.render(torch.arange(9)), table.render(rows))
+    torch.testing.assert_close(few.damping, table.damping[rows])
     table = SampledField.of(sounding("positional"), limit=12)
     own = positional().points
     assert len(table) == 12
@@ -96,36 +88,19 @@ def test_fewer_points_are_spread_out_and_are_the_fields_own():
     assert float(apart.min()) > 0.04
 
 
-def test_taking_rows_and_finding_them():
-    table = SampledField.of(sounding("attention with dampings"))
-    few = table.take(table.spread(9))
-    assert few.nearest(few.points).tolist() == list(range(9))
-    rows = table.nearest(few.points)
-    torch.testing.assert_close(few.render(torch.arange(9)), table.render(rows))
-    torch.testing.assert_close(few.damping, table.damping[rows])
-
-
 def ball(count: int) -> torch.Tensor:
     drawn = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     return torch.nn.functional.normalize(drawn, dim=1)
 
 
-def test_normals_of_a_ball_and_of_a_bowl_point_outwards():
-    out = ball(2000)
-    assert float((outward_normals(out) * out).sum(1).min()) > 0.9
+def test_normals_point_outwards():
+    out, far = ball(2000), torch.tensor([5.0, 0.0, 0.0])
+    # Of two balls, each has its own outside.
+    assert float((outward_normals(torch.cat([out, out + far])) * torch.cat([out, out])).sum(1).min()) > 0.9
     bowl = out[out[:, 2] < -0.3]
     assert float((outward_normals(bowl) * bowl).sum(1).median()) > 0.95
-
-
-def test_parts_that_do_not_touch_each_have_their_outside():
-    out = ball(600)
-    far = torch.tensor([5.0, 0.0, 0.0])
-    assert float((outward_normals(torch.cat([out, out + far])) * torch.cat([out, out])).sum(1).min()) > 0.8
-
-
-def test_two_points_have_normals_away_from_their_middle():
-    normals = outward_normals(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 3.0]]))
-    assert normals.tolist() == [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]
+    two = outward_normals(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 3.0]]))
+    assert two.tolist() == [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]
 
 
 @pytest.mark.parametrize(
@@ -152,6 +127,9 @@ def test_supporting_poles_are_counted_among_the_modes_that_sound(tmp_path):
     table = SampledField.of(field)
     assert len(table.frequency) == 4
     assert table.supporting == table.take(torch.tensor([3])).supporting == (1,)
+    assert table.frequency.tolist() == bank.frequency[:4].tolist()
+    expected = field.render(table.points[:3])
+    torch.testing.assert_close(table.render(torch.arange(3)), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
     make_bundle(table).write(tmp_path / "page")
     assert json.loads((tmp_path / "page" / "manifest.json").read_text())["supporting"] == [1]
     assert SampledField.of(made).supporting == ()

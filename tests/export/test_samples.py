@@ -1,7 +1,6 @@
 """A sampler's grid: every wav is the blow that its row of the table says."""
 
 import csv
-import itertools
 import re
 from collections import Counter
 from dataclasses import replace
@@ -31,6 +30,11 @@ def test_every_row_is_its_blow(tmp_path):
     write_grid(field, tmp_path / "grid", contacts=5, layers=LAYERS, level_db=-3.0)
     found = rows(tmp_path / "grid")
     assert len(found) == 15
+    assert Counter(row["midi_note"] for row in found) == {str(note): 3 for note in range(36, 41)}
+    assert len({(row["x"], row["y"], row["z"]) for row in found}) == 5
+    # A sound holds no time of writing, so that equal sounds are equal files.
+    content = (tmp_path / "grid" / "sounds" / "001-1.wav").read_bytes()
+    assert content[content.index(b"PEAK") + 12 :][:4] == bytes(4)
     truths, sounds = [], []
     for row in found:
         sound, rate = soundfile.read(tmp_path / "grid" / row["file"])
@@ -48,30 +52,12 @@ def test_every_row_is_its_blow(tmp_path):
     assert apart(sounds, 10 ** (-3 / 20) / loudest * np.array(truths)) < 1e-6
 
 
-def test_contacts_lie_apart_and_have_a_note_each(tmp_path):
-    write_grid(table(), tmp_path / "grid", contacts=6, layers=LAYERS)
-    found = rows(tmp_path / "grid")
-    assert Counter(row["midi_note"] for row in found) == {str(note): 3 for note in range(36, 42)}
-    assert len({(row["x"], row["y"], row["z"]) for row in found}) == 6
-    ranges = [(int(row["velocity_low"]), int(row["velocity_high"])) for row in found[:3]]
-    assert ranges[0][0] == 1
-    assert ranges[-1][1] == 127
-    assert all(upper[0] == lower[1] + 1 for lower, upper in itertools.pairwise(ranges))
-
-
 def test_the_instrument_plays_every_file_at_its_key(tmp_path):
     write_grid(table(), tmp_path / "grid", contacts=4, layers=LAYERS)
     regions = played(tmp_path / "grid")
     expected = [(r["file"], r["midi_note"], r["velocity_low"], r["velocity_high"]) for r in rows(tmp_path / "grid")]
     assert sorted((r["sample"], r["key"], r["lovel"], r["hivel"]) for r in regions) == sorted(expected)
     assert all((tmp_path / "grid" / region["sample"]).is_file() for region in regions)
-
-
-def test_a_sound_holds_no_time_of_writing_so_that_equal_sounds_are_equal_files(tmp_path):
-    write_grid(table(), tmp_path / "grid", contacts=1)
-    content = (tmp_path / "grid" / "sounds" / "001-1.wav").read_bytes()
-    start = content.index(b"PEAK")
-    assert content[start + 12 : start + 16] == bytes(4)
 
 
 def played(folder: Path) -> list[dict[str, str]]:
@@ -101,6 +87,8 @@ def levels(folder: Path, note: int) -> np.ndarray:
 @pytest.mark.parametrize("layers", [LAYERS, (Layer(0.5), Layer(1.0), Layer(2.0)), (Layer(2.0), Layer(1.0))])
 def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path, layers):
     write_grid(table(), tmp_path / "grid", contacts=2, layers=layers)
+    write_grid(table(), tmp_path / "one", contacts=2)
+    assert float(played(tmp_path / "one")[0]["amp_velcurve_64"]) == pytest.approx((64 / 127) ** 2, rel=1e-5)
     for note in (36, 37):
         level = levels(tmp_path / "grid", note)
         assert (np.diff(level) >= -1e-6 * level[-1]).all()
@@ -129,12 +117,7 @@ def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path, layers, orde
     assert len(written.remarks) == 1 + (order != [0, 1, 2])
 
 
-def test_one_layer_has_the_whole_keyboard_and_the_square_of_the_velocity(tmp_path):
-    write_grid(table(), tmp_path / "one", contacts=2)
-    assert float(played(tmp_path / "one")[0]["amp_velcurve_64"]) == pytest.approx((64 / 127) ** 2, rel=1e-5)
-
-
-@pytest.mark.parametrize("count", [85, 86, 100, 127])
+@pytest.mark.parametrize("count", [86, 127])
 def test_every_layer_has_a_velocity(tmp_path, count):
     write_grid(
         table(), tmp_path / "grid", contacts=1, layers=[Layer(0.1 + each) for each in range(count)], seconds=0.01
@@ -161,9 +144,6 @@ def test_bad_settings_are_refused(tmp_path, settings, name, value):
     with raises(ExportError, name=name, value=value):
         write_grid(table(), tmp_path / "grid", **settings)
     assert not (tmp_path / "grid").exists()
-
-
-def test_a_rate_that_no_wav_holds_is_refused(tmp_path):
     with raises(ExportError, name="sample_rate", value=8000.5):
         write_grid(replace(table(), sample_rate=8000.5), tmp_path / "grid")
 
@@ -175,11 +155,3 @@ def test_a_harder_impact_is_shorter_in_contact_by_hertzs_law():
     assert layers[1].contact_time == 0.0
     widths = [1 + (layer.contact_time / layers[0].contact_time) ** 2 * (10 ** (1 / 3) - 1) for layer in layers]
     assert widths == pytest.approx([(3.0 / force) ** (1 / 3) for force in (0.3, 3.0, 1.0)])
-
-
-def test_layers_of_hertzs_law_become_brighter_with_the_force(tmp_path):
-    write_grid(table(), tmp_path / "grid", contacts=1, layers=hertz_layers((0.3, 1.0, 3.0)), noise=False)
-    files = [tmp_path / "grid" / row["file"] for row in rows(tmp_path / "grid")]
-    spectra = [np.abs(np.fft.rfft(soundfile.read(file)[0])) for file in files]
-    centers = [float((np.arange(len(each)) * each**2).sum() / (each**2).sum()) for each in spectra]
-    assert centers[0] < centers[1] < centers[2]

@@ -6,8 +6,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from avmsf.errors import ExportError
 from avmsf.export.bundle import make_bundle
 from avmsf.export.web import page_files, single_file, write_webpage
@@ -57,27 +55,19 @@ def test_one_file_holds_all_that_lay_beside_the_page() -> None:
     assert base64.b64decode(inlined["field.bin"]["base64"]) == bundle.files["field.bin"]
 
 
-def test_a_page_without_its_import_map_is_told() -> None:
-    torn = {**PAGE, "index.html": b"<title></title><p>"}
-    with raises(ExportError, file="index.html", name="import map", value=0):
-        single_file(make_bundle(struck_table(shared=True)), torn)
-
-
-@pytest.mark.parametrize("output", ["page", "page.html"])
-def test_the_title_is_the_name_of_the_object(tmp_path: Path, output: str) -> None:
-    write_webpage(replace(struck_table(shared=True), name="Tom & <Ann>"), tmp_path / output)
-    html = (tmp_path / output / "index.html" if output == "page" else tmp_path / output).read_text()
-    assert re.findall(r"<title>(.*?)</title>", html) == ["Tom &amp; &lt;Ann&gt;"]
-
-
 def test_both_forms_are_written_whole_and_kept_from_others(tmp_path: Path) -> None:
-    table = struck_table(shared=True)
+    table = replace(struck_table(shared=True), name="Tom & <Ann>")
     written = write_webpage(table, tmp_path / "site")
     found = {str(path.relative_to(tmp_path / "site")) for path in (tmp_path / "site").rglob("*") if path.is_file()}
     assert found == {*page_files(), "field.bin", "manifest.json"} - {"page/vendor/spark.min.js"}
     assert set(written.sizes) == {tmp_path / "site" / name for name in found}
     single = tmp_path / "ball.html"
     assert write_webpage(table, single).sizes == {single: single.stat().st_size}
+    for page in (single, tmp_path / "site" / "index.html"):
+        assert re.findall(r"<title>(.*?)</title>", page.read_text()) == ["Tom &amp; &lt;Ann&gt;"]
+    torn = {**PAGE, "index.html": b"<title></title><p>"}
+    with raises(ExportError, file="index.html", name="import map", value=0):
+        single_file(make_bundle(table), torn)
     other = tmp_path / "mine.html"
     other.write_text("mine")
     with raises(ExportError, file=other, name="--overwrite"):

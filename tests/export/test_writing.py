@@ -2,7 +2,6 @@
 
 import json
 import os
-from pathlib import Path
 
 from avmsf.errors import ExportError
 from avmsf.export.writing import Written, write_files, write_folder
@@ -40,18 +39,6 @@ def test_an_export_is_replaced_only_if_asked_and_nothing_else_is(tmp_path):
     with raises(ExportError, file=tmp_path / "out", value=["b.txt", "manifest.json", "notes.txt"]):
         write_folder(tmp_path / "out", named("a.txt"), {}, overwrite=True)
     assert listed(tmp_path) == ["out/b.txt", "out/manifest.json", "out/notes.txt"]
-
-
-def test_what_fails_half_way_leaves_all_as_it_was(tmp_path, monkeypatch):
-    write_folder(tmp_path / "out", named("a.txt"), {})
-
-    def fail(path, content):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", fail)
-    with raises(ExportError, file=tmp_path / "out", value="No space left on device"):
-        write_folder(tmp_path / "out", named("b.txt"), {}, overwrite=True)
-    assert listed(tmp_path) == ["out/a.txt", "out/manifest.json"]
 
 
 def test_a_folder_behind_a_link_is_written_to_and_the_link_stays(tmp_path):

@@ -9,7 +9,7 @@ import fast_simplification
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 from trimesh.visual import ColorVisuals
@@ -66,7 +66,9 @@ def read_object(
     if faces > most:
         scene = trimesh.Scene([_reduced(mesh, most / faces) for mesh in meshes])
         left = sum(len(mesh.faces) for mesh in scene.geometry.values())
-        remarks = (f"{_too_fine(source, faces, left)}, without its textures",)
+        remarks = (
+            f"{_named(source)} has {faces:,} triangles, too many for a browser: {left:,} are shown, without textures",
+        )
     content = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
     assert isinstance(content, bytes)
     return ObjectFile("mesh", "object.glb", content, remarks)
@@ -93,10 +95,6 @@ def read_gaussians(path: Path, points: Float[Tensor, "points 3"]) -> GaussianClo
 def _named(source: Path | Surface) -> Path | str:
     """Return what messages call an object."""
     return source if isinstance(source, Path) else "the surface"
-
-
-def _too_fine(source: Path | Surface, faces: int, left: int) -> str:
-    return f"{_named(source)} has {faces:,} triangles, too many for a browser: {left:,} are shown"
 
 
 def _reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
@@ -134,64 +132,31 @@ def _check_fits(
         raise ExportError.expected(wanted, apart, got=got, file=file, name="center", advice=advice)
 
 
-@dataclass(frozen=True, eq=False)
-class DisplayGeometry:
-    """Geometry to show: triangles with colors, or points."""
-
-    vertices: Float[Tensor, "vertices 3"]
-    """Object frame, meters."""
-    faces: Int[Tensor, "faces 3"]
-    """Rows of `vertices`; empty for points."""
-    normals: Float[Tensor, "vertices 3"]
-    """Outward unit normals."""
-    colors: Float[Tensor, "vertices 3"] | None = None
-    """Red, green, blue as displayed (sRGB), 0 to 1; None for gray."""
-    gaussians: Path | None = None
-    """The file of the Gaussians whose centers these are."""
-
-
-def read_display_geometry(
+def read_vertices(
     source: Path | Surface | None, sampled: SampledField, *, meters: float = 1.0
-) -> tuple[DisplayGeometry, tuple[str, ...]]:
-    """Read a mesh whose coordinates count `meters` each, and notes on differences from the file.
+) -> tuple[dict[str, Tensor], Path | None]:
+    """Return the arrays of an object to show, by their names in glTF, and the file if it has Gaussians.
 
-    A `Surface` is in meters, as are Gaussians, of which the centers are shown in their colors; without a source the
-    field's points are shown. Textures become vertex colors, and meshes of more than `MAX_FACES` triangles are reduced.
-    Raises `ExportError` for one that is huge, or not in the field's unit, and `CaptureError` for a file that is not a
-    mesh.
+    `POSITION` (object frame, meters), outward unit `NORMAL`, `COLOR_0` as displayed (sRGB, 0 to 1), and `indices` of
+    triangles. A mesh file's coordinates count `meters` each, and its textures become vertex colors; a `Surface` is in
+    meters, as are Gaussians, of which the centers are shown; without a source the field's points are. Raises
+    `ExportError` for one that is huge, or not in the field's unit, and `CaptureError` for a file that is not a mesh.
     """
-    nowhere = torch.zeros(0, 3, dtype=torch.int64)
     if source is None:
-        return DisplayGeometry(sampled.points, nowhere, sampled.normals), ()
+        return {"POSITION": sampled.points, "NORMAL": sampled.normals}, None
     if isinstance(source, Surface):
         mesh = TexturedMesh.plain(source)
     elif (cloud := read_gaussians(source, sampled.points)) is not None:
         normals = sampled.normals[sampled.nearest(cloud.centers)]
-        return DisplayGeometry(cloud.centers, nowhere, normals, cloud.colors, source), ()
+        return {"POSITION": cloud.centers, "NORMAL": normals, "COLOR_0": cloud.colors}, source
     else:
         mesh = read_textured_mesh(source, meters=meters)
     _check_fits(mesh.vertices.double().numpy(), sampled.points, source)
-    faces = len(mesh.faces)
-    if faces <= MAX_FACES:
-        return _of_corners(mesh), ()
-    corners = mesh.vertices[mesh.faces].reshape(-1, 3).numpy()
-    painted = (255.0 * _corner_colors(mesh)).round().byte().reshape(-1, 3).numpy()
-    solid = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), vertex_colors=painted, process=False)
-    small = _reduced(solid, MAX_FACES / faces)
-    assert isinstance(small.visual, ColorVisuals)
-    corner_rows = torch.from_numpy(np.array(small.faces, dtype=np.int64))
-    shown = torch.from_numpy(np.array(small.visual.vertex_colors[:, :3], dtype=np.float32)) / 255.0
-    vertices = torch.from_numpy(np.array(small.vertices)).float()
-    geometry = _of_corners(TexturedMesh.build(vertices, corner_rows, colors=shown[corner_rows]))
-    return geometry, (_too_fine(source, faces, len(corner_rows)),)
-
-
-def _of_corners(mesh: TexturedMesh) -> DisplayGeometry:
-    """Return a mesh whose vertices are split where normals or colors differ between faces."""
+    # Vertices are split where normals or colors differ between faces.
     corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
     table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
-    kept = torch.from_numpy(table).float()
-    return DisplayGeometry(kept[:, :3], torch.from_numpy(rows.reshape(-1, 3)), kept[:, 3:6], kept[:, 6:])
+    position, normal, color = torch.from_numpy(table).float().split(3, dim=1)
+    return {"POSITION": position, "NORMAL": normal, "COLOR_0": color, "indices": torch.from_numpy(rows.ravel())}, None
 
 
 def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf.export.geometry import DisplayGeometry, read_display_geometry
+from avmsf.export.geometry import read_vertices
 from avmsf.export.one_phase import approximation_error, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import SUFFIXES, Axis, Written, check_suffix, generator, no_modes, pack, write_files
@@ -51,32 +51,35 @@ def write_gltf(
 
     `object` is a mesh with coordinates in units of `meters`, or Gaussians, of which the file has the centers and a copy
     beside it the rest. All coordinates are in the object's frame; the node rotates its axis `up` to glTF's +y. Raises
-    `ExportError` for a name that does not end in .glb, a field without modes, and as `read_display_geometry`.
+    `ExportError` for a name that does not end in .glb, a field without modes, and as `read_vertices`.
     """
     path = Path(path)
     check_suffix(path, SUFFIXES["gltf"])
     if not len(sampled.frequency):
         raise no_modes(path)
     damping, gains = shared_dampings(sampled), signed_amplitudes(sampled)
-    geometry, remarks = read_display_geometry(object, sampled, meters=meters)
-    contents = {path: _glb(*_document(sampled, geometry, up, gains, damping))}
-    if geometry.gaussians is not None:
-        contents[path.with_suffix(".gaussians.ply")] = geometry.gaussians.read_bytes()
+    vertices, gaussians = read_vertices(object, sampled, meters=meters)
+    contents = {path: _glb(*_document(sampled, vertices, up, gains, damping))}
+    if gaussians is not None:
+        contents[path.with_suffix(".gaussians.ply")] = gaussians.read_bytes()
     sizes = write_files(contents, overwrite=overwrite)
     error = approximation_error(sampled, torch.complex(gains, torch.zeros_like(gains)), damping)
-    return Written(sizes, remarks + _remarks(sampled), *error)
+    return Written(sizes, _remarks(sampled), *error)
 
 
 def _document(
     sampled: SampledField,
-    geometry: DisplayGeometry,
+    vertices: dict[str, Tensor],
     up: Axis,
     gains: Float[Tensor, "points modes"],
     damping: Float[Tensor, " modes"],
 ) -> tuple[dict[str, Any], bytes]:
     """Return the JSON and the binary chunk, whose arrays are in the order of the accessors' numbers."""
     order = torch.argsort(sampled.power.sum(0) / damping, descending=True, stable=True)
-    modal, extra, drawn = _modal(sampled, order, gains, damping), _extra(sampled, order), _drawn(geometry)
+    modal, extra = _modal(sampled, order, gains, damping), _extra(sampled, order)
+    drawn = vertices | {"NORMAL": torch.nn.functional.normalize(vertices["NORMAL"], dim=1)}
+    if "COLOR_0" in drawn:
+        drawn["COLOR_0"] = _linear(drawn["COLOR_0"])
     views, accessors, content = _packed([*modal.items(), *extra.items(), *drawn.items()])
     number = count()
     facts = {
@@ -91,7 +94,7 @@ def _document(
     attributes = dict(zip(drawn, number, strict=False))
     indices = {name: attributes.pop(name) for name in ("indices",) if name in attributes}
     primitive = {"attributes": attributes, "mode": _TRIANGLES if indices else _POINTS, "material": 0, **indices}
-    shade = 1.0 if geometry.colors is not None else float(_linear(torch.tensor(_GRAY)))
+    shade = 1.0 if "COLOR_0" in drawn else float(_linear(torch.tensor(_GRAY)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
     sounds = {"modalModel": 0}
     document = {
@@ -133,16 +136,6 @@ def _extra(sampled: SampledField, order: Int[Tensor, " modes"]) -> dict[str, Ten
         arrays["decayRates"] = sampled.damping[:, order].T.reshape(-1)
     if sampled.noise.any():
         arrays["noise"] = sampled.noise
-    return arrays
-
-
-def _drawn(geometry: DisplayGeometry) -> dict[str, Tensor]:
-    """Return the attributes of the vertices, and the indices of triangles."""
-    arrays = {"POSITION": geometry.vertices, "NORMAL": torch.nn.functional.normalize(geometry.normals, dim=1)}
-    if geometry.colors is not None:
-        arrays["COLOR_0"] = _linear(geometry.colors)
-    if len(geometry.faces):
-        arrays["indices"] = geometry.faces.reshape(-1)
     return arrays
 
 
