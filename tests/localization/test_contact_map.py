@@ -39,26 +39,16 @@ def test_region_is_the_smallest_set_of_that_probability():
     assert found.region(0.9).tolist() == [False, True, True, False, True]
     assert found.region(0.5).tolist() == [False, True, False, False, False]
     assert found.region(0.97).sum() == 5
-    with raises(LocationError, name="level", value=1.5):
-        found.region(1.5)
-
-
-def test_a_map_contains_the_contacts_whose_nearest_point_is_in_its_region():
-    found = made([0.05, 0.5, 0.3, 0.05, 0.1])
     assert [found.contains([0.01 * row + 0.004, 0.02, 0.0]) for row in range(5)] == found.region().tolist()
-    assert not found.contains((0.02, 0.0, 0.0), 0.5)
-    with raises(ArrayError, name="contact", value=[1, 2]):
-        found.contains([0.01, 0.0])
-
-
-def test_the_credible_radius_and_the_standard_deviation_are_those_about_the_most_probable_point():
-    found = made([0.05, 0.5, 0.3, 0.05, 0.1])
     assert found.credible_radius(0.95) == pytest.approx(0.03, rel=1e-5)
     assert found.credible_radius(0.85) == pytest.approx(0.01, rel=1e-5)
     # .35 a centimeter away, .05 two and .1 three.
     assert found.position_std == pytest.approx(0.01 * math.sqrt(0.35 + 0.05 * 4 + 0.1 * 9), rel=1e-5)
-    with raises(LocationError, name="level", value=0.0):
-        found.credible_radius(0.0)
+    for call in (found.region, found.credible_radius):
+        with raises(LocationError, name="level", value=1.5):
+            call(1.5)
+    with raises(ArrayError, name="contact", value=[1, 2]):
+        found.contains([0.01, 0.0])
 
 
 def test_peaks_are_positions_apart_that_hold_some_probability():

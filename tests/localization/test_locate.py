@@ -55,6 +55,9 @@ def test_force_polarity_and_onset_do_not_matter():
     assert turned.most_probable == found.most_probable
     torch.testing.assert_close(turned.distance, found.distance, atol=1e-5, rtol=0)
     assert turned.force == pytest.approx(-300.0 * found.force, rel=1e-3)
+    # Nor does the evidence depend on them.
+    assert turned.evidence == pytest.approx(found.evidence, abs=0.1)
+    assert locator.locate(impacts.sounds[0], force=Force(1.0)).evidence == pytest.approx(found.evidence, rel=0.01)
     late = locator.locate(impacts.sounds[0][3:])
     assert missed(late, late.most_probable, impacts.contacts[0]) < 0.02
     assert late.explained_energy > 0.9
@@ -74,7 +77,7 @@ def test_dampings_that_vary_are_accounted_for():
     field = field_of(TrueGains(plate_surface_points(PLATE, 600).float(), factor=2.0))
     sound = field.modal_sounds(field.known(field.gain_field.points[123:124]), 7200)[0]
     corrected = Locator.of(field)
-    plain = replace(corrected, dampings=None, lengths={})
+    plain = replace(corrected, dampings=None)
     distance = [float(each.locate(sound).distance[123]) for each in (corrected, plain)]
     assert distance[0] < 0.5 * distance[1]
 
@@ -94,30 +97,6 @@ def test_a_known_force_tells_places_apart_that_sound_alike():
     known = [locator.locate(sound, force=Force(each, spread_db=0.5)).probability for each in (1.0, 2.0)]
     assert float(known[0][1]) > 0.99
     assert float(known[1][0]) > 0.99
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_a_force_that_cannot_be_is_refused(value):
-    with raises(LocationError, name="force.expected") as caught:
-        Force(value)
-    assert caught.value.value is value
-    with raises(LocationError, name="force.spread_db") as caught:
-        Force(1.0, spread_db=value)
-    assert caught.value.value is value
-
-
-@pytest.mark.parametrize("given", [2.0, 2, torch.tensor([2.0]), [2.0]], ids=repr)
-def test_a_force_may_be_a_number(given):
-    sound = struck(1, seed=3).sounds[0]
-    found = locate(true_field(), sound, force=given, locator=locator_of())
-    prior = locate(true_field(), sound, force=Force(2.0), locator=locator_of())
-    assert torch.equal(found.probability, prior.probability)
-
-
-@pytest.mark.parametrize(("given", "value"), [([1.0, 2.0], [2]), ([[1.0], [2.0, 3.0]], "list")])
-def test_forces_that_are_no_number_are_refused(given, value):
-    with raises(LocationError, name="force", value=value):
-        locate(true_field(), struck(1, seed=3).sounds[0], force=given, locator=locator_of())
 
 
 def test_a_force_that_the_level_contradicts_is_noted():
@@ -212,27 +191,6 @@ def test_a_sound_whose_modes_are_so_strong_at_no_place_has_none(taps):
             _ = found.position
 
 
-def test_the_evidence_depends_on_neither_level_nor_force():
-    sound = struck(1, seed=3).sounds[0]
-    expected = locator_of().locate(sound).evidence
-    assert locator_of().locate(-300.0 * sound).evidence == pytest.approx(expected, abs=0.1)
-    assert locator_of().locate(sound, force=Force(1.0)).evidence == pytest.approx(expected, rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("sound", "name", "value"),
-    [
-        (torch.zeros(5000), "sound", "silence"),
-        (torch.randn(300, generator=torch.Generator().manual_seed(0)), "samples", 300),
-        (torch.full((5000,), torch.nan), "finite", 5000),
-        (torch.randn(7200, generator=torch.Generator().manual_seed(0)), "noise", pytest.approx(1.0, abs=0.5)),
-    ],
-)
-def test_sounds_without_an_impact_are_refused(sound, name, value):
-    with raises(LocationError, name=name, value=value):
-        locator_of().locate(sound)
-
-
 def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
     impacts = struck(2, seed=44)
     for field in (true_field(), adjust_modes(true_field(), pitch=1.1)):
@@ -240,65 +198,54 @@ def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
         assert Locator.of(field).smoothing is None
     higher = adjust_modes(replace(true_field(), origin=Origin(trained_on=("a", "b"))), pitch=1.1)
     assert distinct_contacts(higher) == 2
+    # Contacts that a field does not use are not counted.
+    contacts = bar_contacts(8)
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
+    used = sound_field(gains.without(torch.arange(8) < 3))
+    assert [distinct_contacts(each) for each in (sound_field(gains), used, adjust_modes(used, pitch=1.1))] == [8, 5, 5]
     sound = higher.render(impacts.contacts[:1])[0]
     found = Locator.of(higher).locate(sound)
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.05
 
 
-def test_contacts_that_a_field_does_not_use_are_not_counted():
-    contacts = bar_contacts(8)
-    gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
-    assert distinct_contacts(sound_field(gains)) == 8
-    assert distinct_contacts(sound_field(gains.without(torch.arange(8) < 3))) == 5
-    assert distinct_contacts(adjust_modes(sound_field(gains.without(torch.arange(8) < 3)), pitch=1.1)) == 5
+@pytest.mark.parametrize("given", [2.0, 2, torch.tensor([2.0]), [2.0]], ids=repr)
+def test_a_force_may_be_a_number(given):
+    found, expected = (locator_of().locate(SOUND, force=force) for force in (given, Force(2.0)))
+    assert torch.equal(found.probability, expected.probability)
 
 
-def test_lengths_that_are_used_are_kept():
-    fresh = Locator.of(true_field(100))
-    sound = struck(1, seed=45).sounds[0]
-    fresh.prepare(720)
-    kept = fresh.lengths[720, math.inf]
-    for samples in range(800, 1000, 10):
-        fresh.locate(sound[:samples])
-        fresh.locate(sound[:720])
-    assert fresh.lengths[720, math.inf] is kept
-    assert len(fresh.lengths) == 8
-
-
-def test_a_locator_is_of_its_own_field_and_points():
-    sound = struck(1, seed=46).sounds[0]
-    with raises(LocationError, name="locator", value="points or directions"):
-        locate(true_field(), sound, points=torch.zeros(5, 3), locator=locator_of())
-    with raises(LocationError, name="locator", value="another field"):
-        locate(true_field(100), sound, locator=locator_of())
+SOUND = struck(1, seed=3).sounds[0]
+NOISE = torch.randn(7200, generator=torch.Generator().manual_seed(0))
+DRAWN = NOISE[:9].view(3, 3)
 
 
 @pytest.mark.parametrize(
-    ("name", "given"),
+    ("make", "attributes"),
     [
-        ("points", {"points": torch.zeros(0, 3)}),
-        ("points", {"points": torch.zeros(3, 2)}),
-        ("points", {"points": torch.full((3, 3), torch.nan)}),
-        ("directions", {"points": torch.zeros(3, 3), "directions": torch.zeros(2, 3)}),
-        ("directions", {"points": torch.zeros(3, 3), "directions": torch.full((3, 3), torch.nan)}),
+        (lambda: Force(0.0), {"name": "force.expected", "value": 0.0}),
+        (lambda: Force(math.inf), {"name": "force.expected", "value": math.inf}),
+        (lambda: Force(1.0, spread_db=-1.0), {"name": "force.spread_db", "value": -1.0}),
+        (lambda: locator_of().locate(SOUND, force=[1.0, 2.0]), {"name": "force", "value": [2]}),
+        (lambda: locator_of().locate(SOUND, force=[[1.0], [2.0, 3.0]]), {"name": "force", "value": "list"}),
+        (lambda: locator_of().locate(torch.zeros(5000)), {"name": "sound", "value": "silence"}),
+        (lambda: locator_of().locate(NOISE[:300]), {"name": "samples", "value": 300}),
+        (lambda: locator_of().locate(torch.full((5000,), torch.nan)), {"name": "finite", "value": 5000}),
+        (lambda: locator_of().locate(NOISE), {"name": "noise", "value": pytest.approx(1.0, abs=0.5)}),
+        (lambda: locator_of().locate(SOUND, highest=50.0), {"name": "modes", "value": 50.0}),
+        (lambda: Locator.of(true_field(), points=torch.zeros(0, 3)), {"name": "points"}),
+        (lambda: Locator.of(true_field(), points=torch.zeros(3, 2)), {"name": "points"}),
+        (lambda: Locator.of(true_field(), points=torch.full((3, 3), torch.nan)), {"name": "points"}),
+        (
+            lambda: Locator.of(true_field(), points=torch.zeros(3, 3), directions=torch.zeros(2, 3)),
+            {"name": "directions"},
+        ),
+        (
+            lambda: locate(true_field(), SOUND, points=torch.zeros(5, 3), locator=locator_of()),
+            {"name": "locator", "value": "points or directions"},
+        ),
+        (lambda: locate(true_field(100), SOUND, locator=locator_of()), {"name": "locator", "value": "another field"}),
     ],
 )
-def test_points_without_sense_are_refused(name, given):
-    with raises(LocationError, name=name):
-        Locator.of(true_field(), **given)
-
-
-def test_a_recording_below_all_modes_is_refused():
-    with raises(LocationError, name="modes", value=50.0):
-        locator_of().locate(struck(1, seed=0).sounds[0], highest=50.0)
-
-
-def test_of_several_recordings_only_the_first_waits_for_the_fields_gains(monkeypatch: pytest.MonkeyPatch):
-    field, sounds = true_field(300), struck(2, seed=3).sounds
-    made = []
-    of = Locator.of
-    monkeypatch.setattr(Locator, "of", lambda *given, **named: made.append(given) or of(*given, **named))
-    first, second = (locate(field, sound) for sound in sounds)
-    assert len(made) == 1
-    assert torch.equal(second.probability, locate(field, sounds[1], points=field.gain_field.points).probability)
-    assert not torch.equal(first.probability, second.probability)
+def test_what_cannot_be_located_is_refused(make, attributes):
+    with raises(LocationError, **attributes):
+        make()

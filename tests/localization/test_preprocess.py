@@ -80,50 +80,15 @@ def test_how_hard_a_blow_was_is_x_its_push_was_recorded():
     assert (soft.newtons, hard.newtons) == (pytest.approx(0.02, rel=0.05), pytest.approx(0.4, rel=0.05))
 
 
-def test_a_rate_that_holds_no_mode_is_refused():
-    sound = torch.from_numpy(recorded(struck(1, seed=1).sounds[0]).channels[0][::40].copy())
-    with raises(LocationError, name="sample_rate", value=450.0):
-        preprocess_recording(sound, true_field(), sample_rate=450.0)
-
-
-def test_clipping_is_said_with_its_share():
-    recording = recorded(struck(1, seed=23).sounds[0])
-    clipped = Recording("hit.wav", np.clip(8 * recording.channels, -1, 1), RATE, "PCM_16")
-    note = locate(true_field(), clipped, locator=locator_of()).notes[0]
-    assert note.startswith("hit.wav")
-    assert "clipped" in note
-
-
-def test_a_second_impact_is_noted_and_not_used():
+def test_clipping_and_a_second_impact_are_noted_and_the_second_is_not_used():
     impacts = struck(2, seed=24)
     both = torch.cat([impacts.sounds[0][:5400], impacts.sounds[1]])
+    loud = Recording("hit.wav", np.clip(8 * recorded(both).channels, -1, 1), RATE, "PCM_16")
+    note = locate(true_field(), loud, locator=locator_of()).notes[0]
+    assert (note.startswith("hit.wav"), "clipped" in note) == (True, True)
     found = locate(true_field(), recorded(both), locator=locator_of())
     assert [float(each) for each in re.findall(r"([\d.]+) s\b", found.notes[0])] == pytest.approx([0.1, 0.4], abs=0.01)
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.03
-
-
-@pytest.mark.parametrize(
-    "samples",
-    [torch.randn(9000, generator=torch.Generator().manual_seed(1)), torch.sin(0.3 * torch.arange(9000))],
-    ids=["noise", "hum"],
-)
-def test_sounds_that_neither_rise_nor_fall_are_refused(samples):
-    with raises(LocationError, file="the recording") as caught:
-        preprocess_recording(samples, true_field())
-    # Decibels between the loudest and the quietest part.
-    assert 0.0 <= caught.value.value < 6.0
-
-
-def test_samples_of_several_channels_and_impossible_rates_are_refused():
-    sound = recorded(struck(1, seed=25).sounds[0]).channels
-    with raises(LocationError, name="recording", value=[1, 9000]):
-        locate(true_field(), sound)
-    with raises(LocationError, name="recording", value=[]):
-        preprocess_recording(torch.tensor(1.0), true_field())
-    for rate in (math.nan, math.inf, 0.0, -8000.0):
-        with raises(LocationError, name="sample_rate") as caught:
-            locate(true_field(), sound[0], sample_rate=rate)
-        assert caught.value.value is rate
 
 
 def test_channels_follow_the_capture_where_the_recording_has_them():
@@ -169,3 +134,27 @@ def test_a_recording_that_starts_with_its_impact_is_read_as_those_of_a_capture_t
     assert len(preprocess_recording(whole, field).sound) < len(sound) + 5
     later = recorded(sound)
     assert len(preprocess_recording(later, uncut).sound) == len(preprocess_recording(later, field).sound)
+
+
+HIT = recorded(struck(1, seed=1).sounds[0]).channels[0][::40].copy()
+NOISE, HUM = torch.randn(9000, generator=torch.Generator().manual_seed(1)), torch.sin(0.3 * torch.arange(9000))
+
+
+@pytest.mark.parametrize(
+    ("samples", "rate", "attributes"),
+    [
+        (NOISE, None, {"file": "the recording"}),
+        (HUM, None, {"file": "the recording"}),
+        (NOISE[None], None, {"name": "recording", "value": [1, 9000]}),
+        (torch.tensor(1.0), None, {"name": "recording", "value": []}),
+        (
+            recorded(struck(1, seed=1).sounds[0]).channels[0][::40].copy(),
+            450.0,
+            {"name": "sample_rate", "value": 450.0},
+        ),
+        *((NOISE, rate, {"name": "sample_rate", "value": rate}) for rate in (math.inf, 0.0, -8000.0)),
+    ],
+)
+def test_recordings_that_hold_no_impact_or_no_mode_are_refused(samples, rate, attributes):
+    with raises(LocationError, **attributes):
+        preprocess_recording(samples, true_field(), sample_rate=rate)

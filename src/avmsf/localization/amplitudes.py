@@ -177,22 +177,3 @@ def _steady(cells: Float64[Tensor, "frames bands"]) -> float:
     """
     floor = torch.kthvalue(cells.flatten(), max(1, round(_NOISE_QUANTILE * cells.numel()))).values
     return float(floor) / -math.log1p(-_NOISE_QUANTILE)
-
-
-DETUNINGS = (0.9, 0.95, 1.05, 1.1)
-"""Factors on all frequencies: 5 % is a half-power bandwidth of a mode that turns six times while it falls to 1/e."""
-
-
-def detuned_extractors(bank: ModalBank, *, sample_rate: float, samples: int, highest: float) -> tuple[Extractor, ...]:
-    """Return the extractors of a bank's modes at each of `DETUNINGS`, of those modes that stay below `highest` Hz.
-
-    A detuning that leaves no mode below is left out; those downwards leave all that are below in tune.
-    """
-    below = [(factor, factor * bank.frequency < highest) for factor in DETUNINGS]
-    return tuple(
-        Extractor.of(
-            ModalBank(factor * bank.frequency[kept], bank.damping[kept]), sample_rate=sample_rate, samples=samples
-        )
-        for factor, kept in below
-        if bool(kept.any())
-    )

@@ -16,6 +16,7 @@ Dampings are no evidence, even of a field whose dampings vary with the contact: 
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
@@ -62,27 +63,21 @@ class PredictedGains:
     """Predicted gains of impacts at points."""
 
     gains: Complex64[Tensor, "points modes"]
-    power: Float32[Tensor, "points modes"]
-    """Squares of the gains' magnitudes."""
     variance: Float32[Tensor, "points modes"]
     """v(x): the field's posterior variance of the gains."""
-    mean_power: Float32[Tensor, " modes"]
-    """Mean of the gains' squares over the surface, nowhere zero."""
     frequency: Float64[Tensor, " modes"]
     """Hz."""
 
-    @classmethod
-    def of(
-        cls,
-        gains: Complex64[Tensor, "points modes"],
-        variance: Float32[Tensor, "points modes"],
-        frequency: Float64[Tensor, " modes"],
-    ) -> "PredictedGains":
-        """Return gains with their powers."""
-        power = gains.abs().square()
-        mean_power = power.mean(0)
-        least = max(1e-8 * float(mean_power.max()), _TINY)
-        return cls(gains, power, variance, mean_power.clamp_min(least), frequency)
+    @cached_property
+    def power(self) -> Float32[Tensor, "points modes"]:
+        """Squares of the gains' magnitudes."""
+        return self.gains.abs().square()
+
+    @cached_property
+    def mean_power(self) -> Float32[Tensor, " modes"]:
+        """Mean of the gains' squares over the surface, nowhere zero."""
+        mean = self.power.mean(0)
+        return mean.clamp_min(max(1e-8 * float(mean.max()), _TINY))
 
 
 @dataclass(frozen=True, eq=False)

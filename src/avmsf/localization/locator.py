@@ -1,8 +1,9 @@
 """The posterior of an impact's contact: gains extracted from its sound, compared with those that a field predicts."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from statistics import fmean
 from threading import RLock
 
@@ -14,7 +15,7 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike, as_directions, as_vectors, short_repr
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
-from avmsf.localization.amplitudes import Amplitudes, Extractor, detuned_extractors
+from avmsf.localization.amplitudes import Amplitudes, Extractor
 from avmsf.localization.contact_map import ContactMap
 from avmsf.localization.likelihood import Force, LikelihoodResult, PredictedGains, cosine_distance, evaluate_likelihood
 from avmsf.localization.prediction import (
@@ -30,6 +31,8 @@ from avmsf.modal.modes import ModalBank
 
 _MAX_CACHED_LENGTHS = 8
 """Lengths of sounds whose equations are kept."""
+DETUNINGS = (0.9, 0.95, 1.05, 1.1)
+"""Factors on all frequencies: 5 % is a half-power bandwidth of a mode that turns six times while it falls to 1/e."""
 _LIKELY = -3.0
 """Tempered log likelihood, relative to the largest, from which on a position is likely: 5 % of its probability."""
 _FORCE_DEVIATIONS = 4.0
@@ -54,10 +57,8 @@ class Locator:
     smoothing: csr_array | None
     """Kernel that smooths the posterior over neighboring points, by the position error of fields of few contacts; None
     for no smoothing."""
-    lengths: dict[tuple[int, float], "_Length"] = dataclass_field(default_factory=dict, repr=False)
-    """Cache: what depends on a sound's length, for the lengths used last."""
-    _lock: RLock = dataclass_field(default_factory=RLock, repr=False)
-    """Held while the cache changes, so that threads share a locator and none repeats another's computation."""
+    _lock: RLock = dataclass_field(default_factory=RLock, repr=False, init=False)
+    """Held while the caches change, so that threads share a locator and none repeats another's computation."""
 
     @classmethod
     def of(
@@ -79,7 +80,7 @@ class Locator:
             field,
             positions.float(),
             gains,
-            variance + local_variance(positions, gains.__getitem__),
+            variance + local_variance(positions, gains),
             dampings,
             smoothing_matrix(positions, contacts=distinct_contacts(field)),
         )
@@ -149,18 +150,14 @@ class Locator:
         """Factor on the exponent of the tempered likelihood, by leave-one-out over the field's own contacts."""
         return calibrate_tempering(self.field)
 
+    @cached_property
+    def _lengths(self) -> "Callable[[int, float], _Length]":
+        return lru_cache(_MAX_CACHED_LENGTHS)(partial(_Length.of, self))
+
     def _length(self, samples: int, highest: float) -> "_Length":
-        key = (samples, highest)
         with self._lock:
             _ = self.tempering_factor
-            # The entry that is used moves to the end, so that one that a stream uses again and again is never dropped.
-            found = self.lengths.pop(key, None)
-            if found is None:
-                while len(self.lengths) >= _MAX_CACHED_LENGTHS:
-                    del self.lengths[next(iter(self.lengths))]
-                found = _Length.of(self, samples, highest)
-            self.lengths[key] = found
-        return found
+            return self._lengths(samples, highest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +171,7 @@ class _Length:
     """Gains of the modes themselves, in units of `unit`."""
     unit: float
     detuned: tuple[Extractor, ...]
-    """For the null model."""
+    """For the null model: of the modes at each of `DETUNINGS` that stay below the highest frequency, if any do."""
 
     @classmethod
     def of(cls, locator: Locator, samples: int, highest: float) -> "_Length":
@@ -198,7 +195,9 @@ class _Length:
             )
         gains = gains / unit
         predicted = _decorrelated(gains, locator.variance[:, modes] / unit**2, extractor)
-        detuned = detuned_extractors(bank, sample_rate=rate, samples=samples, highest=highest)
+        below = [(factor, factor * bank.frequency < highest) for factor in DETUNINGS]
+        banks = [ModalBank(factor * bank.frequency[low], bank.damping[low]) for factor, low in below if bool(low.any())]
+        detuned = tuple(Extractor.of(each, sample_rate=rate, samples=samples) for each in banks)
         return cls(extractor, predicted, gains, unit, detuned)
 
     def separate(self, amplitudes: Amplitudes) -> tuple[Complex128[Tensor, " modes"], Float64[Tensor, " modes"]]:
@@ -251,7 +250,7 @@ def _decorrelated(
         gains, variance = gains.clone(), variance.clone()
         gains[:, correlated] = gains[:, correlated] @ inner.conj().to(torch.complex64)
         variance[:, correlated] = variance[:, correlated] @ inner.abs().square().float()
-    return PredictedGains.of(gains, variance, shares.T @ extractor.bank.frequency)
+    return PredictedGains(gains, variance, shares.T @ extractor.bank.frequency)
 
 
 def _force_notes(

@@ -1,13 +1,12 @@
 """Predicted gains of impacts at points, the variance of their errors, and how strongly these are correlated."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
 import torch
-from jaxtyping import Complex64, Float, Float32, Float64, Int, Int64
+from jaxtyping import Complex64, Float, Float32, Float64
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -77,25 +76,17 @@ def predict(
 
 
 def local_variance(
-    points: Float[Tensor, "points 3"],
-    gains: Callable[[Int[Tensor, " some"]], Complex64[Tensor, "some modes"]],
-    rows: Int[Tensor, " rows"] | None = None,
-) -> Float32[Tensor, "rows modes"]:
-    """Return the variance of gains over the patch of surface that each point, or each of some, represents.
-
-    `gains` returns those of points of given rows.
-    """
-    chosen = torch.arange(len(points)) if rows is None else rows
+    points: Float[Tensor, "points 3"], gains: Complex64[Tensor, "points modes"]
+) -> Float32[Tensor, "points modes"]:
+    """Return the variance of gains over the patch of surface that each point represents."""
     count = min(_NEIGHBORS, len(points) - 1)
+    total = torch.zeros(gains.shape)
     if count < 1:
-        return torch.zeros(gains(chosen).shape)
-    places = points.double().numpy()
-    near = torch.from_numpy(cKDTree(places).query(places[chosen.numpy()], k=count + 1)[1][:, 1:])
-    needed, of = torch.unique(torch.cat([chosen[:, None], near], dim=1), return_inverse=True)
-    known = gains(needed)
-    total = torch.zeros(len(chosen), known.shape[1])
-    for other in of[:, 1:].T:
-        total += (known[other] - known[of[:, 0]]).abs().square()
+        return total
+    positions = points.double().numpy()
+    near = torch.from_numpy(cKDTree(positions).query(positions, k=count + 1)[1][:, 1:])
+    for other in near.T:
+        total += (gains[other] - gains).abs().square()
     return total * (_PATCH / count)
 
 
@@ -175,14 +166,15 @@ def calibrate_tempering(field: SoundField) -> float:
         return 1.0
     gains = fitted_mixture(field)
     fitted = replace(field, gain_field=gains)
-    contacts = _holdout_contacts(gains)
+    contacts = farthest_points(gains.contacts, min(_MAX_HOLDOUT, len(gains.contacts)))
     points = gains.points.double()
+    merged = _SAME * (points.amax(0) - points.amin(0)).norm()
     near = torch.from_numpy(cKDTree(points.numpy()).query(gains.contacts[contacts].numpy())[1])
     spread = farthest_points(points, min(_POINTS, len(points)))
     rows = torch.unique(torch.cat([spread, near]))
     truths = torch.searchsorted(rows, near)
     places, factor = gains.points[rows], calibration_factor(fitted)
-    about = local_variance(gains.points, lambda some: predict(fitted, gains.points[some])[0], rows)
+    about = local_variance(gains.points, predict(fitted, gains.points)[0])[rows]
     prior = point_areas(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
     smoothing = smoothing_matrix(places, contacts=distinct_contacts(fitted))
     # A locator leaves the others out, too.
@@ -190,7 +182,7 @@ def calibrate_tempering(field: SoundField) -> float:
     rotated = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
     score = -0.5 * (_FACTORS.log() / _LOG_PRIOR_STD).square()
     for contact, truth in zip(contacts.tolist(), truths.tolist(), strict=True):
-        left = gains.without(_at_same_point(gains, contact))
+        left = gains.without((gains.contacts - gains.contacts[contact]).norm(dim=1) <= merged)
         if left.place_count < 2:
             continue
         measured = gains.values[contact][kept] * rotated
@@ -198,7 +190,7 @@ def calibrate_tempering(field: SoundField) -> float:
             continue
         loudest = float(measured.abs().max())
         mean, variance, _ = predict(replace(field, gain_field=left), places, factor=factor)
-        known = PredictedGains.of(mean[:, kept], (variance + about)[:, kept], field.bank.frequency[kept].double())
+        known = PredictedGains(mean[:, kept], (variance + about)[:, kept], field.bank.frequency[kept].double())
         found = evaluate_likelihood(
             known, measured, torch.full(measured.shape, _NOISE * loudest**2, dtype=torch.float64)
         )
@@ -211,19 +203,6 @@ def calibrate_tempering(field: SoundField) -> float:
         )
         score += _log_score(exponents[:, None] * found.log_likelihood + prior, truth, smoothing)
     return float(_FACTORS[int(score.argmax())])
-
-
-def _holdout_contacts(gains: MixtureGains) -> Int64[Tensor, " contacts"]:
-    """Return the rows of the contacts that are left out."""
-    if len(gains.contacts) <= _MAX_HOLDOUT:
-        return torch.arange(len(gains.contacts))
-    return farthest_points(gains.contacts, _MAX_HOLDOUT)
-
-
-def _at_same_point(gains: MixtureGains, contact: int) -> Tensor:
-    """Return which contacts are where one is."""
-    size = (gains.points.amax(0) - gains.points.amin(0)).double().norm()
-    return (gains.contacts - gains.contacts[contact]).norm(dim=1) <= _SAME * size
 
 
 def _explained_energy(predicted: Tensor, measured: Tensor, weights: Float64[Tensor, " modes"]) -> float:
