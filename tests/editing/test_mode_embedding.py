@@ -1,4 +1,4 @@
-"""Vectors of mode sets in closed form, and the space that UMAP makes of them: seeded, stored, and made again."""
+"""Vectors of mode sets in closed form, and the space that UMAP makes of them."""
 
 import importlib.util
 import math
@@ -20,8 +20,7 @@ def bank(frequency: list[float] | torch.Tensor, damping: list[float] | torch.Ten
 
 
 def random_bank(modes: int, *, seed: int, pitch: float = 0.0, decay: float = 0.0) -> ModalBank:
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.rand(2, modes, generator=generator, dtype=torch.float64)
+    drawn = torch.rand(2, modes, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     return bank(2 ** (9 + 4 * drawn[0] + pitch), 2 ** (3 + drawn[1] + decay))
 
 
@@ -30,15 +29,11 @@ def shift(features, first: ModalBank, second: ModalBank) -> float:
 
 
 @pytest.mark.parametrize("modes", [1, 7, 200])
-def test_a_set_an_octave_higher_is_one_away(modes):
-    low, high = random_bank(modes, seed=0), random_bank(modes, seed=0, pitch=1.0)
+def test_an_octave_and_twice_the_damping_are_one_away(modes):
+    low, high, fast = (random_bank(modes, seed=0, **change) for change in ({}, {"pitch": 1.0}, {"decay": 1.0}))
     assert shift(pitches, low, high) == pytest.approx(1.0, abs=1e-12)
-
-
-def test_twice_the_damping_is_one_away_and_no_other_pitch():
-    slow, fast = random_bank(9, seed=0), random_bank(9, seed=0, decay=1.0)
-    assert shift(rings, slow, fast) == pytest.approx(1.0, abs=1e-12)
-    assert shift(pitches, slow, fast) == 0.0
+    assert shift(rings, low, fast) == pytest.approx(1.0, abs=1e-12)
+    assert shift(pitches, low, fast) == 0.0
 
 
 def test_dampings_are_taken_where_their_pitch_is():
@@ -47,31 +42,18 @@ def test_dampings_are_taken_where_their_pitch_is():
     curve = rings(bank(frequency, 3.0 * (frequency / 1000) ** 2))[32:] * math.sqrt(15)
     expected = math.log2(3.0) + 2 * (np.linspace(math.log2(125.0), math.log2(16000.0), 15) - math.log2(1000.0))
     assert np.abs(curve - expected)[2:-4] == pytest.approx(0.0, abs=0.01)
-
-
-def test_far_from_every_mode_the_nearest_one_counts():
-    curve = rings(bank([15.0, 16.0], [4.0, 32.0]))[32:] * math.sqrt(15)
-    assert curve[-1] == pytest.approx(5.0, abs=0.1)
+    # Far from every mode the nearest one counts.
+    assert rings(bank([15.0, 16.0], [4.0, 32.0]))[-1] * math.sqrt(15) == pytest.approx(5.0, abs=0.1)
 
 
 @pytest.mark.parametrize("features", FEATURES.values(), ids=FEATURES)
 def test_neither_order_nor_number_of_modes_matters(features):
     one = random_bank(20, seed=1)
-    turned = torch.randperm(20, generator=torch.Generator().manual_seed(0))
-    assert shift(features, one, bank(one.frequency[turned], one.damping[turned])) < 1e-12
-    # Every mode a thousand times instead of once: the quantiles are interpolated a little otherwise.
+    permuted = torch.randperm(20, generator=torch.Generator().manual_seed(0))
+    assert shift(features, one, bank(one.frequency[permuted], one.damping[permuted])) < 1e-12
+    # Quantiles of repeated modes are interpolated a little otherwise.
     dense = bank(2 ** (9 + 4 * torch.linspace(0, 1, 100)), 8.0)
     assert shift(features, dense, bank(dense.frequency.repeat(9), 8.0)) < 0.02
-
-
-@pytest.mark.parametrize("features", FEATURES.values(), ids=FEATURES)
-def test_sets_that_are_none_are_refused(features):
-    with raises(EvaluationError, name="bank", value=0):
-        features(bank([]))
-    with raises(EvaluationError, row=1, name="frequency", value=0.0):
-        features(bank([100.0, 0.0]))
-    with raises(EvaluationError, row=0, name="damping"):
-        features(bank([100.0], math.nan))
 
 
 def labelled(count: int = 8) -> tuple[list[ModalBank], list[str]]:
@@ -81,48 +63,37 @@ def labelled(count: int = 8) -> tuple[list[ModalBank], list[str]]:
     return [*low, *high], ["wood"] * count + ["glass"] * count
 
 
-@pytest.fixture(scope="module")
-def space() -> MaterialSpace:
+@pytest.mark.slow
+def test_like_is_near_unlike_far_and_a_seed_gives_the_same_space():
     # Importing it compiles for many seconds, which only its embeddings need.
     if importlib.util.find_spec("umap") is None:
         pytest.skip("needs pip install 'avmsf[eval]'")
-    return MaterialSpace.of(*labelled(), seed=3)
-
-
-@pytest.mark.slow
-def test_an_objects_like_is_near_and_its_opposite_far(space):
-    wood, glass = random_bank(25, seed=99), random_bank(25, seed=98, pitch=3.0)
-    assert space.distance(space.place(wood), "wood") < 0.5 * space.distance(space.place(wood), "glass")
-    assert space.distance(space.place(glass), "glass") < 0.5 * space.distance(space.place(glass), "wood")
+    space, again = (MaterialSpace.of(*labelled(), seed=3) for _ in range(2))
+    wood, glass = space.place(random_bank(25, seed=99)), space.place(random_bank(25, seed=98, pitch=3.0))
+    assert space.distance(wood, "wood") < 0.5 * space.distance(wood, "glass")
+    assert space.distance(glass, "glass") < 0.5 * space.distance(glass, "wood")
     assert space.nearest_neighbor_accuracy() == 1.0
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_space(space):
-    again = MaterialSpace.of(*labelled(), seed=3)
     assert np.array_equal(again.embedding, space.embedding)
-    other = random_bank(25, seed=99)
-    assert np.array_equal(again.place(other), space.place(other))
-    # Placing others in between changes nothing.
-    space.place(random_bank(10, seed=97))
-    assert np.array_equal(again.place(other), space.place(other))
+    assert np.array_equal(again.place(random_bank(25, seed=99)), wood)
     assert not np.array_equal(MaterialSpace.of(*labelled(), seed=4).embedding, space.embedding)
 
 
-def test_objects_that_make_no_space_are_refused():
-    banks, materials = labelled()
-    with raises(EvaluationError, name="materials", value=15):
-        MaterialSpace.of(banks, materials[1:])
-    with raises(EvaluationError, name="mode_sets", value=(4, 1)):
-        MaterialSpace.of(banks[:4], materials[:4])
-    with raises(EvaluationError, name="bowl", value=0):
-        MaterialSpace.of([*banks, bank([])], [*materials, "wood"], names=[*map(str, range(16)), "bowl"])
-    with raises(EvaluationError, name="material", value="steel"):
-        MaterialSpace.of(banks, materials).center("steel")
+BANKS, MATERIALS = labelled()
 
 
-def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
+@pytest.mark.parametrize(
+    ("make", "attributes"),
+    [
+        (lambda: pitches(bank([])), {"name": "bank", "value": 0}),
+        (lambda: rings(bank([100.0, 0.0])), {"row": 1, "name": "frequency", "value": 0.0}),
+        (lambda: rings(bank([100.0], math.nan)), {"row": 0, "name": "damping"}),
+        (lambda: MaterialSpace.of(BANKS, MATERIALS[1:]), {"name": "materials", "value": 15}),
+        (lambda: MaterialSpace.of(BANKS[:4], MATERIALS[:4]), {"name": "mode_sets", "value": (4, 1)}),
+        (lambda: MaterialSpace.of(BANKS, MATERIALS).center("steel"), {"name": "material", "value": "steel"}),
+        (lambda: MaterialSpace.of(BANKS, MATERIALS).embedding, {"name": "umap-learn"}),
+    ],
+)
+def test_what_makes_no_space_is_refused(make, attributes, monkeypatch):
     monkeypatch.setitem(sys.modules, "umap", None)
-    with raises(EvaluationError, name="umap-learn") as caught:
-        _ = MaterialSpace.of(*labelled()).embedding
-    assert "pip install 'avmsf[eval]'" in str(caught.value)
+    with raises(EvaluationError, **attributes):
+        make()

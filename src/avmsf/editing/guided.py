@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64
 from safetensors.torch import save
 from torch import Tensor
 
@@ -75,64 +75,6 @@ SEARCHED = replace(INDEPENDENT, name="searched", searches=True)
 
 PARAMETERIZATIONS = {each.name: each for each in (HIERARCHICAL, PUBLISHED, INDEPENDENT, SEARCHED)}
 """All of them, by name."""
-
-
-class EditVariables:
-    """The variables of an edit, and their optimizer."""
-
-    def __init__(self, start: ModalEdit, edited: Int[Tensor, " edited"], parameters: Parameterization) -> None:
-        """Begin at `start`; the modes `edited` move by themselves, the others follow the common factors alone.
-
-        Quantities whose rate is 0 stay where they begin.
-        """
-        self.parameters, self.edited = parameters, edited
-        own = torch.zeros(len(start.shift), dtype=torch.bool).index_fill(0, edited, True)
-        self.values = {name: each.detach().clone() for name, each in vars(start).items()}
-        groups = []
-        for name, value in self.values.items():
-            rate = getattr(parameters, f"{name}_rate")
-            if rate > 0:
-                groups.append({"params": [value.requires_grad_()], "lr": rate, "rate": rate})
-                if value.ndim:
-                    value.register_hook(lambda gradient: torch.where(own, gradient, 0.0))
-        # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
-
-    def edit(self) -> ModalEdit:
-        """Return the edit as it stands, differentiable in the values."""
-        return ModalEdit(**self.values)
-
-    def penalty(self) -> Float64[Tensor, ""]:
-        """Return the penalty on single modes, in the unit of the loss."""
-        own = {name: self.values[name][self.edited] for name in _DEVIATIONS}
-        own["scale"] = own["scale"] - own["scale"].mean()
-        parts = [(own[name] / deviation).square().mean() for name, deviation in _DEVIATIONS.items()]
-        return 0.5 * self.parameters.stiffness * torch.stack(parts).sum()
-
-    def differentiate(self, loss: Float[Tensor, ""]) -> bool:
-        """Take the gradient of a loss and the penalty; return whether both are finite."""
-        self.optimizer.zero_grad()
-        torch.autograd.backward(loss + self.penalty())
-        found = [loss, *(value.grad for value in self.values.values() if value.grad is not None)]
-        return all(bool(torch.isfinite(each).all()) for each in found)
-
-    def move(self, *, done: float) -> None:
-        """Take a step of the optimizer; `done` is the fraction of finished steps."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["rate"] * (0.525 + 0.475 * math.cos(math.pi * done))
-        self.optimizer.step()
-
-    def state(self) -> dict[str, Any]:
-        """Return the complete state: tensors, numbers, containers of these."""
-        values = {name: value.detach() for name, value in self.values.items()}
-        return {"values": values, "optimizer": self.optimizer.state_dict()}
-
-    def resume(self, state: dict[str, Any]) -> None:
-        """Restore what `state` returned."""
-        with torch.no_grad():
-            for name, value in self.values.items():
-                value.copy_(state["values"][name])
-        self.optimizer.load_state_dict(state["optimizer"])
 
 
 _MAX_PROBES = 16
@@ -247,10 +189,29 @@ class _Optimization:
         state = self.checkpoint.read()
         searching = state is None and parameters.searches
         start = guide.start(self.probes) if searching else ModalEdit.none(self.field.bank)
-        self.variables = EditVariables(start, self.probes.loudest(config.free_modes), parameters)
+        self.edited = self.probes.loudest(config.free_modes)
+        """The modes that move by themselves; the others follow the common factors alone."""
+        self.values = {name: each.detach().clone() for name, each in vars(start).items()}
+        self.optimizer = self._optimizer()
         if state is not None:
-            self.variables.resume(state["variables"])
+            with torch.no_grad():
+                for name, value in self.values.items():
+                    value.copy_(state["variables"]["values"][name])
+            self.optimizer.load_state_dict(state["variables"]["optimizer"])
             self.step, self.failed = state["step"], state["failed"]
+
+    def _optimizer(self) -> torch.optim.Adam:
+        """Return an optimizer of the values; those whose rate is 0 stay where they begin."""
+        own = torch.zeros(len(self.field.bank), dtype=torch.bool).index_fill(0, self.edited, True)
+        groups = []
+        for name, value in self.values.items():
+            rate = getattr(self.parameters, f"{name}_rate")
+            if rate > 0:
+                groups.append({"params": [value.requires_grad_()], "lr": rate, "rate": rate})
+                if value.ndim:
+                    value.register_hook(lambda gradient: torch.where(own, gradient, 0.0))
+        # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
+        return torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def finish(self, progress: Callable[[GuidedEditProgress], None] | None) -> SoundField:
         """Take the steps that are left and return the edited field."""
@@ -258,7 +219,7 @@ class _Optimization:
             while self.step < self.config.steps:
                 loss = self._take_step()
                 if progress is not None:
-                    edit, every = self.variables.edit(), self.config.preview_every
+                    edit, every = ModalEdit(**self.values), self.config.preview_every
                     due = every > 0 and (self.step % every == 0 or self.step == self.config.steps)
                     preview = self._preview() if due else None
                     factors, place = (edit.pitch_factor, edit.decay_factor), self.loudest_point if due else None
@@ -280,7 +241,7 @@ class _Optimization:
         rows = torch.randperm(len(self.points), generator=generator)[: self.config.contacts_per_step]
         rendered = self._at(self.points[rows])
         before = level(rendered.sounds(), sample_rate=self.field.sample_rate)
-        sounds = rendered.sounds(self.variables.edit())
+        sounds = rendered.sounds(ModalEdit(**self.values))
         after = level(sounds, sample_rate=self.field.sample_rate)
         sounds = sounds * (before.square().sum() / after.square().sum()).sqrt()
         with torch.no_grad():
@@ -303,12 +264,24 @@ class _Optimization:
     def _update(self, sounds: Sounds, targets: Sounds) -> float:
         target = spectral_target(targets, fft_sizes=self.sizes, hops=[size // 4 for size in self.sizes])
         error = spectral_loss(sounds, target) / len(self.sizes)
-        if not self.variables.differentiate(error):
+        self.optimizer.zero_grad()
+        torch.autograd.backward(error + self._penalty())
+        gradients = [value.grad for value in self.values.values() if value.grad is not None]
+        if not all(bool(torch.isfinite(each).all()) for each in (error, *gradients)):
             wanted, advice = "a finite value and gradient", "lower the learning rates"
             raise EditError.expected(wanted, float(error), row=self.step, name="loss", advice=advice)
         self.consistent = False
-        self.variables.move(done=self.step / self.config.steps)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["rate"] * (0.525 + 0.475 * math.cos(math.pi * self.step / self.config.steps))
+        self.optimizer.step()
         return float(error.detach())
+
+    def _penalty(self) -> Float64[Tensor, ""]:
+        """Return the penalty on single modes, in the unit of the loss."""
+        own = {name: self.values[name][self.edited] for name in _DEVIATIONS}
+        own["scale"] = own["scale"] - own["scale"].mean()
+        parts = [(own[name] / deviation).square().mean() for name, deviation in _DEVIATIONS.items()]
+        return 0.5 * self.parameters.stiffness * torch.stack(parts).sum()
 
     def _preview(self) -> Float[Tensor, " samples"]:
         """Return the edited field's sound, noise and all, where the unedited one is loudest."""
@@ -317,7 +290,7 @@ class _Optimization:
     def _normalized_edit(self) -> ModalEdit:
         """Return the edit as it stands, as loud at the probes as the field was."""
         with torch.no_grad():
-            edit = self.variables.edit()
+            edit = ModalEdit(**self.values)
             if self.parameters.gains_follow:
                 edit = edit.following(self.probes.field.bank)
             after = level(self.probes.sounds(edit), sample_rate=self.field.sample_rate)
@@ -330,7 +303,9 @@ class _Optimization:
         return FieldAtContacts.at(self.field, contacts, samples=max(1, samples))
 
     def _save(self) -> None:
-        self.checkpoint.save({"variables": self.variables.state(), "step": self.step, "failed": self.failed})
+        values = {name: value.detach() for name, value in self.values.items()}
+        variables = {"values": values, "optimizer": self.optimizer.state_dict()}
+        self.checkpoint.save({"variables": variables, "step": self.step, "failed": self.failed})
 
 
 def checkpoint_identity(
