@@ -155,7 +155,7 @@ def read_vertices(
     # Vertices are split where normals or colors differ between faces.
     corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
     table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
-    position, normal, color = torch.from_numpy(table).float().split(3, dim=1)
+    position, normal, color = torch.split(torch.from_numpy(table).float(), 3, dim=1)
     return {"POSITION": position, "NORMAL": normal, "COLOR_0": color, "indices": torch.from_numpy(rows.ravel())}, None
 
 
