@@ -112,28 +112,3 @@ def expected_level(values: Array, frequency: Array, counted: Array, *, width: fl
         near = np.exp(-0.5 * (np.log(frequency / mode) / width) ** 2) * counted
         found.append(np.exp((near * np.log((values**2).mean(0))).sum() / near.sum() - bias))
     return np.array(found)
-
-
-def thin_plate(points: Array, contacts: Array, drift_share: float) -> Array:
-    """Return the kernel among points in a plane or on a line, of a thin plate known at some contacts.
-
-    All in one unit; the affine part by its regression on the contacts, both parts of mean one there.
-    """
-
-    def bending(one: Array, other: Array) -> Array:
-        distance = np.linalg.norm(one[:, None] - other, axis=2)
-        return distance**2 * np.log(np.where(distance > 0, distance, 1.0))
-
-    def affine(each: Array) -> Array:
-        return np.column_stack([np.ones(len(each)), each]) @ np.linalg.pinv(
-            np.column_stack([np.ones(len(contacts)), contacts])
-        )
-
-    def parts(one: Array, other: Array) -> tuple[Array, Array]:
-        left, right = affine(one), affine(other)
-        bent = bending(one, other) - left @ bending(contacts, other) - bending(one, contacts) @ right.T
-        return bent + left @ bending(contacts, contacts) @ right.T, left @ right.T
-
-    own = [np.diag(each).mean() for each in parts(contacts, contacts)]
-    bent, drift = parts(points, points)
-    return (1.0 - drift_share) * bent / own[0] + drift_share * drift / own[1]

@@ -7,7 +7,7 @@ import torch
 
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.modal.modes import ModalBank
-from factories.gain_cases import draw, impacts, model
+from factories.gain_cases import draw, model
 
 CONTACTS, MODES = 14, 5
 ORDER = torch.tensor([2, 4, 0])
@@ -59,16 +59,6 @@ def test_a_shift_of_one_two_hundredth_moves_a_value_by_its_standard_error():
     expected = torch.zeros_like(moved)
     expected[6, 1, 0], expected[2, 3, 1] = model().noise()[1, 0], -model().noise()[3, 1]
     assert torch.allclose(moved, expected, rtol=1e-5, atol=1e-9)
-
-
-def test_finished_is_the_model_of_the_moved_values_in_another_order():
-    finished, asked = refined(0.01).finished(ORDER), impacts(9, seed=5)
-    expected = model().with_values(refined(0.01).finished(torch.arange(MODES)).values).take(ORDER)
-    assert torch.equal(finished.values, expected.values)
-    assert torch.equal(
-        finished.predict(asked.points, asked.directions).mean, expected.predict(asked.points, asked.directions).mean
-    )
-    assert not finished.mixture.values.requires_grad
 
 
 def test_a_shift_costs_its_squares_by_the_modes_energy():

@@ -1,5 +1,7 @@
 """Kernel families: what makes them covariances, what they are invariant to, and splines as an independent oracle."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
@@ -12,18 +14,38 @@ from scipy.interpolate import RBFInterpolator
 from avmsf.field.gains import kernels
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.symmetry import Symmetric
+from avmsf.symmetry.characters import groups_of
+from avmsf.symmetry.symmetries import MirrorSymmetry, Symmetries
 from factories.gain_cases import POSITIONAL, SIZE, draw, impacts, plate
-from oracles import gain_model as oracle
 
-KINDS = [*POSITIONAL, Elastic]
+KINDS = [*POSITIONAL, Elastic, Symmetric, Visual]
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
-def made(kind: type[KernelFamily], sites: Sites) -> KernelFamily:
-    return Elastic(sites, SIZE, plate()) if kind is Elastic else kind(sites, SIZE)
+def made(
+    kind: type[KernelFamily],
+    sites: Sites,
+    move: Callable[[torch.Tensor], torch.Tensor] = torch.clone,
+    size: float = SIZE,
+) -> KernelFamily:
+    """Return a family of the plate, which a similarity moved and enlarged to this size."""
+    origin, (x, y, _) = move(torch.zeros(3, dtype=torch.float64)), torch.eye(3, dtype=torch.float64)
+    if kind is Elastic:
+        ends = move(plate().nodes[:, None] + plate().shapes) - move(plate().nodes)[:, None]
+        return Elastic(sites, size, replace(plate(), nodes=move(plate().nodes), shapes=ends))
+    if kind is Visual:
+        return Visual(sites, size, move(impacts(40, seed=3).points).float(), draw(40, 4, seed=4).float())
+    if kind is Symmetric:
+        normals = (torch.nn.functional.normalize(move(each) - origin, dim=0) for each in (x, y))
+        mirrors = tuple(MirrorSymmetry(each, origin, 0.0) for each in normals)
+        groups = groups_of(Symmetries((), mirrors, 0.01, 0.38, math.inf))
+        return Symmetric(sites, size, groups, directional=True)
+    return kind(sites, size)
 
 
 def scattered(dimensions: int, count: int, *, seed: int = 5) -> torch.Tensor:
@@ -74,45 +96,24 @@ def test_elastic_kernels_are_loadings_times_factors():
     assert torch.allclose(found, family.take(rows).between(others, known), rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@every_kind
 @pytest.mark.parametrize("count", [4, 12])
-def test_kernels_are_covariances_everywhere(kind, count):
-    """Symmetric and positive semidefinite among the reference impacts and any others together."""
+def test_kernels_are_covariances_of_mean_one_at_the_contacts(kind, count):
+    """Symmetric and positive semidefinite among the contacts and any other impacts, with `own` on the diagonal."""
     family, others = made(kind, impacts(count, seed=1)), impacts(9, seed=2)
-    both = Sites(
-        torch.cat([family.reference.points, others.points]), torch.cat([family.reference.directions, others.directions])
-    )
+    known = family.reference
+    both = Sites(torch.cat([known.points, others.points]), torch.cat([known.directions, others.directions]))
     joint = family.between(both, both)
-    assert torch.allclose(joint, joint.mT, rtol=1e-12, atol=1e-12)
-    assert bool((torch.linalg.eigvalsh(joint).amin(1) > -1e-12 * joint.abs().amax((1, 2)) - 1e-300).all())
+    torch.testing.assert_close(joint, joint.mT, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(joint[:, :count, :count], family.kernels(), rtol=1e-9, atol=1e-9)
+    assert bool((torch.linalg.eigvalsh(joint).amin(1) > -1e-9 * joint.abs().amax((1, 2)) - 1e-300).all())
+    diagonal = torch.diagonal(joint, dim1=1, dim2=2)
+    torch.testing.assert_close(family.own(both), diagonal, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(family.take(torch.tensor([-1])).own(both), diagonal[-1:], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(diagonal[:, :count].mean(1), torch.ones(len(family)).double(), rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [4, 12])
-def test_kernels_have_mean_one_on_the_diagonal(kind, count):
-    diagonal = torch.diagonal(made(kind, impacts(count, seed=1)).kernels(), dim1=1, dim2=2).mean(1)
-    assert torch.allclose(diagonal, torch.ones_like(diagonal), rtol=1e-9)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_kernels_to_other_places_agree_with_those_among_the_contacts(kind):
-    family = made(kind, impacts(12, seed=1))
-    again = Sites(family.reference.points.clone(), family.reference.directions.clone())
-    assert torch.allclose(family.between(again, again), family.kernels(), rtol=1e-12, atol=1e-12)
-    rows = torch.tensor([7, 0, 3])
-    cross = family.between(again.take(rows), family.reference)
-    assert torch.allclose(cross, family.kernels()[:, rows], rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_own_variance_is_the_diagonal(kind):
-    family, others = made(kind, impacts(12, seed=1)), impacts(9, seed=2)
-    diagonal = torch.diagonal(family.between(others, others), dim1=1, dim2=2)
-    assert torch.allclose(family.own(others), diagonal, rtol=1e-9, atol=1e-12)
-    assert torch.allclose(family.take(torch.tensor([-1])).own(others), diagonal[-1:], rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", KINDS)
+@every_kind
 def test_mean_is_the_kernels_times_their_coefficients(kind):
     family, others = made(kind, impacts(12, seed=1)), impacts(9, seed=2)
     kept = family.take(torch.arange(0, len(family), 2))
@@ -122,12 +123,12 @@ def test_mean_is_the_kernels_times_their_coefficients(kind):
     assert torch.allclose(found, expected, rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@every_kind
 def test_an_opposite_impact_changes_the_sign(kind):
     family, others = made(kind, impacts(12, seed=1)), impacts(9, seed=2)
     cross = family.between(others, family.reference)
     opposite = family.between(replace(others, directions=-others.directions), family.reference)
-    assert torch.equal(opposite, -cross)
+    torch.testing.assert_close(opposite, -cross, rtol=1e-12, atol=1e-12)
     assert bool(cross[-1].any())
 
 
@@ -140,30 +141,19 @@ def test_perpendicular_impacts_say_nothing_of_each_other(kind):
     assert torch.equal(family.own(others), family.own(family.reference))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@every_kind
 @pytest.mark.parametrize("count", [4, 12])
-def test_moving_the_object_changes_nothing(kind, count):
-    sites, others, shift = impacts(count, seed=1), impacts(9, seed=2), torch.tensor([3.0, -1.0, 2.0]).double()
-    moved, elsewhere = (Sites(each.points @ turn().T + shift, each.directions @ turn().T) for each in (sites, others))
-    one = made(kind, sites)
-    if kind is Elastic:
-        body = replace(plate(), nodes=plate().nodes @ turn().T + shift, shapes=plate().shapes @ turn().T)
-        other: KernelFamily = Elastic(moved, SIZE, body)
-    else:
-        other = kind(moved, SIZE)
-    found = other.between(elsewhere, moved)
+def test_an_object_that_is_moved_turned_and_enlarged_has_the_same_kernels(kind, count):
+    def move(points: torch.Tensor) -> torch.Tensor:
+        return 7.0 * points @ turn().T + torch.tensor([3.0, -1.0, 2.0], dtype=torch.float64)
+
+    here = impacts(count, seed=1), impacts(9, seed=2)
+    there = [Sites(move(each.points), each.directions @ turn().T) for each in here]
+    found = made(kind, there[0], move, 7.0 * SIZE).between(*there)
     # The elastic family keeps shapes in single precision.
-    assert torch.allclose(found, one.between(others, sites), rtol=0, atol=1e-5 if kind is Elastic else 1e-9)
-
-
-@pytest.mark.parametrize("kind", POSITIONAL)
-@pytest.mark.parametrize("count", [4, 12])
-def test_a_larger_object_has_the_same_kernels(kind, count):
-    sites, others = impacts(count, seed=1), impacts(9, seed=2)
-    larger, elsewhere = (replace(each, points=7.0 * each.points) for each in (sites, others))
-    one, other = kind(sites, SIZE), kind(larger, 7.0 * SIZE)
-    found = other.between(elsewhere, larger)
-    assert torch.allclose(found, one.between(others, sites), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        found, made(kind, here[0]).between(*here), rtol=0, atol=1e-5 if kind is Elastic else 1e-9
+    )
 
 
 @pytest.mark.parametrize("kind", POSITIONAL)
@@ -187,19 +177,6 @@ def test_smooth_kernels_are_the_written_ones():
     smooth = [torch.exp(-0.5 * squares / (share * 0.4) ** 2) for share in (0.05, 0.1, 0.2, 0.4, 0.8)]
     mixed = [(1.0 - share) * each + share * affine for share in (0.5, 0.9) for each in smooth[1:]]
     assert torch.allclose(family.kernels(), torch.stack(smooth + mixed), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("dimensions", [1, 2])
-def test_thin_plate_kernels_are_the_written_ones(dimensions):
-    """Along the axes of the contacts, over the longest extent, with each share of the affine part."""
-    known, others = scattered(dimensions, 12), scattered(dimensions, 5, seed=6)
-    middle, both = known.mean(0), torch.cat([known, others])
-    axes = torch.linalg.svd(known - middle, full_matrices=False).Vh[:dimensions].T
-    along = ((both - middle) @ axes).numpy()
-    along /= np.ptp(along[:12], axis=0).max()
-    expected = [oracle.thin_plate(along, along[:12], share) for share in (0.3, 0.7, 0.95)]
-    found = ThinPlate(alike(known), 0.4).between(alike(both), alike(both)).numpy()
-    assert found == pytest.approx(np.stack(expected), rel=1e-8, abs=1e-9)
 
 
 def spline_case(dimensions: int, count: int) -> tuple[ThinPlate, Sites, torch.Tensor]:

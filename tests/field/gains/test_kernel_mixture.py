@@ -123,25 +123,6 @@ def test_evidence_is_the_textbook_one():
     assert found.numpy() == pytest.approx(np.array(expected), rel=1e-9)
 
 
-def test_evidence_is_the_likelihood_integrated_over_the_scale():
-    """Up to a constant that depends on the number of contacts alone, by numerical integration over log s."""
-    values, floor, _ = drawn()
-    kernels = among()[:, :3, :3]
-    found = log_evidence(*(torch.from_numpy(each.copy()) for each in (kernels, values[:3], floor)))
-    integrals = [
-        [
-            [
-                oracle.integrated_log_evidence(k, q + floor[s], values[:3, s], np.zeros_like, (-24.0, 48.0))
-                for s in range(SERIES)
-            ]
-            for q in NOISE_SHARES
-        ]
-        for k in kernels
-    ]
-    difference = found.numpy() - np.array(integrals)
-    assert difference == pytest.approx(np.full_like(difference, difference[0, 0, 0]), abs=1e-6)
-
-
 def test_evidence_does_not_depend_on_the_batches(monkeypatch):
     tensors = [torch.from_numpy(each.copy()) for each in (among(), *drawn()[:2])]
     whole = log_evidence(*tensors)
@@ -238,11 +219,6 @@ def test_leave_out_is_what_the_other_groups_predict(groups):
                 assert one[rows, series].numpy() == pytest.approx(other, rel=rel, abs=1e-9)
 
 
-def test_a_lone_group_is_predicted_as_silence():
-    mean = mixture().leave_out(torch.zeros(CONTACTS, dtype=torch.int64)).mean
-    assert torch.allclose(mean, torch.zeros_like(mean), atol=1e-9)
-
-
 def test_weights_sum_to_one_and_none_is_negligible():
     found = weighed(mixture().values, mixture().floor, hypotheses())
     assert torch.allclose(found.weights.sum((0, 1)), torch.ones(SERIES, dtype=torch.float64))
@@ -284,25 +260,6 @@ def test_the_prior_is_learned_by_five_rounds_of_expectation_maximization():
         likelihood + log_prior[:, None], given.category.tolist(), start, rounds=5, pseudo_count=0.1
     )
     assert learned_prior(torch.from_numpy(likelihood), given).numpy() == pytest.approx(expected, rel=1e-6)
-
-
-def test_a_series_that_says_little_borrows_from_the_others():
-    generator = np.random.default_rng(6)
-    chosen = np.linalg.cholesky(among()[2] + 0.003 * np.eye(CONTACTS)) @ generator.normal(size=(CONTACTS, 20))
-    weak = torch.from_numpy(generator.normal(size=(CONTACTS, 1)))
-    floor, alike = torch.zeros(21, dtype=torch.float64), torch.zeros(KERNELS, 21, dtype=torch.float64)
-    # Against a floor of a hundred times the mean square, all kernels are nearly alike.
-    floor[-1] = 100.0
-    values = torch.cat([torch.from_numpy(chosen), weak], dim=1)
-    separate = hypotheses(
-        category=torch.arange(KERNELS),
-        category_prior=torch.full((KERNELS,), 0.25, dtype=torch.float64),
-        log_prior=alike,
-    )
-    together = weighed(values, floor, separate).weights[2, :, -1].sum()
-    alone = weighed(values[:, -1:], floor[-1:], replace(separate, log_prior=alike[:, :1])).weights[2, :, -1].sum()
-    assert float(alone) < 0.35
-    assert float(together) > 0.8
 
 
 def test_a_series_of_zeros_has_mean_zero_and_teaches_nothing():

@@ -1,6 +1,5 @@
-"""The gain model: predictions against dense computations, invariances, and its record and tensors in a file."""
+"""The gain model: predictions against dense computations, invariances, and what mode shapes are worth."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -145,50 +144,6 @@ def test_one_contact_leaves_families_as_probable_as_they_were():
     assert torch.allclose(given.shares(), expected[:, None].expand(-1, MODES), rtol=1e-9)
 
 
-def test_leave_one_out_does_not_know_the_place():
-    """Whatever is measured at a place, by one impact or two, changes the prediction there through the weights alone."""
-    given = model()
-    assert given.places.tolist().count(int(given.places[0])) == 2
-    mean = given.leave_one_out()
-    for place in given.places.unique().tolist():
-        rows = torch.nonzero(given.places == place).flatten()
-        others = given.without(given.places == place)
-        # One hypothesis alone has no weights that the others could change.
-        weights = torch.zeros_like(given.mixture.weights)
-        weights[-1, 0] = 1.0
-        single, rest = (replace(each, mixture=replace(each.mixture, weights=weights)) for each in (given, others))
-        expected = gains_at(rest, given.training.take(rows))
-        assert torch.allclose(single.leave_one_out()[rows], expected, rtol=1e-4, atol=1e-6)
-    assert float((mean - given.values).abs().square().sum() / given.values.abs().square().sum()) < 0.1
-
-
-def test_standardized_errors_are_of_size_one_for_draws_of_the_model():
-    """Over many modes drawn from a smooth kernel with one percent of noise."""
-    sites = impacts(16, seed=1)
-    smooth = families(sites)[1]
-    kernel = smooth.kernels()[2] + 0.01 * torch.eye(16, dtype=torch.float64)
-    drawn = torch.randn(16, 200, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
-    values = torch.linalg.cholesky(kernel).to(torch.complex128) @ drawn
-    gains = replace(
-        measured(sites),
-        values=values,
-        variance=torch.zeros(200, dtype=torch.float64),
-        frequency=torch.linspace(100.0, 9000.0, 200, dtype=torch.float64),
-        damping=torch.full((200,), 10.0, dtype=torch.float64),
-    )
-    given = fit_mixture(families(sites, elastic=False), gains, sites.points.float(), directional=True)
-    assert float(given.standardized_errors().square().mean().sqrt()) == pytest.approx(1.0, abs=0.15)
-
-
-def test_standardized_errors_judge_the_measured_gains():
-    given = model()
-    errors = given.standardized_errors()
-    assert errors.shape == (14, MODES, 2)
-    moved = replace(given.with_values(2.0 * given.values), measured=given.values)
-    assert torch.equal(moved.leave_one_out(), given.leave_one_out())
-    assert torch.equal(moved.standardized_errors(), errors)
-
-
 @pytest.mark.parametrize("variance", [0.0, 1e-5, 100.0])
 def test_a_mode_without_gains_is_silent_and_changes_no_other(variance):
     sites = impacts(12, seed=1)
@@ -280,27 +235,45 @@ def test_the_mean_is_linear_in_the_values():
     assert torch.equal(given.with_values(given.values).mixture.weights, given.mixture.weights)
 
 
-def test_impacts_of_no_direction_go_straight_into_the_body():
-    given = model()
-    into = torch.zeros_like(ASKED.points)
-    into[:, 2] = -ASKED.points[:, 2].sign()
-    directions = 3.0 * ASKED.directions
-    directions[::2] = 0.0
-    sites = given.sites(ASKED.points, directions)
-    assert torch.allclose(sites.directions[::2], into[::2])
-    assert torch.allclose(sites.directions[1::2], ASKED.directions[1::2])
-    assert torch.allclose(given.sites(ASKED.points).directions, into)
-    assert not directions[::2].any()
+def test_mode_shapes_predict_what_positions_cannot_and_know_how_well():
+    """Of shapes that are known at few places."""
+    sites, asked = impacts(8, seed=1), impacts(60, seed=5)
+    gains, true = measured(sites, noise=0.01), measured(asked, noise=0.0).values
+    fits = [
+        fit_mixture(families(sites, elastic=each), gains, sites.points.float(), directional=True)
+        for each in (True, False)
+    ]
+    own, other = (gains_at(each, asked) - true for each in fits)
+    shaped, smooth = ((each.abs().square().mean(0) / true.abs().square().mean(0)).sqrt() for each in (own, other))
+    assert float(smooth.min()) > 0.3
+    assert float(shaped.max()) < 0.1
+    within = torch.view_as_real(own).abs() < 1.645 * deviation_at(fits[0], asked)
+    # Of draws from the model .9; shapes that are exact leave less unknown than the hypotheses allow for.
+    assert float(within.double().mean()) > 0.85
 
 
-@pytest.mark.parametrize("elastic", [True, False])
-def test_a_model_comes_back_from_its_tensors_to_the_last_bit(elastic):
-    given = replace(model(elastic=elastic), measured=1.1 * model(elastic=elastic).values, spread_share=0.75)
-    record = json.loads(json.dumps(given.record()))
-    tensors = {name: tensor.detach().clone().contiguous() for name, tensor in given.tensors().items()}
-    back = MixtureGains.restore(record, tensors)
-    assert torch.equal(back.point_estimate(ASKED.points).parts, given.point_estimate(ASKED.points).parts)
-    assert torch.equal(back.leave_one_out(), given.leave_one_out())
-    pairs = zip(*(each.covariances(ASKED.points, None) for each in (back, given)), strict=True)
-    assert all(torch.equal(one[1], other[1]) and one[2] == other[2] for one, other in pairs)
-    assert back.record() == record
+def test_two_impacts_near_each_other_that_differ_do_not_make_gains_run_away():
+    sites = impacts(12, seed=1).take(torch.tensor([*range(12), 0]))
+    sites.points[12, 0] += 1e-4
+    gains = measured(sites)
+    size = float(gains.values.abs().max())
+    gains.values[12] = gains.values[0] + size
+    given = fit_mixture(families(sites, elastic=False), gains, sites.points.float(), directional=True)
+    assert given.place_count == 12
+    # A slope of their difference over a tenth of a millimeter would reach a thousand times as far.
+    assert float(gains_at(given).abs().max()) < 3.0 * size
+
+
+def test_impacts_in_one_place_have_their_mean_there():
+    sites = impacts(1, seed=1).take(torch.zeros(4, dtype=torch.int64))
+    noise = 0.02 * torch.tensor([1.0, -1.0, 2.0, -2.0], dtype=torch.float64)[:, None]
+    gains, exact = measured(sites), measured(sites.take(torch.tensor([0])), noise=0.0).values
+    given = fit_mixture(
+        families(sites, elastic=False), replace(gains, values=exact * (1.0 + noise)), sites.points.float(),
+        directional=True,
+    )  # fmt: skip
+    assert given.place_count == 1
+    found = gains_at(given, sites)
+    torch.testing.assert_close(found, exact.expand(4, -1), rtol=0, atol=0.05 * float(exact.abs().max()))
+    assert bool(gains_at(given).isfinite().all())
+    assert bool(deviation_at(given).isfinite().all())

