@@ -89,15 +89,6 @@ def test_an_interrupted_fit_goes_on_to_the_same_result(tmp_path, stage, step):
     assert keys.told[done:] == []
 
 
-def test_a_fit_may_be_interrupted_again_and_again(tmp_path):
-    checkpoint = tmp_path / "fit.checkpoint"
-    keys = Interruption(*((stage, step) for stage in STAGES for step in (3, 9, 13)))
-    for _ in range(9):
-        with pytest.raises(KeyboardInterrupt):
-            fitted(checkpoint, keys)
-    expect_same(fitted(checkpoint, keys), uninterrupted())
-
-
 def interrupt(patch: pytest.MonkeyPatch, owner: type, name: str, *, call: int) -> None:
     """Press the keys at the end of the given call of a method."""
     original, calls = getattr(owner, name), count(1)
@@ -136,16 +127,6 @@ def test_patience_survives_an_interruption(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fitted(tmp_path / "state", keys, config=PATIENT)
     expect_same(fitted(tmp_path / "state", keys, config=PATIENT), uninterrupted(PATIENT))
-
-
-def test_a_look_that_was_cut_off_is_taken_again(tmp_path, monkeypatch):
-    stopped = uninterrupted(PATIENT).origin.report["steps"]
-    # Sounds are made once a step after the warm-up and once a look, of which the first comes before those steps.
-    with monkeypatch.context() as patch:
-        interrupt(patch, TrainingRun, "sounds", call=stopped + stopped // 10 + 1)
-        with pytest.raises(KeyboardInterrupt):
-            fitted(tmp_path / "state", config=PATIENT)
-    expect_same(fitted(tmp_path / "state", config=PATIENT), uninterrupted(PATIENT))
 
 
 def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):

@@ -107,21 +107,13 @@ def test_independent_noise_is_rendered_as_noise():
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_few_places_say_nothing_of_quality(count):
-    field = fitted(replace(strikes(20), before=None, after=None).take(range(count)))
-    assert field.quality is None
+    assert fitted(parted(strikes(20))[0].take(range(count))).quality is None
 
 
-def test_the_sentence_names_both_errors_and_what_to_do():
-    better, worse = str(FieldQuality(9, 0.321, 0.72)), str(FieldQuality(9, 0.81, 0.72))
-    assert "0.32" in better
-    assert "0.72" in better
-    assert "0.81" in worse
-    assert "photographs" in worse
-    assert "photographs" not in better
-
-
-def test_an_edited_field_has_no_quality():
+def test_an_edited_field_has_no_quality_and_its_surroundings_no_next_contact():
     field = fitted(parted(strikes(20))[0])
+    # The points fill the box of the contacts: many of them are not on any object.
+    assert field.quality.next_contact is None
     edited = replace(field, origin=replace(field.origin, report={**field.origin.report, "edits": [{"edit": "x"}]}))
     assert edited.quality is None
 
@@ -145,18 +137,6 @@ def test_the_next_contact_is_where_no_contact_is_and_lowers_the_expected_error_m
     assert torch.equal(suggest(field, 1).contacts[0], contact)
     save(field, tmp_path / "field.safetensors")
     assert load(tmp_path / "field.safetensors").quality == field.quality
-
-
-def test_no_contact_is_advised_where_the_object_is_not_known():
-    # The points fill the box of the contacts: many of them are not on any object.
-    assert fitted(parted(strikes(20))[0]).quality.next_contact is None
-
-
-def test_the_advice_says_where_and_how_far_away():
-    words = str(FieldQuality(9, 0.3, 0.7, (0.0214, -0.013, 0.08), 0.0413))
-    assert "(0.021, -0.013, 0.080) m" in words
-    assert "41 mm" in words
-    assert FieldQuality(9, 0.3, 0.7).advice == ""
 
 
 @pytest.mark.parametrize(("nearest", "mean"), [(None, 0.7), (0.9, 0.7), (0.7, 0.9)])

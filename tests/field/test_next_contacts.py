@@ -117,19 +117,6 @@ def test_contacts_differ_lie_on_the_object_and_lower_the_error_each(made: type) 
         assert torch.allclose(found.directions, DOWN.expand(8, 3))
 
 
-@both_models
-@pytest.mark.parametrize("count", [3, 20])
-def test_what_is_not_known_of_places_has_no_negative_variance(made: type, count: int) -> None:
-    contacts = bar_contacts(count)
-    rows = [*range(count), 0]
-    known = made(contacts[rows], drawn_gains(contacts, seed=4)[rows]).covariances(bar_contacts(40, seed=9), None)
-    for _, covariance, noise in known:
-        size = float(torch.diagonal(covariance).max())
-        assert noise > 0
-        assert torch.allclose(covariance, covariance.T, atol=1e-9 * size)
-        assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * size
-
-
 def test_gains_of_unknown_uncertainty_are_refused() -> None:
     impacts = plate_impacts()
     modes = plate_extraction(impacts)

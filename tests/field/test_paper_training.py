@@ -6,10 +6,8 @@ import pytest
 import torch
 
 from avmsf.field.config import AttentionShape, FitConfig
-from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention, AttentionGains
 from avmsf.field.gains.data import gain_data
-from avmsf.field.store import load, save
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.residual_noise import noise_power
 from avmsf.modal.spectra import magnitude_stft
@@ -112,13 +110,3 @@ def test_the_context_is_projected_where_it_is_asked_for() -> None:
     assert torch.allclose(projected.read(rows).mean, plain.read(rows).mean, atol=1e-6)
     projected.load_state_dict({**plain.state_dict(), "project.weight": torch.zeros(8, 8)})
     assert not torch.allclose(projected.read(rows).mean, plain.read(rows).mean, atol=1e-3)
-
-
-def test_a_projected_field_is_read_back(tmp_path) -> None:
-    impacts = plate_impacts()
-    config = replace(SHORT, projection=True, warmup_gains="regression", warmup_weights="equal", spectral_norm="common")
-    field = fit(impacts, plate_features(), plate_extraction(impacts), config, gains=Attention())
-    save(field, tmp_path / "new.safetensors")
-    read = load(tmp_path / "new.safetensors")
-    assert read.origin.config == field.origin.config
-    assert torch.equal(read.render(impacts.contacts), field.render(impacts.contacts))

@@ -70,19 +70,6 @@ def test_what_is_drawn_from_the_model_is_covered() -> None:
     assert by_energy == pytest.approx(0.9, abs=0.05)
 
 
-def test_a_wider_interval_covers_more() -> None:
-    everywhere = bar_contacts(60, seed=13)
-    rates = []
-    for seed in range(4):
-        values = drawn_gains(everywhere, seed=seed)
-        field = sound_field(positional_field(everywhere[:20], values[:20]))
-        measured = torch.view_as_complex(values[20:])
-        rates.append([coverage(field, everywhere[20:], measured, level=each).plain for each in (0.3, 0.6, 0.9)])
-    low, middle, high = torch.tensor(rates).mean(0).tolist()
-    assert low < middle < high
-    assert high == pytest.approx(0.9, abs=0.08)
-
-
 def test_an_impact_from_below_has_the_opposite_gain_where_directions_are_known() -> None:
     everywhere = bar_contacts(60, seed=13)
     values = drawn_gains(everywhere, seed=0)
@@ -198,17 +185,6 @@ def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
     torch.testing.assert_close(
         spectrum_band(above, points[3]).upper_db, spectrum_band(mute, points[3]).upper_db, rtol=0, atol=1e-9
     )
-
-
-def test_bands_are_the_same_every_time_and_wider_where_less_is_known() -> None:
-    contacts = bar_contacts(80)
-    contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
-    field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=8)))
-    struck, far = contacts[0], torch.tensor([0.95 * LENGTH, 0.05, 0.0])
-    near, off, again = (spectrum_band(field, each) for each in (struck, far, far))
-    assert torch.equal(off.upper_db, again.upper_db)
-    peak = int((BANK.frequency[0] / 2000 * 800).round())
-    assert float((off.upper_db - off.lower_db)[peak]) > 2.0 * float((near.upper_db - near.lower_db)[peak])
 
 
 def test_what_cannot_be_said_is_refused() -> None:

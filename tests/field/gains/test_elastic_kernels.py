@@ -32,8 +32,6 @@ from factories.gain_cases import SIZE, draw, families, impacts, measured, plate
 from oracles import gain_model as oracle
 
 SHAPES = 6
-UNCHANGED = len(FACTORS) // 2 * len(FREQUENCY_ERRORS)
-"""Row of the pair of a factor of 1 and the least error."""
 PROFILES = len(PERTURBATIONS) + len(WIDTHS)
 
 
@@ -130,15 +128,6 @@ def test_gains_tell_the_factor_where_frequencies_do_not():
     assert abs(math.log(body.factor / 1.3)) <= 0.05
 
 
-def test_a_frequency_alone_tells_which_of_two_alike_shapes_a_mode_is():
-    """With one contact gains say nothing: the kernels whose center is nearest in frequency are most probable."""
-    given = family(1)
-    given.frequency_weights = torch.where(torch.arange(len(given.frequency_weights)) == UNCHANGED, 1.0, 0.0).double()
-    prior = given.log_prior(torch.log(plate().frequency)).reshape(PROFILES, SHAPES, len(RESIDUALS), SHAPES)
-    assert torch.equal(prior[0, :, 0].argmax(0), torch.arange(SHAPES))
-    assert torch.equal(prior, prior[:1, :, :1].expand_as(prior))
-
-
 @pytest.mark.parametrize(("scatter", "expected"), [(0.0, 0.01), (0.025, 0.03)])
 def test_all_modes_together_tell_how_exact_the_frequencies_are(scatter, expected):
     sites = impacts(8, seed=1)
@@ -166,7 +155,11 @@ def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
         for error, weight in zip(FREQUENCY_ERRORS, 0.5 * each + 0.5 * each.mean(), strict=True):
             density = norm.pdf(measured_modes.numpy(), center[:, None], error)
             expected += float(weight) * density * (high - low) / inside
-    assert given.shape_log_prior(measured_modes).exp().numpy() == pytest.approx(expected, rel=1e-4)
+    found = given.shape_log_prior(measured_modes)
+    assert found.exp().numpy() == pytest.approx(expected, rel=1e-4)
+    # It is that of each kernel around a shape.
+    prior = given.log_prior(measured_modes).reshape(PROFILES, SHAPES, len(RESIDUALS), SHAPES)
+    assert torch.equal(prior, found[None, :, None].expand_as(prior))
 
 
 def test_the_factors_prior_is_a_density_of_the_log_factor():
