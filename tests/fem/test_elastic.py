@@ -8,9 +8,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.sparse.linalg
 import torch
-from jaxtyping import Float64
 from threadpoolctl import threadpool_info, threadpool_limits
-from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.eigen import lowest_vibrations, one_blas_thread, rigid_motions
@@ -48,11 +46,6 @@ def curved(sides: int) -> Solid:
     directions = torch.stack([along, across, torch.full_like(along, 0.1)], dim=1)
     radii = 0.1 + flat.points[:, 2:]
     return Solid.build(radii * directions / directions.norm(dim=1, keepdim=True), flat.cells)
-
-
-def rotation() -> Float64[Tensor, "3 3"]:
-    drawn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))).Q
-    return drawn * torch.linalg.det(drawn)
 
 
 def test_a_slender_bar_bends_as_a_free_beam():
@@ -104,23 +97,9 @@ def test_frequencies_converge_as_second_order_elements_do():
 
 
 def test_thin_curved_walls_do_not_lock():
-    skfem = pytest.importorskip("skfem", reason="linear elements are scikit-fem's")
+    # Linear elements of the finer mesh are half as high again.
     coarse, fine = (float(elastic_modes(curved(sides), GLASS, count=4).frequency[0]) for sides in (5, 9))
     assert coarse == pytest.approx(fine, rel=0.03)
-    linear = linear_frequency(skfem, curved(9), GLASS)
-    assert linear > 1.5 * fine
-
-
-def linear_frequency(skfem: object, solid: Solid, material: Material) -> float:
-    from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, MeshTet
-    from skfem.helpers import dot
-    from skfem.models.elasticity import lame_parameters, linear_elasticity
-
-    basis = Basis(MeshTet(solid.points.numpy().T, solid.cells.numpy().T), ElementVector(ElementTetP1()))
-    forces = linear_elasticity(*lame_parameters(material.young, material.poisson)).assemble(basis)
-    weights = BilinearForm(lambda u, v, w: material.density * dot(u, v)).assemble(basis)
-    squares = scipy.sparse.linalg.eigsh(forces, k=8, M=weights, sigma=-1e6, return_eigenvectors=False)
-    return math.sqrt(np.sort(squares)[6]) / (2 * math.pi)
 
 
 def test_matrices_are_those_of_another_implementation(bracket):
@@ -184,37 +163,6 @@ def test_shapes_are_mass_normalized_and_free_of_rigid_motion(bracket):
     np.testing.assert_allclose(stored, np.diag(found.squares), atol=1e-8 * found.squares[-1])
 
 
-def test_response_is_reciprocal_and_that_of_the_matrices(bracket, modes):
-    mesh, forces, weights = matrices(bracket, STEEL)
-    heavy = scipy.sparse.kron(weights, np.eye(3), format="csr")
-    # Close above the second mode, where all others together do a thousandth of what it does.
-    square = (2 * math.pi * float(modes.frequency[1])) ** 2 * (1 + 1e-6)
-    one, other = 0, len(bracket.points) - 2
-    directions = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.28, 0.96]], dtype=torch.float64)
-    gains = modes.gains(torch.from_numpy(mesh.nodes[[one, other]]), directions)
-    responses = []
-    for struck, heard in ((0, 1), (1, 0)):
-        force = np.zeros(forces.shape[0])
-        node = (one, other)[struck]
-        force[3 * node : 3 * node + 3] = directions[struck]
-        moved = scipy.sparse.linalg.spsolve((forces - square * heavy).tocsc(), force).reshape(-1, 3)
-        responses.append(moved[(one, other)[heard]] @ directions[heard].numpy())
-        expected = float(gains[struck, 1] * gains[heard, 1]) / ((2 * math.pi * float(modes.frequency[1])) ** 2 - square)
-        assert responses[-1] == pytest.approx(expected, rel=1e-2)
-    assert responses[0] == pytest.approx(responses[1], rel=1e-6)
-
-
-def test_turned_and_moved_bodies_sound_the_same(bracket, modes):
-    turn, shift = rotation(), torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
-    moved = elastic_modes(Solid.build(bracket.points @ turn.T + shift, bracket.cells), STEEL, count=8)
-    assert torch.allclose(moved.frequency, modes.frequency, rtol=1e-8)
-    places = bracket.points[::5]
-    here, there = modes.at(places), moved.at(places @ turn.T + shift)
-    sign = torch.sign((torch.einsum("cmd,ed->cme", here, turn) * there).sum(dim=(0, 2)))
-    expected = torch.einsum("cmd,ed->cme", here, turn) * sign[:, None]
-    assert torch.allclose(there, expected, atol=1e-6 * float(here.abs().max()))
-
-
 def test_size_stiffness_and_density_obey_the_scaling_laws(bracket, modes):
     larger = elastic_modes(Solid.build(2.5 * bracket.points, bracket.cells), STEEL, count=8)
     assert torch.allclose(larger.frequency, modes.frequency / 2.5, rtol=1e-9)
@@ -228,19 +176,6 @@ def test_size_stiffness_and_density_obey_the_scaling_laws(bracket, modes):
     assert modes.mass == pytest.approx(STEEL.density * bracket.volume, rel=1e-12)
 
 
-def test_a_heavier_cell_slows_modes_by_its_kinetic_energy(bracket, modes):
-    drawn = torch.rand(len(bracket.cells), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    found = elastic_modes(bracket, STEEL, count=8, density_factor=1.0 + 1e-4 * drawn)
-    mesh, forces, weights = matrices(bracket, STEEL)
-    free = lowest_vibrations(
-        forces, weights, rigid_motions(mesh.nodes, weights), count=8, shift=1e4, supported=False
-    ).shapes
-    added = scipy.sparse.kron(mass(mesh, STEEL.density * 1e-4 * drawn), np.eye(3))
-    # Rayleigh: to first order the squared frequency falls by the added mass's part of the kinetic energy.
-    expected = -0.5 * np.einsum("fm,fm->m", free, added @ free)
-    np.testing.assert_allclose((found.frequency / modes.frequency - 1).numpy(), expected, rtol=1e-2)
-
-
 def test_soft_springs_raise_each_mode_by_its_motion_there(bracket, modes):
     places = torch.tensor([[0.01, 0.012, 0.0], [0.06, 0.01, 0.0], [0.035, 0.045, 0.0]], dtype=torch.float64)
     stiff = 1e4
@@ -250,16 +185,6 @@ def test_soft_springs_raise_each_mode_by_its_motion_there(bracket, modes):
     # Rayleigh: a spring's energy in a mode that moves its foot by one unit.
     expected = stiff * modes.at(places).square().sum(dim=(0, 2))
     assert torch.allclose(raised, expected, rtol=1e-2)
-
-
-def test_stiff_springs_leave_no_rigid_motion(bracket, modes):
-    corners = bracket.points[bracket.points[:, 2] == 0.0]
-    held = elastic_modes(bracket, STEEL, count=4, springs=[(place, 1e12) for place in corners])
-    assert float(held.frequency[0]) > float(modes.frequency[0])
-
-
-def test_places_at_nodes_have_the_nodes_shapes(modes):
-    assert torch.allclose(modes.at(modes.nodes), modes.shapes, atol=1e-9 * float(modes.shapes.abs().max()))
 
 
 def test_interpolation_is_exact_for_second_degree_and_takes_the_nearest_place(modes):
@@ -283,6 +208,7 @@ def test_interpolation_is_exact_for_second_degree_and_takes_the_nearest_place(mo
     ("settings", "name", "row", "value"),
     [
         ({"count": 0}, "count", None, 0),
+        ({"count": 310}, "nodes", None, 105),
         ({"stiffness_factor": torch.ones(3)}, "stiffness_factor", None, 3),
         ({"density_factor": -torch.ones(36)}, "density_factor", 0, -1.0),
         ({"springs": [(torch.zeros(3), 0.0)]}, "springs", 0, 0.0),
@@ -293,21 +219,13 @@ def test_settings_that_cannot_be(bracket, settings, name, row, value):
         elastic_modes(bracket, STEEL, **settings)
 
 
-def test_more_modes_than_nodes_allow(bracket):
-    with raises(SimulationError, name="nodes", value=len(SecondOrder.of(bracket).nodes)):
-        elastic_modes(bracket, STEEL, count=310)
-
-
-def test_positions_that_are_no_numbers(modes):
+def test_bodies_in_parts_and_positions_that_are_no_numbers_are_refused(bracket, modes):
+    apart = torch.cat([bracket.points, bracket.points + 1.0])
+    parts = Solid.build(apart, torch.cat([bracket.cells, bracket.cells + len(bracket.points)]))
+    with raises(SimulationError, name="parts", value=2):
+        elastic_modes(parts, STEEL, count=4)
     with raises(SimulationError, name="places", row=1, value=pytest.approx([math.nan, 0.0, 0.0], nan_ok=True)):
         modes.at(torch.tensor([[0.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]))
-
-
-def test_bodies_in_parts_are_refused(bracket):
-    count = len(bracket.points)
-    apart = torch.cat([bracket.points, bracket.points + 1.0])
-    with raises(SimulationError, name="parts", value=2):
-        elastic_modes(Solid.build(apart, torch.cat([bracket.cells, bracket.cells + count])), STEEL, count=4)
 
 
 def test_the_limit_on_blas_is_taken_back_whichever_thread_ends_last():

@@ -55,7 +55,6 @@ def test_an_inverted_part_is_turned_and_the_wall_of_a_void_is_not():
     found = checked(surface_of(trimesh.util.concatenate([outer, inner, beside])), log=messages.append)
     assert found.mesh.volume == pytest.approx(truth, rel=1e-5)
     assert len(messages) == 1
-    assert messages[0].startswith("320 of 960 triangles")
     # All of it inside out: the void goes with the body around it.
     every = trimesh.util.concatenate([outer, inner])
     every.invert()
@@ -129,16 +128,6 @@ def test_a_rough_form_that_is_no_noise_stays():
     assert denoised(waves)[0] is waves
 
 
-def test_smoothing_is_told():
-    clean = welded(trimesh.creation.icosphere(3))
-    noise = 0.02 * clean.scale * np.random.default_rng(0).standard_normal(clean.vertices.shape)
-    messages: list[str] = []
-    rough = Surface(torch.from_numpy(clean.vertices + noise).float(), torch.from_numpy(np.array(clean.faces)))
-    checked(rough, log=messages.append)
-    assert len(messages) == 1
-    assert f"{roughness(weld(rough)):.0f} degrees" in messages[0]
-
-
 def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     corners = np.array(ball.triangles).reshape(-1, 3)
@@ -172,14 +161,10 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
 ) -> None:
     # Those that the wall is made of are far fewer.
     limit(monkeypatch, 6000)
-    messages: list[str] = []
     found, known = (
-        SurfaceBodies(surface_of(mesh), thicknesses=[0.002], count=4, dofs=8000, log=messages.append).bodies[0].elastic
+        SurfaceBodies(surface_of(mesh), thicknesses=[0.002], count=4, dofs=8000).bodies[0].elastic
         for mesh in (dense, coarse)
     )
-    assert f"{len(dense.faces)} triangles" in messages[0]
-    assert "6000 triangles" in messages[1]
-    assert sum("6000 triangles" in message for message in messages) == 1
     # Without thinning, elements that differ change frequencies by 1.5 % at this size.
     assert found.frequency.numpy() == pytest.approx(known.frequency.numpy(), rel=0.03)
     assert found.mass == pytest.approx(known.mass, rel=0.01)
@@ -188,16 +173,14 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
 def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch: pytest.MonkeyPatch) -> None:
     clean = ellipsoid(5)
     noise = 0.01 * clean.scale * np.random.default_rng(0).standard_normal(clean.vertices.shape) / 3**0.5
-    messages: list[str] = []
     limit(monkeypatch, 4000)
-    found = thinned(mesh_of(clean.vertices + noise, clean.faces), log=messages.append)
+    found = thinned(mesh_of(clean.vertices + noise, clean.faces), log=lambda words: None)
     assert len(found.faces) == 4000
     assert (len(boundary_edges(found)), count_crowded_edges(found)) == (0, 0)
     surface = ClosestPoints(clean.triangles)
     before = np.sqrt((surface(clean.vertices + noise).distances ** 2).mean())
     assert np.sqrt((surface(found.vertices).distances ** 2).mean()) < 0.35 * before
     assert found.volume == pytest.approx(clean.volume, rel=0.01)
-    assert messages[-1].endswith("degrees")
 
 
 def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:

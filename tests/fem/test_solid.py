@@ -1,7 +1,6 @@
 """Tetrahedra: their volume, their outside, and bodies made of meshes that are closed, open or broken."""
 
 import math
-import re
 from collections.abc import Callable
 
 import numpy as np
@@ -142,27 +141,6 @@ def test_a_coarser_sheet_keeps_its_hole():
     assert coarse.area == pytest.approx(sheet.area, rel=1e-6)
 
 
-class WithoutNormals(Trimesh):
-    """A mesh whose normals say nothing."""
-
-    @property
-    def vertex_normals(self) -> np.ndarray:
-        return np.zeros(self.vertices.shape)
-
-
-def test_a_coarser_ring_stays_a_ring():
-    ring = weld(surface_of(trimesh.creation.torus(0.05, 0.008, major_sections=24, minor_sections=8)))
-    # Edges longer than the tube is round, and no normals: nothing but its topology keeps it from being pinched.
-    faces = coarsened(WithoutNormals(ring.vertices, ring.faces, process=False), 0.06, turn=-1.0).faces
-    edges, count = np.unique(
-        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True
-    )
-    assert len(faces) < 0.5 * len(ring.faces)
-    assert (count == 2).all()
-    # Euler's characteristic of a ring.
-    assert len(np.unique(faces)) - len(edges) + len(faces) == 0
-
-
 def test_a_finer_skin_is_the_same_surface():
     box = weld(surface_of(trimesh.creation.box((0.3, 0.02, 0.01))))
     fine = remeshed(box, 0.01)
@@ -206,6 +184,9 @@ def test_a_hollow_ball_has_two_surfaces():
     ("make", "settings", "name", "value"),
     [
         (ball, {"thickness": 0.0}, "thickness", 0.0),
+        # Too thick for the surface.
+        (ball, {"thickness": 0.02}, "thickness", 0.02),
+        (lambda: half(ball()), {"thickness": 0.06}, "thickness", 0.06),
         (ball, {"thickness": 0.003, "detail": 1.5}, "detail", 1.5),
         (lambda: Surface(torch.rand(9, 3), torch.zeros(0, 3).long()), {"thickness": 0.001}, "faces", 0),
         (lambda: Surface(torch.zeros(3, 3), torch.tensor([[0, 1, 2]])), {"thickness": 0.001}, "areas", 0.0),
@@ -216,18 +197,6 @@ def test_a_hollow_ball_has_two_surfaces():
 def test_walls_that_cannot_be(make: Callable[[], Surface], settings, name, value):
     with raises(SimulationError, name=name, value=value):
         shell(make(), **settings)
-
-
-@pytest.mark.parametrize(
-    ("make", "thickness", "suggested"),
-    [(ball, 0.02, r"0 m.*0\.00\d+ m$"), (lambda: half(ball()), 0.06, r"thickness=0\.0\d+")],
-)
-def test_walls_too_thick_for_the_surface_are_answered_with_one_that_fits(
-    make: Callable[[], Surface], thickness: float, suggested: str
-):
-    with raises(SimulationError, name="thickness", value=thickness) as caught:
-        shell(make(), thickness=thickness)
-    assert re.search(suggested, str(caught.value))
 
 
 def mixed(surface: Surface) -> Surface:
@@ -271,22 +240,16 @@ def test_triangles_that_face_different_ways_are_filled_all_the_same():
 
 
 @pytest.mark.parametrize(
-    ("make", "name", "value", "suggested"),
+    ("make", "name", "value"),
     [
-        (lambda: half(ball()), "holes", pytest.approx(1 / 3, abs=0.09), r"0\.00\d m$"),
-        (
-            lambda: Surface(torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), torch.tensor([[0, 1, 2]])),
-            "volume",
-            0,
-            r"0\.002 m$",
-        ),
-        (lambda: apart(ball(subdivisions=1)), "parts", 2, ""),
+        (lambda: half(ball()), "holes", pytest.approx(1 / 3, abs=0.09)),
+        (lambda: Surface(0.1 * torch.eye(3), torch.tensor([[0, 1, 2]])), "volume", 0),
+        (lambda: apart(ball(subdivisions=1)), "parts", 2),
     ],
 )
-def test_meshes_that_cannot_be_filled(make: Callable[[], Surface], name, value, suggested):
-    with raises(SimulationError, name=name, value=value) as caught:
+def test_meshes_that_cannot_be_filled(make: Callable[[], Surface], name, value):
+    with raises(SimulationError, name=name, value=value):
         fill(make(), detail=0.2)
-    assert re.search(suggested, str(caught.value))
 
 
 def apart(surface: Surface) -> Surface:

@@ -21,21 +21,6 @@ RIGID = 1e12
 LOWEST = Patch("its lowest part", (0.0, 0.0, -1.0))
 
 
-def standing(solid: Solid) -> Solid:
-    """The solid, its x axis upwards."""
-    return Solid.build(solid.points[:, [1, 2, 0]], solid.cells)
-
-
-def test_a_bar_held_at_its_lower_end_is_a_cantilever():
-    length, height, width = 0.2, 0.005, 0.008
-    solid = standing(block((length, height, width), (16, 1, 1)))
-    modes = elastic_modes(solid, NOMINAL, count=4, support=Support((LOWEST,), RIGID))
-    speed = math.sqrt(NOMINAL.young / NOMINAL.density)
-    # 1 + cosh x cos x = 0 at x = 1.8751, for bending in the plane of either side.
-    expected = [1.8751**2 / (2 * math.pi) * speed * side / math.sqrt(12) / length**2 for side in (height, width)]
-    assert modes.frequency[:2].tolist() == pytest.approx(expected, rel=0.02)
-
-
 def springed_beam(ratio: float) -> list[float]:
     """Wave numbers times length of a beam between two springs, each `ratio` times as stiff as E I / length^3.
 

@@ -50,15 +50,13 @@ def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
 
 
 def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkeypatch: pytest.MonkeyPatch):
-    messages: list[str] = []
     monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 1500)
-    found = computed(sheet(), count=6, dofs=4000, log=messages.append)
+    found = computed(sheet(), count=6, dofs=4000)
     assert [body.thickness for body in found.bodies] == pytest.approx(
         [part * math.hypot(0.24, 0.17) for part in candidate_bodies.THICKNESS_RATIOS]
     )
     assert not any(body.fine for body in found.bodies)
-    assert any("42 open edges" in message for message in messages)
-    assert "42 open edges" in found.refused[None]
+    assert None in found.refused
     body = found.bodies[1]
     fine = SurfaceBodies(sheet(), count=6, dofs=4000).refined(body)
     assert fine.fine
@@ -71,10 +69,8 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
 
 @pytest.mark.slow
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
-    messages: list[str] = []
     inwards = Surface(ball().vertices, ball().faces.flip(1))
-    found = computed(inwards, thicknesses=[None], count=20, dofs=10000, cache=tmp_path, log=messages.append).bodies[0]
-    assert any(f"{len(inwards.faces)} of {len(inwards.faces)} triangles" in message for message in messages)
+    found = computed(inwards, thicknesses=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
     # Fillings by other seeds differ by 2 % in frequency at this size.
@@ -92,18 +88,12 @@ def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path
 def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
     outer, inner = trimesh.creation.icosphere(3, radius=0.06), trimesh.creation.icosphere(3, radius=0.054)
     inner.invert()
-    messages: list[str] = []
-    both = surface_of(trimesh.util.concatenate([outer, inner]))
-    found = computed(both, count=8, dofs=8000, log=messages.append)
+    found = computed(surface_of(trimesh.util.concatenate([outer, inner])), count=8, dofs=8000)
     assert [body.thickness for body in found.bodies] == [None]
-    # One line for all walls that are too thick, another for the surface's two parts.
-    assert sum("not a candidate body" in message for message in messages) == 2
     # A hollow ball, not a massive one.
     mass = NOMINAL.density * 4 / 3 * math.pi * (0.06**3 - 0.054**3)
     assert found.bodies[0].elastic.mass == pytest.approx(mass, rel=0.06)
-    reasons = [reason for wall, reason in found.refused.items() if wall is not None]
-    assert len(reasons) == 6
-    assert all("thick on average" in reason or "2 parts" in reason for reason in reasons)
+    assert len([wall for wall in found.refused if wall is not None]) == 6
 
 
 def test_boxes_that_overlap_are_one_body():
@@ -112,7 +102,7 @@ def test_boxes_that_overlap_are_one_body():
     assert [body.name for body in found.bodies] == ["solid body"]
     volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
     assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
-    assert "2 parts" in found.refused[0.001]
+    assert 0.001 in found.refused
 
 
 @pytest.mark.slow
@@ -124,36 +114,29 @@ def test_the_aircraft_is_filled(shared: Path):
     assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
 
 
-def test_parts_that_do_not_touch_are_refused_with_all_reasons():
+def apart() -> Surface:
     one, other = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.1, 0.1, 0.1))
     other.apply_translation((0.3, 0.0, 0.0))
-    apart = surface_of(trimesh.util.concatenate([one, other]))
-    with raises(SimulationError, name="surface") as caught:
-        computed(apart, thicknesses=[None, 0.001], count=6, dofs=3000)
-    filled, walled = caught.value.value
-    for name, reason in (("solid body", filled), ("wall of 1 mm", walled)):
-        assert reason.startswith(f"{name}: ")
-        assert "2 parts" in reason
+    return surface_of(trimesh.util.concatenate([one, other]))
 
 
-def test_a_wall_thicker_than_the_object_is_refused():
+@pytest.mark.parametrize(
+    ("make", "thicknesses", "refused"),
+    [
+        (apart, [None, 0.001], ["solid body", "wall of 1 mm"]),
+        (sheet, [0.2], ["wall of 200 mm"]),
+        (ball, [0.04], ["wall of 40 mm"]),
+    ],
+)
+def test_surfaces_of_no_body_are_refused_with_all_reasons(make, thicknesses, refused):
     with raises(SimulationError, name="surface") as caught:
-        computed(sheet(), thicknesses=[0.2])
-    [reason] = caught.value.value
-    assert reason.startswith("wall of 200 mm: ")
-    assert "170 mm" in reason
-    assert "200 mm" in reason
-    with raises(SimulationError, name="surface") as caught:
-        computed(ball(), thicknesses=[0.04])
-    [reason] = caught.value.value
-    assert reason.startswith("wall of 40 mm: thickness: ")
+        computed(make(), thicknesses=thicknesses, count=6, dofs=3000)
+    assert [reason.partition(": ")[0] for reason in caught.value.value] == refused
 
 
 def test_points_alone_have_no_body():
-    cloud = Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64))
-    with raises(SimulationError, name="faces", value=0) as caught:
-        computed(cloud)
-    assert "642" in str(caught.value)
+    with raises(SimulationError, name="faces", value=0):
+        computed(Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64)))
 
 
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
@@ -188,31 +171,21 @@ def coarse() -> CandidateBody:
     return CandidateBody(0.004, elastic, fine=False)
 
 
-def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory(
-    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody
-):
-    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 1e9)
-    messages: list[str] = []
-    assert SurfaceBodies(sheet(), count=4, dofs=400_000, log=messages.append).refined(coarse) is coarse
-    assert messages[-1].startswith("wall of 4 mm: ")
-    assert "400000" in messages[-1]
-
-
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [(MemoryError(), "1500 (--set body.dofs=N)"), (SimulationError("badly shaped"), "badly shaped")],
-)
-def test_a_body_stays_coarse_where_a_finer_one_fails(
-    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody, error: Exception, reason: str
+@pytest.mark.parametrize("error", [None, MemoryError(), SimulationError("badly shaped")])
+def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory_or_fails(
+    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody, error: Exception | None
 ):
     def fail(*solid: object, **settings: object) -> None:
+        assert error is not None
         raise error
 
     monkeypatch.setattr(candidate_bodies, "elastic_modes", fail)
+    if error is None:
+        monkeypatch.setattr(body_meshes, "_free_memory", lambda: 1e9)
     messages: list[str] = []
-    assert SurfaceBodies(sheet(), count=4, dofs=3000, log=messages.append).refined(coarse) is coarse
+    bodies = SurfaceBodies(sheet(), count=4, dofs=3000 if error else 400_000, log=messages.append)
+    assert bodies.refined(coarse) is coarse
     assert messages[-1].startswith("wall of 4 mm: ")
-    assert reason in messages[-1]
 
 
 def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(monkeypatch: pytest.MonkeyPatch):
@@ -230,7 +203,7 @@ def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(m
     monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 2000)
     found = computed(sheet(), thicknesses=[0.004, 0.012], count=4, dofs=4000, log=messages.append)
     assert [(body.thickness, body.fine) for body in found.bodies] == [(0.004, False)]
-    assert any(message.startswith("wall of 4 mm: ") and "2000 (--set body.dofs=N)" in message for message in messages)
+    assert any(message.startswith("wall of 4 mm: ") for message in messages)
     assert list(found.refused) == [0.012]
 
 

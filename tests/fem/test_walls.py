@@ -117,32 +117,25 @@ def test_a_plate_of_twelve_triangles_has_leissas_frequencies():
     assert found.tolist() == pytest.approx([13.489, 19.789, 24.432], rel=0.01)
 
 
-def test_a_body_of_too_coarse_elements_is_made_finer_and_its_error_told(monkeypatch: pytest.MonkeyPatch):
-    def modes(dofs: int, error: float) -> ElasticModes:
-        """Frequencies whose error falls with the third power of the edges' length."""
-        frequency = 100.0 * (1.0 + error * (40_000 / dofs) ** 1.5) * torch.arange(1, 9, dtype=torch.float64)
+class Converging(SurfaceBodies):
+    """Bodies whose frequencies' error falls with the third power of the edges' length."""
+
+    def __init__(self, error: float) -> None:
+        self.error, self.asked, self.messages = error, list[int](), list[str]()
+        super().__init__(box(0.1, 0.1, 0.1), thicknesses=[None], count=8, dofs=40_000, log=self.messages.append)
+
+    def modes(self, thickness: float | None, *, dofs: int = 40_000, **others: object) -> ElasticModes:
+        self.asked.append(dofs)
+        frequency = 100.0 * (1.0 + self.error * (40_000 / dofs) ** 1.5) * torch.arange(1, 9, dtype=torch.float64)
         nodes, none = torch.zeros(dofs, 3, dtype=torch.float64), torch.zeros(0, 6, dtype=torch.int64)
         return ElasticModes(frequency, nodes, none, torch.zeros(dofs, 8, 3, dtype=torch.float64), NOMINAL, 1.0)
 
-    def made(error: float) -> tuple[list[int], list[str]]:
-        asked: list[int] = []
-        messages: list[str] = []
 
-        def found(maker: object, thickness: float | None, *, dofs: int = 40_000, **others: object) -> ElasticModes:
-            asked.append(dofs)
-            return modes(dofs, error)
-
-        monkeypatch.setattr("avmsf.fem.candidate_bodies.SurfaceBodies.modes", found)
-        assert SurfaceBodies(box(0.1, 0.1, 0.1), thicknesses=[None], count=8, dofs=40_000, log=messages.append).bodies
-        return asked, messages
-
-    assert max(made(0.03)[0]) == 40_000
-    asked, messages = made(0.08)
-    assert max(asked) == 80_000
-    assert not messages
-    # A third of .3 and more is left with twice as many.
-    [words] = made(0.3)[1]
-    assert f"{0.3 / 2**1.5 / (1 + 0.3 / 2**1.5):.0%}" in words
+@pytest.mark.parametrize(("error", "dofs", "told"), [(0.03, 40_000, 0), (0.08, 80_000, 0), (0.3, 80_000, 1)])
+def test_a_body_of_too_coarse_elements_is_made_finer_and_an_error_that_is_left_told(error: float, dofs: int, told: int):
+    made = Converging(error)
+    assert made.bodies
+    assert (max(made.asked), len(made.messages)) == (dofs, told)
 
 
 @pytest.mark.slow
