@@ -112,14 +112,18 @@ def test_a_doublet_three_hertz_apart_is_resolved(seconds: float):
     torch.testing.assert_close(found.damping, pair.damping, rtol=0.07, atol=0)
 
 
-def test_louder_recordings_have_louder_gains_and_the_same_modes():
+# Rates from 170 Hz to 1.5 MHz.
+@pytest.mark.parametrize(("scale", "stretch"), [(300.0, 1.0), (1.0, 93.75), (1.0, 1 / 94)])
+def test_louder_recordings_have_louder_gains_and_faster_ones_higher_modes(scale: float, stretch: float):
     impacts, _ = recorded(-40.0, seconds=0.25)
-    one, two = (extract_sounds(impacts.sounds * scale, sample_rate=RATE) for scale in (1.0, 300.0))
-    torch.testing.assert_close(two.bank.frequency, one.bank.frequency, rtol=1e-6, atol=0)
-    torch.testing.assert_close(two.bank.damping, one.bank.damping, rtol=1e-3, atol=0)
-    torch.testing.assert_close(two.gains, 300 * one.gains, rtol=0, atol=0.3 * float(one.gains.abs().max()) * 1e-2)
+    one = extract_sounds(impacts.sounds, sample_rate=RATE)
+    two = extract_sounds(scale * impacts.sounds, sample_rate=RATE * stretch)
+    torch.testing.assert_close(two.bank.frequency, stretch * one.bank.frequency, rtol=1e-6, atol=0)
+    torch.testing.assert_close(two.bank.damping, stretch * one.bank.damping, rtol=1e-3, atol=0)
+    largest = scale * float(one.gains.abs().max())
+    torch.testing.assert_close(two.gains, scale * one.gains, rtol=0, atol=1e-5 * largest)
     # In bands where the modes outlast the sound their least rounding decides what is left: .3 dB.
-    torch.testing.assert_close(two.residual.magnitude, 300 * one.residual.magnitude, rtol=0.035, atol=0)
+    torch.testing.assert_close(two.residual.magnitude, scale * one.residual.magnitude, rtol=0.035, atol=0)
 
 
 def test_one_loud_recording_does_not_drown_the_others():
@@ -128,15 +132,6 @@ def test_one_loud_recording_does_not_drown_the_others():
     uneven[2] *= 1000
     even, found = (HighResolution().find(sounds, RATE) for sounds in (impacts.sounds, uneven))
     torch.testing.assert_close(found.frequency, even.frequency, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("stretch", [93.75, 1 / 40])
-def test_played_faster_all_rates_rise_alike(stretch: float):
-    impacts, _ = recorded(-40.0, seconds=0.25)
-    slow, fast = (extract_sounds(impacts.sounds, sample_rate=rate) for rate in (RATE, RATE * stretch))
-    torch.testing.assert_close(fast.bank.frequency, slow.bank.frequency * stretch, rtol=1e-6, atol=0)
-    torch.testing.assert_close(fast.bank.damping, slow.bank.damping * stretch, rtol=1e-3, atol=0)
-    torch.testing.assert_close(fast.residual.magnitude, slow.residual.magnitude, rtol=0.035, atol=0)
 
 
 def test_an_offset_is_no_mode():
@@ -168,25 +163,6 @@ def test_at_most_as_many_as_asked_for_are_kept():
     strongest = truth.frequency[energy.argsort(descending=True)[:3]]
     assert len(few) == 5
     assert float((few.frequency[:, None] - strongest).abs().amin(0).max()) < 1.0
-
-
-@pytest.mark.parametrize(("rate", "samples"), [(100.0, 1000), (400.0, 1600), (192000.0, 9600)])
-def test_rates_from_a_hundred_hertz_to_192_kilohertz(rate: float, samples: int):
-    bank = ModalBank(
-        torch.tensor([0.09, 0.21, 0.43], dtype=torch.float64) * rate,
-        torch.tensor([6.0, 10.0, 30.0], dtype=torch.float64) * rate / samples,
-    )
-    sounds = make(bank, torch.randn(4, 3, generator=seeded(3)), rate=rate, samples=samples, noise=0.01)
-    found = extract_sounds(sounds, sample_rate=rate)
-    torch.testing.assert_close(found.bank.frequency, bank.frequency, rtol=5e-4, atol=0)
-    torch.testing.assert_close(found.bank.damping, bank.damping, rtol=0.05, atol=0)
-
-
-def test_a_single_sound_is_enough_without_its_contact():
-    impacts, truth = recorded(-40.0, seconds=0.25)
-    found = extract_sounds(impacts.sounds[:1], sample_rate=RATE)
-    assert len(found.bank) > 10
-    assert float((found.bank.frequency[:, None] / truth.frequency - 1).abs().amin(1).median()) < 1e-4
 
 
 def test_the_papers_method_finds_the_plates_strong_modes():
@@ -237,10 +213,10 @@ def test_sounds_without_modes_are_refused_with_the_cause(sounds: Callable[[], Te
         extract_modes(impacts_of(sounds()))
 
 
-@pytest.mark.parametrize("method", [HighResolution, ShortTime])
-def test_no_modes_at_all_cannot_be_asked_for(method) -> None:
-    with raises(ExtractionError, name="modes", value=0):
-        method(modes=0)
+def test_no_modes_at_all_cannot_be_asked_for() -> None:
+    for method in (HighResolution, ShortTime):
+        with raises(ExtractionError, name="modes", value=0):
+            method(modes=0)
 
 
 @pytest.mark.parametrize("lacking", ["frequency", "gains", "residual"])

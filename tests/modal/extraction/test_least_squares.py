@@ -66,12 +66,6 @@ def test_gains_of_exact_sounds_come_back():
     torch.testing.assert_close(fit_gains(sounds, BANK, sample_rate=RATE), gains, rtol=0, atol=1e-7)
 
 
-def test_sine_gains_of_sines_come_back():
-    gains = draw(BANK)[0].real
-    sounds = gains @ basis(BANK, 6000)[: len(BANK)]
-    torch.testing.assert_close(fit_sine_gains(sounds, BANK, sample_rate=RATE), gains, rtol=0, atol=1e-7)
-
-
 def test_gains_of_sines_that_start_late_come_back_with_their_phases():
     gains = draw(BANK)[0].real
     phase = torch.linspace(-1.5, 1.5, len(BANK), dtype=torch.float64)
