@@ -142,17 +142,6 @@ def test_shapes_have_no_symmetries_but_those_they_claim(kind: str) -> None:
         assert misfit(middle, mirror(np.array([0.0, 0.0, 1.0]))) > 1e-3
 
 
-def test_lobes_are_as_many_as_claimed() -> None:
-    orders = {made("fluted", seed).symmetry.order for seed in range(5)}
-    assert len(orders) > 1
-    for seed in range(3):
-        shape = made("fluted", seed)
-        places = vertices(shape)
-        angles = np.arctan2(places[:, 1], places[:, 0])
-        wave = np.exp(1j * np.arange(2, 30)[:, None] * angles) @ np.hypot(places[:, 0], places[:, 1])
-        assert 2 + int(np.abs(wave).argmax()) == shape.symmetry.order
-
-
 def test_the_volume_of_a_tube_of_many_sides() -> None:
     radius, length, wall = 0.02, 0.1, 0.003
     turned = Turned.lay(Profile([(radius, height, wall) for height in (0.0, 0.5 * length, length)]))
@@ -177,13 +166,6 @@ def test_the_volume_of_a_bowl_by_pappus() -> None:
     outside = 2.0 * math.pi * (math.cos(turns[0]) - math.cos(turns[-1])) * wall**3 / 12.0
     # Polygons instead of circles, smaller by a part of pi^2 / (6 n^2) for n sides, and half of that in their wall.
     assert body.solid().volume == pytest.approx(way * wall + outside, rel=4e-3)
-
-
-def test_the_volume_of_a_platter() -> None:
-    shape = made("platter")
-    extent = np.ptp(shape.solid.points.numpy(), axis=0)
-    assert shape.solid.volume == pytest.approx(float(extent.prod()), rel=1e-12)
-    assert extent[2] == pytest.approx(shape.thickness, rel=1e-12)
 
 
 def test_a_seed_gives_the_same_individual_and_another_seed_another() -> None:

@@ -12,7 +12,7 @@ import torch
 
 from avmsf.errors import SimulationError
 from avmsf.fem.damping import damped, rayleigh
-from avmsf.fem.material import CERAMIC, STEEL, WOOD
+from avmsf.fem.material import CERAMIC, STEEL
 from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
 from avmsf.simulate.imperfections import damping_matrix, smooth_field, stream, support_places
@@ -31,18 +31,6 @@ def coupled(count: int = 8, *, seed: int = 0) -> tuple[torch.Tensor, torch.Tenso
     frequency[1] = frequency[0] + 3.0
     root = torch.randn(count, count, generator=generator, dtype=torch.float64)
     return frequency, 20.0 * torch.eye(count, dtype=torch.float64) + 5.0 * root @ root.T
-
-
-def test_proportional_damping_is_rayleighs_law():
-    frequency = torch.tensor([310.0, 2000.0, 7000.0], dtype=torch.float64)
-    vibration = damped(frequency, torch.diag(rayleigh(frequency, WOOD)), highest=20000.0)
-    omega = 2 * math.pi * frequency
-    decay = 0.5 * (60.0 + 2e-6 * omega**2)
-    assert torch.allclose(vibration.damping, decay, rtol=1e-11)
-    assert torch.allclose(vibration.frequency, torch.sqrt(omega**2 - decay**2) / (2 * math.pi), rtol=1e-11)
-    # Each damped mode is one undamped mode alone.
-    moved = (vibration.accelerations * vibration.pushes.T).abs()
-    assert float((moved - torch.diag(torch.diagonal(moved))).abs().max()) < 1e-9 * float(moved.max())
 
 
 def test_coupled_modes_move_as_the_equation_of_motion_integrated():
@@ -137,27 +125,17 @@ def test_a_cushion_is_no_hammer():
     assert caught.value.value > 0.02
 
 
-def test_a_small_breathing_ball_is_a_monopole():
-    radius, frequency, distance = 0.01, 200.0, 2.0
+@pytest.mark.parametrize("place", [(0.0, 2.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, -4.0)])
+def test_a_small_breathing_ball_is_a_monopole(place: tuple[float, float, float]):
+    radius, frequency, distance = 0.01, 200.0, max(map(abs, place))
     modes = breathing_sphere(radius, frequency)
     vibration = damped(modes.frequency, torch.tensor([[2.0]], dtype=torch.float64), highest=20000.0)
-    microphone = torch.tensor([0.0, distance, 0.0], dtype=torch.float64)
-    heard = radiated(modes, vibration, microphone)
+    heard = complex(radiated(modes, vibration, torch.tensor(place, dtype=torch.float64))[0])
     # Volume acceleration over 4 pi r, exact for ka = .04 to the second order of ka; the ball's own area is the mesh's.
-    acceleration = complex(vibration.accelerations[0, 0])
-    expected = AIR_DENSITY * radius**2 * acceleration / distance
-    assert abs(complex(heard[0])) == pytest.approx(abs(expected), rel=5e-3)
+    expected = AIR_DENSITY * radius**2 * complex(vibration.accelerations[0, 0]) / distance
+    assert abs(heard) == pytest.approx(abs(expected), rel=5e-3)
     # The time from the nearest point is left out; what is left is less than from the middle.
-    assert abs(np.angle(complex(heard[0]) / expected)) < 2.5 * 2 * math.pi * frequency * radius / SOUND_SPEED
-
-
-def test_a_breathing_ball_fades_as_one_over_the_distance_and_sounds_alike_on_all_sides():
-    modes = breathing_sphere(0.03, 3000.0)
-    vibration = damped(modes.frequency, torch.tensor([[2.0]], dtype=torch.float64), highest=20000.0)
-    away = [torch.tensor(place, dtype=torch.float64) for place in ([0, 0, 5.0], [0, 5.0, 0], [0, 0, 10.0])]
-    near, aside, far = (abs(complex(radiated(modes, vibration, place)[0])) for place in away)
-    assert near / far == pytest.approx(2.0, rel=2e-3)
-    assert near == pytest.approx(aside, rel=1e-3)
+    assert abs(np.angle(heard / expected)) < 2.5 * 2 * math.pi * frequency * radius / SOUND_SPEED
 
 
 def test_a_thin_wall_sounds_though_its_faces_move_together():
