@@ -41,7 +41,10 @@ def test_another_recipe_runs_again(tmp_path: Path, recipe: dict) -> None:
     make, folder = Maker(), StageFolder(tmp_path)
     folder.keep(stage(make, steps=3))
     assert folder.keep(stage(make, **recipe)).fresh
-    assert make.runs == 2
+    # Tuples are the lists that they are read back as.
+    folder.keep(stage(make, sizes=(1, 2)))
+    assert not folder.keep(stage(make, sizes=(1, 2))).fresh
+    assert make.runs == 3
 
 
 def test_a_stage_is_made_once_after_those_that_it_depends_on_and_again_when_these_change(tmp_path: Path) -> None:
@@ -65,12 +68,6 @@ def test_a_stage_is_made_once_after_those_that_it_depends_on_and_again_when_thes
     (tmp_path / "a.txt").write_text("changed")
     (tmp_path / "a.txt.stage.json").unlink()
     assert run("other")["b.txt"].path.read_text() == "otherc"
-
-
-def test_tuples_are_the_lists_that_they_are_read_back_as(tmp_path: Path) -> None:
-    make, folder = Maker(), StageFolder(tmp_path)
-    folder.keep(stage(make, sizes=(1, 2)))
-    assert not folder.keep(stage(make, sizes=(1, 2))).fresh
 
 
 def test_an_output_that_was_changed_or_lost_is_made_again(tmp_path: Path) -> None:
@@ -97,13 +94,16 @@ def test_a_stage_that_fails_midway_runs_again_even_under_an_older_recipe(tmp_pat
     assert folder.path("cloud.ply").read_text() == "old"
 
 
-def test_a_record_of_another_version_or_a_damaged_one_does_not_count(
+def test_a_record_of_another_version_or_code_or_a_damaged_one_does_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make, folder = Maker(), StageFolder(tmp_path)
     folder.keep(stage(make))
     monkeypatch.setattr("avmsf.__version__", "0.0.0")
     assert folder.keep(stage(make)).fresh
+    monkeypatch.setattr("avmsf.pipeline.stages.source_digest", lambda module: "other code")
+    assert folder.keep(stage(make)).fresh
+    assert not folder.keep(stage(make)).fresh
     (tmp_path / "cloud.ply.stage.json").write_text("[]")
     assert folder.keep(stage(make)).fresh
 
@@ -153,10 +153,9 @@ def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed
     assert found == [True, False]
 
 
-def test_a_folder_that_cannot_be_written_is_named_with_the_option_for_another(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     make = Maker()
     (tmp_path / "cloud.ply.stage.json").mkdir()
-    with raises(CaptureError, file=tmp_path / "cloud.ply") as caught:
+    with raises(CaptureError, file=tmp_path / "cloud.ply"):
         StageFolder(tmp_path).keep(stage(make))
-    assert "--cache" in str(caught.value)
     assert make.runs == 0

@@ -1,4 +1,4 @@
-"""Shapes of what Gaussians show, without photographs."""
+"""Gaussians as shapes: without photographs, without what is far away, and moved onto a mesh."""
 
 from dataclasses import replace
 
@@ -8,10 +8,15 @@ import torch
 import trimesh
 
 from avmsf.errors import SceneError
+from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.mesh import Surface
 from avmsf.pipeline.cloud_shape import shape_of_cloud
+from avmsf.pipeline.scene import without_far
+from avmsf.pipeline.shape import OFF_MESH, moved_onto
 from factories.ball_views import MIDDLE, RADIUS
+from factories.clouds import random_cloud
 from factories.raising import raises
 
 CELLS = 48
@@ -73,3 +78,45 @@ def test_gaussians_that_show_no_object_are_refused() -> None:
     for wrong, name in ((_ball(opacity=0.01), "opacities"), (_ball(99), "opacities"), (in_one_place, "centers")):
         with raises(SceneError, name=name):
             shape_of_cloud(wrong)
+
+
+def test_gaussians_meters_away_are_left_out_and_a_long_thin_object_is_kept_whole() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rod = torch.rand(3000, 3, generator=generator) * torch.tensor([0.4, 0.01, 0.01])
+    far = 3 * torch.randn(90, 3, generator=generator)
+    kept = without_far(random_cloud(torch.cat([rod, far])))
+    assert torch.equal(kept.centers, rod)
+    assert len(without_far(random_cloud(rod))) == 3000
+
+
+SPHERE = trimesh.creation.icosphere(4, 0.1)
+SURFACE = Surface(torch.from_numpy(SPHERE.vertices).float(), torch.from_numpy(SPHERE.faces))
+
+
+def gaussians() -> tuple[FeatureField, torch.Tensor]:
+    """Return points about a ball, each with its row as feature, and their distances from the middle."""
+    generator = torch.Generator().manual_seed(0)
+    ways = torch.nn.functional.normalize(torch.randn(600, 3, generator=generator), dim=1)
+    radius = torch.where(torch.arange(600) % 10 == 0, 0.08, 0.1 + 0.002 * torch.randn(600, generator=generator))
+    return FeatureField(radius[:, None] * ways, torch.arange(600.0)[:, None], "rows"), radius
+
+
+def test_points_move_onto_the_mesh_and_those_far_from_it_go() -> None:
+    features, radius = gaussians()
+    moved = moved_onto(features, SURFACE)
+    size = 0.2 * 3**0.5
+    kept = torch.nonzero((radius - 0.1).abs() <= OFF_MESH * size).flatten()
+    assert torch.equal(moved.features[:, 0].long(), kept)
+    assert 500 < len(kept) < 560
+    # Triangles of this ball lie up to .2 % of the radius beneath it.
+    assert float((moved.points.norm(dim=1) - 0.1).abs().max()) < 3e-4
+    ways = torch.nn.functional.normalize(features.points[kept], dim=1)
+    assert float((moved.points - 0.1 * ways).norm(dim=1).max()) < 1e-3
+
+
+def test_points_of_another_frame_and_a_cloud_change_nothing() -> None:
+    features, _ = gaussians()
+    far = Surface(SURFACE.vertices + 1.0, SURFACE.faces)
+    bare = Surface(SURFACE.vertices, SURFACE.faces[:0])
+    assert moved_onto(features, far) is features
+    assert moved_onto(features, bare) is features
