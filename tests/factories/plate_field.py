@@ -1,12 +1,16 @@
 """A small plate, struck and fitted in a moment, for the tests of fields."""
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit
+from avmsf.field.gains.attention import Attention
+from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -56,3 +60,17 @@ def plate_extraction(impacts: Impacts) -> Extraction:
     level = float(impacts.sounds.square().mean().sqrt()) * 0.01
     bank = ModalBank(modes.frequency + 0.2, modes.damping * 1.05)
     return Extraction(bank, gains + 0j, Residual(torch.full((33,), level)))
+
+
+def few_impacts() -> dict[str, Any]:
+    """Return what a fit to six short recordings is given."""
+    impacts = plate_impacts(6, seconds=0.1)
+    return {"train": impacts, "features": plate_features(60), "modes": plate_extraction(impacts)}
+
+
+def plate_fit(config: FitConfig, **changes: Any) -> SoundField:
+    """Fit the network to the plate, with other arguments where `changes` names them."""
+    train = changes.pop("train", plate_impacts())
+    modes = changes.pop("modes", None) or plate_extraction(plate_impacts(len(train)))
+    gains = changes.pop("gains", Attention())
+    return fit(train, changes.pop("features", plate_features()), modes, config, gains=gains, **changes)

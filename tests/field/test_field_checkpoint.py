@@ -11,13 +11,13 @@ import torch
 
 from avmsf.errors import FieldFileError, FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fingerprint, fit
+from avmsf.field.fit import fingerprint
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.sound_field import SoundField
 from avmsf.field.trainer import Progress
 from avmsf.field.training import AdamW, TrainingRun
-from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from factories.plate_field import QUICK, few_impacts, plate_features, plate_fit
 from factories.raising import raises
 
 CONFIG = replace(
@@ -30,9 +30,7 @@ STAGES = ("trial with shared damping", "trial with per-contact damping", "fit")
 def fitted(
     checkpoint: Path | None, progress: Callable[[Progress], None] | None = None, *, config: FitConfig = CONFIG
 ) -> SoundField:
-    impacts = plate_impacts(6, seconds=0.1)
-    modes = plate_extraction(impacts)
-    return fit(impacts, plate_features(60), modes, config, gains=Attention(), checkpoint=checkpoint, progress=progress)
+    return plate_fit(config, **few_impacts(), checkpoint=checkpoint, progress=progress)
 
 
 @cache
@@ -157,21 +155,21 @@ def test_a_fit_that_diverged_between_two_reads_of_the_loss_leaves_no_checkpoint(
 
 
 def test_all_that_decides_a_fit_tells_its_checkpoint_from_others():
-    impacts, features = plate_impacts(6, seconds=0.1), plate_features(60)
-    modes = plate_extraction(impacts)
+    impacts, features, modes = few_impacts().values()
     other_bank = replace(modes, bank=replace(modes.bank, damping=2 * modes.bank.damping))
     other_noise = replace(modes, residual=replace(modes.residual, magnitude=2 * modes.residual.magnitude))
+    directions = (impacts.directions, -impacts.directions, None)
     fits = [
-        *((each, features, modes, CONFIG) for each in (impacts, replace(impacts, sounds=impacts.sounds * 1.5))),
+        *((replace(impacts, directions=each), features, modes, CONFIG) for each in directions),
+        (replace(impacts, sounds=impacts.sounds * 1.5), features, modes, CONFIG),
         (replace(impacts, sample_rate=9000.0), features, modes, CONFIG),
-        *((replace(impacts, directions=each), features, modes, CONFIG) for each in (-impacts.directions, None)),
         (impacts, plate_features(50), modes, CONFIG),
         *((impacts, features, each, CONFIG) for each in (other_bank, other_noise)),
         (impacts, features, modes, replace(CONFIG, seed=1)),
     ]
     keys = [fingerprint(gain_data(*each), Attention()) for each in fits]
     assert len(set(keys)) == len(fits)
-    assert fingerprint(gain_data(*fits[0]), Attention()) == keys[0]
+    assert fingerprint(gain_data(impacts, features, modes, CONFIG), Attention()) == keys[0]
     assert fingerprint(gain_data(*fits[0]), Attention(plate_features(50))) not in keys
 
 

@@ -12,8 +12,6 @@ from avmsf.errors import FitError
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fit
-from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import spectral_loss
 from avmsf.field.sound_field import SoundField
@@ -22,7 +20,7 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
-from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
+from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_fit, plate_impacts
 from factories.raising import raises
 from oracles.plate import plate_modes
 
@@ -31,28 +29,20 @@ SHORT = replace(QUICK, warmup_steps=4, steps=4)
 VALIDATED = replace(SHORT, damping="validated")
 
 
-def fitted(config: FitConfig, **changes) -> SoundField:
-    """Fit to the plate, with other arguments where `changes` names them."""
-    impacts = changes.pop("train", plate_impacts())
-    modes = changes.pop("modes", None) or plate_extraction(plate_impacts(len(impacts)))
-    gains = changes.pop("gains", Attention())
-    return fit(impacts, changes.pop("features", plate_features()), modes, config, gains=gains, **changes)
-
-
 @cache
 def short_fit() -> SoundField:
-    return fitted(SHORT)
+    return plate_fit(SHORT)
 
 
 @cache
 def validated_fit() -> SoundField:
-    return fitted(VALIDATED)
+    return plate_fit(VALIDATED)
 
 
 @cache
 def long_fit() -> tuple[SoundField, list[Progress]]:
     told: list[Progress] = []
-    return fitted(LONG, progress=told.append), told
+    return plate_fit(LONG, progress=told.append), told
 
 
 def bits(field: SoundField) -> dict[str, torch.Tensor]:
@@ -95,11 +85,11 @@ def test_the_same_seed_gives_the_same_field_to_the_last_bit_and_another_another(
     first = validated_fit()
     torch.manual_seed(2)
     before = torch.get_rng_state()
-    again = fitted(VALIDATED)
+    again = plate_fit(VALIDATED)
     assert same(first, again)
     assert first.origin == again.origin
     assert torch.equal(torch.get_rng_state(), before)
-    assert not torch.equal(fitted(replace(VALIDATED, seed=1)).bank.frequency, first.bank.frequency)
+    assert not torch.equal(plate_fit(replace(VALIDATED, seed=1)).bank.frequency, first.bank.frequency)
 
 
 def test_recordings_in_float64_give_the_same_field():
@@ -107,7 +97,7 @@ def test_recordings_in_float64_give_the_same_field():
     wide = replace(impacts, sounds=impacts.sounds.double())
     modes = plate_extraction(impacts)
     wide_modes = replace(modes, residual=replace(modes.residual, magnitude=modes.residual.magnitude.double()))
-    field = fitted(SHORT, train=wide, modes=wide_modes)
+    field = plate_fit(SHORT, train=wide, modes=wide_modes)
     assert same(field, short_fit())
     assert {each.dtype for each in field.gain_field.state_dict().values()} == {torch.float32}
     assert field.residual.magnitude.dtype == torch.float32
@@ -126,7 +116,7 @@ def test_modes_come_out_by_frequency():
     """Modes in the wrong order come out ascending, and each with its own gains."""
     impacts = plate_impacts()
     modes = plate_extraction(impacts)
-    field = fitted(replace(LONG, steps=0), modes=flipped(modes))
+    field = plate_fit(replace(LONG, steps=0), modes=flipped(modes))
     assert bool((field.bank.frequency.diff() > 0).all())
     gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate)
     assert float((field.gains(impacts.contacts) - gains).square().sum() / gains.square().sum()) < 0.02
@@ -134,7 +124,7 @@ def test_modes_come_out_by_frequency():
 
 def test_supporting_poles_are_the_same_poles_in_the_field():
     modes = flipped(plate_extraction(plate_impacts()))
-    field = fitted(SHORT, modes=modes, supporting=[0])
+    field = plate_fit(SHORT, modes=modes, supporting=[0])
     assert field.is_mode.tolist() == [True] * (len(modes.bank) - 1) + [False]
 
 
@@ -148,7 +138,7 @@ def test_modes_that_start_late_keep_their_phase_unless_sines_are_asked_for(phase
     )
     config = replace(LONG, steps=0, residual=False, phase=phase)
     turned = replace(modes, gains=modes.gains * cmath.exp(1.2j))
-    field = fitted(config, train=replace(impacts, sounds=late), modes=turned)
+    field = plate_fit(config, train=replace(impacts, sounds=late), modes=turned)
     error = float((field.render(impacts.contacts) - late).square().sum() / late.square().sum())
     # A sine holds cos^2 1.2 = .13 of the energy of one that starts 1.2 radians later.
     if phase == "common":
@@ -182,7 +172,7 @@ def test_a_trial_does_not_learn_from_the_recordings_held_out():
     losses, reports = [], []
     for each in (impacts.sounds, sounds):
         told: list[Progress] = []
-        field = fitted(VALIDATED, train=replace(impacts, sounds=each), modes=modes, progress=told.append)
+        field = plate_fit(VALIDATED, train=replace(impacts, sounds=each), modes=modes, progress=told.append)
         losses.append([step.loss for step in told])
         reports.append(field.origin.report)
     assert reports[1]["validation_contacts"] == held
@@ -197,7 +187,7 @@ def test_looking_more_often_changes_no_step(monkeypatch):
     losses: dict[int, list[float]] = {1: [], 100: []}
     for every, seen in losses.items():
         monkeypatch.setattr("avmsf.field.trainer._VALIDATION_STEPS", every)
-        fitted(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
+        plate_fit(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
     assert losses[1] == losses[100]
 
 
@@ -205,7 +195,7 @@ def test_patience_ends_a_trial_early_and_shortens_the_fit():
     told: list[Progress] = []
     # Steps far too long for the network to go on improving.
     config = replace(QUICK, warmup_steps=20, warmup_rate=3e-2, learning_rate=0.3, steps=200, patience=10)
-    report = fitted(config, progress=told.append).origin.report
+    report = plate_fit(config, progress=told.append).origin.report
     trial = [each.step for each in told if each.stage == "trial with shared damping"]
     final = [each.step for each in told if each.stage == "fit"]
     assert max(trial) < 220
@@ -217,10 +207,10 @@ def test_the_reason_for_the_form_of_damping_is_reported():
     one_step, few = replace(VALIDATED, warmup_steps=1, steps=1), {"train": plate_impacts(5)}
     fits = (
         # Too few positions, as set, none held out, a gain model of one form, validated.
-        fitted(one_step, **few),
-        fitted(replace(one_step, damping="shared"), **few),
-        fitted(replace(one_step, validation=0.0)),
-        fitted(one_step, gains=MixtureEstimator(("smooth",)), **few),
+        plate_fit(one_step, **few),
+        plate_fit(replace(one_step, damping="shared"), **few),
+        plate_fit(replace(one_step, validation=0.0)),
+        plate_fit(one_step, gains=MixtureEstimator(("smooth",)), **few),
         validated_fit(),
     )
     reports = [field.origin.report for field in fits]
@@ -231,7 +221,7 @@ def test_the_reason_for_the_form_of_damping_is_reported():
 
 @pytest.mark.parametrize("damping", ["shared", "per-contact"])
 def test_damping_follows_the_config(damping):
-    field, impacts = fitted(replace(SHORT, damping=damping)), plate_impacts()
+    field, impacts = plate_fit(replace(SHORT, damping=damping)), plate_impacts()
     dampings = field.dampings(impacts.contacts)
     assert float(dampings.min()) > 0
     assert (float(dampings.std(0).max()) > 0) == (damping == "per-contact")
@@ -240,7 +230,7 @@ def test_damping_follows_the_config(damping):
 
 
 def test_a_field_without_residual_has_no_noise():
-    field = fitted(replace(SHORT, residual=False))
+    field = plate_fit(replace(SHORT, residual=False))
     assert float(field.residual.magnitude.abs().max()) == 0
     assert short_fit().residual.magnitude.min() > 0
 
@@ -252,14 +242,14 @@ def test_noise_is_measured_after_training_or_trained():
     level = 0.01 * float(impacts.sounds.square().mean().sqrt())
     decibels = 20 * torch.log10(field.residual.magnitude / level)
     assert -1.0 < float(decibels.median()) < 3.0
-    trained = fitted(replace(SHORT, noise_rate=0.1)).residual.magnitude
+    trained = plate_fit(replace(SHORT, noise_rate=0.1)).residual.magnitude
     # Adam moves each logarithm by about the rate at each of four steps.
     assert 0.02 < float(torch.log(trained / measured).abs().mean()) < 0.5
 
 
 def test_warm_up_aims_at_the_gains_that_sines_can_express():
     impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
-    field = fitted(replace(LONG, steps=0))
+    field = plate_fit(replace(LONG, steps=0))
     gains = fit_sine_gains(impacts.sounds, modes.bank, sample_rate=impacts.sample_rate)
     error = (field.gains(impacts.contacts) - gains).square().sum() / gains.square().sum()
     assert float(error) < 0.02
@@ -271,13 +261,13 @@ def test_warm_up_aims_at_the_gains_that_sines_can_express():
 def test_without_a_warm_up_modes_are_as_strong_as_they_were_found_whatever_their_phase():
     modes = plate_extraction(plate_impacts())
     late = replace(modes, gains=1j * modes.gains)
-    sines, cosines = (fitted(replace(SHORT, warmup_steps=0), modes=each).gain_field for each in (modes, late))
+    sines, cosines = (plate_fit(replace(SHORT, warmup_steps=0), modes=each).gain_field for each in (modes, late))
     assert float(sines.gain_scale.min()) > 0
     assert torch.allclose(cosines.gain_scale, sines.gain_scale)
 
 
 def test_forces_make_a_field_per_newton():
-    assert fitted(SHORT, train=plate_impacts(forces=True)).origin.per_newton is True
+    assert plate_fit(SHORT, train=plate_impacts(forces=True)).origin.per_newton is True
     assert short_fit().origin.per_newton is False
 
 
@@ -291,7 +281,7 @@ def test_a_silent_recording_and_a_mode_that_is_never_excited_do_no_harm():
     damping = torch.cat([modes.bank.damping, torch.tensor([20.0], dtype=torch.float64)])
     zeros = torch.zeros(12, 1)
     more = Extraction(ModalBank(frequency, damping), torch.cat([modes.gains, zeros], 1), modes.residual)
-    field = fitted(VALIDATED, train=replace(impacts, sounds=sounds), modes=more)
+    field = plate_fit(VALIDATED, train=replace(impacts, sounds=sounds), modes=more)
     assert all(bool(torch.isfinite(each).all()) for each in bits(field).values())
     gains = field.gains(impacts.contacts).abs().mean(0)
     assert float(gains[-1]) < 0.1 * float(gains[:-1].mean())
@@ -300,34 +290,34 @@ def test_a_silent_recording_and_a_mode_that_is_never_excited_do_no_harm():
 def test_recordings_that_cannot_be_fitted_are_refused():
     impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
     with raises(FitError, name="train", row=None):
-        fitted(SHORT, train=impacts.take([]), modes=modes)
+        plate_fit(SHORT, train=impacts.take([]), modes=modes)
     with raises(FitError, name="modes", value=12):
-        fitted(SHORT, train=impacts.take(range(7)), modes=modes)
+        plate_fit(SHORT, train=impacts.take(range(7)), modes=modes)
     with raises(FitError, name="train", value="silence"):
-        fitted(SHORT, train=replace(impacts, sounds=torch.zeros_like(impacts.sounds)))
+        plate_fit(SHORT, train=replace(impacts, sounds=torch.zeros_like(impacts.sounds)))
     broken = impacts.sounds.clone()
     broken[3, 17] = math.inf
     with raises(FitError, name="plate/004", row=3):
-        fitted(SHORT, train=replace(impacts, sounds=broken))
+        plate_fit(SHORT, train=replace(impacts, sounds=broken))
     with raises(FitError, name="modes", value=pytest.approx(2302.0, abs=1.0)):
-        fitted(SHORT, train=replace(impacts, sample_rate=4000.0))
+        plate_fit(SHORT, train=replace(impacts, sample_rate=4000.0))
     none = torch.zeros(0, dtype=torch.float64)
     empty = Extraction(ModalBank(none, none), torch.zeros(12, 0) + 0j, modes.residual)
     with raises(FitError, name="modes", value=0):
-        fitted(SHORT, modes=empty)
+        plate_fit(SHORT, modes=empty)
 
 
 def test_too_many_clusters_are_refused():
     few = FeatureField.from_points(plate_impacts().contacts)
     with pytest.raises(FitError):
-        fitted(FitConfig(), features=few)
-    assert fitted(replace(SHORT, clusters=12), features=few).gain_field.shape.clusters == 12
+        plate_fit(FitConfig(), features=few)
+    assert plate_fit(replace(SHORT, clusters=12), features=few).gain_field.shape.clusters == 12
 
 
 def test_a_fit_that_diverges_says_so():
     config = replace(QUICK, learning_rate=1e30, warmup_steps=0)
     with raises(FitError, name="fit") as caught:
-        fitted(config)
+        plate_fit(config)
     assert not math.isfinite(caught.value.value)
 
 
@@ -341,5 +331,5 @@ def test_steps_take_turns_at_the_frames(monkeypatch, every, turns):
         return spectral_loss(sounds, target, first=first, every=every)
 
     monkeypatch.setattr("avmsf.field.training.spectral_loss", noted)
-    fitted(replace(SHORT, interleave=every))
+    plate_fit(replace(SHORT, interleave=every))
     assert asked == [(turn, every) for turn in turns for _ in ("whole", "early")]

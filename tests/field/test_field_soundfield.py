@@ -7,11 +7,9 @@ from functools import cache
 import pytest
 import torch
 
-from avmsf.field.fit import fit
-from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.residual_noise import shape_noise
-from factories.plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
+from factories.plate_field import PLATE, QUICK, plate_fit, plate_impacts
 from oracles.plate import sample_contacts
 
 CONTACTS = sample_contacts(PLATE, 40, generator=torch.Generator().manual_seed(5))
@@ -19,9 +17,8 @@ CONTACTS = sample_contacts(PLATE, 40, generator=torch.Generator().manual_seed(5)
 
 @cache
 def field() -> SoundField:
-    impacts = plate_impacts(forces=True)
     config = replace(QUICK, damping="per-contact", warmup_steps=20, steps=4, learning_rate=0.05)
-    return fit(impacts, plate_features(), plate_extraction(impacts), config, gains=Attention())
+    return plate_fit(config, train=plate_impacts(forces=True))
 
 
 def test_a_sound_is_its_modes_and_the_noise():
@@ -86,16 +83,6 @@ def test_force_scales_all_of_the_sound():
     assert torch.equal(field().render(CONTACTS, forces=0.0), torch.zeros(40, 2400))
     # Noise and modes alike, to float32.
     torch.testing.assert_close(field().render(CONTACTS, forces=0.3), 0.3 * sounds, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("samples", [1, 511, 2400, 5000])
-def test_modes_of_a_longer_sound_begin_as_those_of_a_shorter_one(samples):
-    silent = replace(field(), residual=replace(field().residual, magnitude=torch.zeros(33)))
-    shorter, longer = silent.render(CONTACTS, samples=samples), silent.render(CONTACTS, samples=6000)
-    assert shorter.shape == (40, samples)
-    loudest = float(longer.abs().max())
-    torch.testing.assert_close(shorter, longer[:, :samples], rtol=0, atol=1e-6 * loudest)
-    assert field().render(CONTACTS, samples=samples).shape == (40, samples)
 
 
 def test_rendering_keeps_no_gradients_and_changes_no_chance():

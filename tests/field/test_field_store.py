@@ -15,12 +15,10 @@ from safetensors.torch import save as to_bytes
 
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FieldFileError
-from avmsf.field.fit import fit
-from avmsf.field.gains.attention import Attention
 from avmsf.field.header import FORMAT
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from factories.plate_field import PLATE, QUICK, plate_extraction, plate_features, plate_impacts
+from factories.plate_field import PLATE, QUICK, plate_fit, plate_impacts
 from factories.raising import raises
 from oracles.plate import sample_contacts
 
@@ -31,17 +29,8 @@ SETTINGS = CaptureSettings(response_channel=2, highpass=30.0, align=False)
 
 @cache
 def field(damping: str = "shared") -> SoundField:
-    impacts = plate_impacts(forces=True)
     config = replace(CONFIG, damping=damping, learning_rate=0.05)
-    return fit(
-        impacts,
-        plate_features(),
-        plate_extraction(impacts),
-        config,
-        gains=Attention(),
-        capture="a plate",
-        settings=SETTINGS,
-    )
+    return plate_fit(config, train=plate_impacts(forces=True), capture="a plate", settings=SETTINGS)
 
 
 def other_field() -> SoundField:

@@ -10,7 +10,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from avmsf._utils.device import without_denormals
 from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -19,7 +18,7 @@ from avmsf.field.trainer import GainEstimator
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.record import with_record
-from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+from factories.plate_field import QUICK, few_impacts, plate_fit
 from factories.raising import raises
 
 CONFIG = replace(QUICK, warmup_steps=2, steps=2, damping="per-contact", fft_sizes=(256, 128), early=256)
@@ -40,8 +39,7 @@ def on_meta(value: object) -> object:
 
 def started(recipe: GainEstimator, config: FitConfig, device: str) -> tuple[TrainingRun, Targets]:
     """Return a run before its first step, and what it is fitted to, on a device."""
-    impacts = plate_impacts(6, seconds=0.1)
-    data = gain_data(impacts, plate_features(60), plate_extraction(impacts), replace(config, clusters=4))
+    data = gain_data(*few_impacts().values(), replace(config, clusters=4))
     gains, rows = recipe.start(data)
     targets = Targets.of(data, rows, "cpu" if device == "meta" else device)
     return TrainingRun(gains, data, device), on_meta(targets) if device == "meta" else targets
@@ -121,7 +119,7 @@ def test_the_cpu_is_as_good_as_no_choice() -> None:
     if CUDA:
         pytest.skip("the choice here is a GPU")
     fields_ = [fitted(device) for device in (None, "cpu")]
-    contacts = plate_impacts(6, seconds=0.1).contacts
+    contacts = few_impacts()["train"].contacts
     assert torch.equal(*(each.render(contacts) for each in fields_))
     assert fields_[0].origin == fields_[1].origin
 
@@ -129,17 +127,15 @@ def test_the_cpu_is_as_good_as_no_choice() -> None:
 @pytest.mark.skipif(not CUDA, reason="needs a CUDA GPU")
 @pytest.mark.parametrize("recipe", [Attention(), MixtureEstimator()], ids=["network", "mixture"])
 def test_a_gpu_gives_the_same_field_up_to_rounding(recipe: GainEstimator) -> None:
-    contacts = plate_impacts(6, seconds=0.1).contacts
+    contacts = few_impacts()["train"].contacts
     one, other = (fitted(device, recipe).render(contacts) for device in ("cpu", "cuda"))
     # Rounding of float32, grown over a few steps.
     torch.testing.assert_close(one, other, rtol=0, atol=1e-3 * float(one.abs().max()))
 
 
 def fitted(device: str | None, recipe: GainEstimator | None = None):
-    impacts = plate_impacts(6, seconds=0.1)
-    recipe = Attention() if recipe is None else recipe
-    config = replace(CONFIG, clusters=4)
-    return fit(impacts, plate_features(60), plate_extraction(impacts), config, gains=recipe, device=device)
+    gains = Attention() if recipe is None else recipe
+    return plate_fit(replace(CONFIG, clusters=4), **few_impacts(), gains=gains, device=device)
 
 
 @pytest.mark.parametrize("device", ["nonesuch", "meta", *([] if CUDA else ["cuda"])])

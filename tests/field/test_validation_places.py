@@ -7,10 +7,9 @@ import torch
 
 from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.fit import fit
-from avmsf.field.gains.attention import Attention, held_out
+from avmsf.field.gains.attention import held_out
 from avmsf.gaussians.points import farthest_points
-from factories.plate_field import QUICK, plate_extraction, plate_impacts
+from factories.plate_field import QUICK, plate_extraction, plate_fit, plate_impacts
 
 COUNT = 12
 
@@ -43,7 +42,7 @@ def test_a_fit_validates_at_places_it_does_not_learn_from() -> None:
     twice = replace(impacts.take([*range(COUNT)] * 2), names=names)
     config = replace(QUICK, damping="validated", warmup_steps=1, steps=1)
     features = FeatureField.from_contacts(impacts.contacts)
-    report = fit(twice, features, plate_extraction(twice), config, gains=Attention()).origin.report
+    report = plate_fit(config, train=twice, features=features, modes=plate_extraction(twice)).origin.report
     held = {int(name) for name in report["validation_contacts"]}
     assert len(held) == 6
     assert {row % COUNT for row in held}.isdisjoint(row % COUNT for row in set(range(2 * COUNT)) - held)
