@@ -76,36 +76,22 @@ def test_tetrahedra_that_cannot_be(points, cells, name, row, value):
         Solid.build(points, cells)
 
 
-def test_closest_points_are_those_of_a_dense_cloud():
+def test_closest_points_are_those_of_trimesh():
     mesh = trimesh.creation.torus(0.04, 0.015, major_sections=12, minor_sections=6)
-    triangles = np.array(mesh.triangles)
-    # One long triangle beside many small ones.
-    triangles = np.concatenate([triangles, [[[0.0, 0.0, 0.1], [1.0, 0.0, 0.1], [1.0, 0.001, 0.1]]]])
-    places = np.random.default_rng(0).uniform(-0.15, 0.15, (30, 3))
-    search = ClosestPoints(triangles)
-    assert len(search(places[:0]).rows) == 0
-    found = search(places)
-    at = np.einsum("pc,pcd->pd", found.weights, triangles[found.rows])
-    np.testing.assert_allclose(np.linalg.norm(at - places, axis=1), found.distances, atol=1e-12)
-    assert (found.weights >= 0).all()
-    np.testing.assert_allclose(found.weights.sum(axis=1), 1.0, rtol=1e-12)
-    steps = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60
-    cloud = np.einsum("sc,tcd->std", steps, triangles).reshape(-1, 3)
-    nearest = np.array([np.linalg.norm(cloud - place, axis=1).min() for place in places])
-    assert (found.distances <= nearest + 1e-12).all()
-    # Half a step of the cloud in a small triangle, and of the long one where that is nearest.
-    assert (nearest - found.distances < 0.009).all()
-    assert np.median(nearest - found.distances) < 1e-5
-
-
-def test_closest_points_of_single_triangles_are_those_of_trimesh():
-    # Of a closed surface each side belongs to two triangles, and the other one would stand in for a side left out.
-    random = np.random.default_rng(1)
-    for corners in random.uniform(-0.1, 0.1, (20, 3, 3)):
-        places = random.uniform(-0.2, 0.2, (40, 3))
-        found = ClosestPoints(corners[None])(places)
-        expected = trimesh.triangles.closest_point(np.repeat(corners[None], len(places), axis=0), places)
-        np.testing.assert_allclose(found.weights @ corners, expected, atol=1e-12)
+    # One long triangle beside many small ones; and single ones, as a neighbor would stand in for a side left out.
+    long = [[[0.0, 0.0, 0.1], [1.0, 0.0, 0.1], [1.0, 0.001, 0.1]]]
+    random = np.random.default_rng(0)
+    for triangles in (np.concatenate([mesh.triangles, long]), *random.uniform(-0.1, 0.1, (20, 1, 3, 3))):
+        search, places = ClosestPoints(triangles), random.uniform(-0.2, 0.2, (40, 3))
+        assert len(search(places[:0]).rows) == 0
+        found = search(places)
+        soup = Trimesh(**trimesh.triangles.to_kwargs(triangles), process=False)
+        expected, distances, _ = trimesh.proximity.closest_point_naive(soup, places)
+        np.testing.assert_allclose(found.distances, distances, atol=1e-12)
+        assert (found.weights >= 0).all()
+        np.testing.assert_allclose(found.weights.sum(axis=1), 1.0, rtol=1e-12)
+        at = np.einsum("pc,pcd->pd", found.weights, triangles[found.rows])
+        np.testing.assert_allclose(at, expected, atol=1e-12)
 
 
 def test_a_coarser_skin_keeps_its_volume_and_stays_closed():

@@ -11,12 +11,15 @@ from avmsf.editing.material import change_material, infer_material
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.errors import FieldFileError
 from avmsf.fem.material import GLASS, WOOD
+from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.header import FORMAT
 from avmsf.field.store import load
 from factories.raising import raises
-from factories.stored_fields import fields
 
 FILES = sorted((Path(__file__).parent / "data").glob("format-*/*.safetensors"))
+MIXTURE = Path(__file__).parent / "data" / f"format-{FORMAT}" / "mixture.safetensors"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
@@ -29,18 +32,18 @@ def test_a_stored_field_sounds_as_it_did(path):
 
 
 def test_the_present_format_has_stored_fields_of_all_kinds():
-    assert {path.stem for path in FILES if path.parent.name == f"format-{FORMAT}"} == set(fields())
+    kinds = {load(path).gain_field.kind for path in FILES if path.parent == MIXTURE.parent}
+    assert kinds == {each.kind for each in (AttentionGains, BodyGains, MixtureGains, ScaledGains)}
 
 
 def test_a_stored_alignment_is_read():
-    path = next(path for path in FILES if path.stem == "mixture")
-    alignment = load(path).alignment
+    alignment = load(MIXTURE).alignment
     assert alignment is not None
     assert len(alignment.names) == len(alignment.delays) == 8
 
 
 def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
-    field = adjust_modes(change_material(fields()["mixture"], GLASS, WOOD), pitch=1.1)
+    field = adjust_modes(change_material(load(MIXTURE), GLASS, WOOD), pitch=1.1)
     entries = field.origin.report[EDITS]
     old = [{**entry, "edit": kind} for entry, kind in zip(entries, ("recast", "retune"), strict=True)]
     report = {**field.origin.report, EDITS: [*old, {"edit": "steer"}, {"edit": "recast", "to": entries[0]["to"]}]}
@@ -71,7 +74,7 @@ def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
     ],
 )
 def test_edits_and_supporting_poles_that_cannot_be_are_refused(report, name, tmp_path):
-    field = fields()["mixture"]
+    field = load(MIXTURE)
     damaged = replace(field, origin=replace(field.origin, report={**field.origin.report, **report}))
     with raises(FieldFileError, name=f"origin.report.{name}"):
         damaged.save(tmp_path / "field.safetensors")

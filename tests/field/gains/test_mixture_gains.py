@@ -116,15 +116,6 @@ def test_covariances_are_those_of_the_most_probable_hypothesis(make):
         assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * noise
 
 
-def test_without_noise_nothing_is_unknown_at_the_contacts():
-    sites = impacts(12, seed=1)
-    exact = replace(measured(sites), variance=torch.zeros(MODES).double())
-    given = fit_mixture(families(sites), exact, sites.points.float(), directional=True, noise_shares=(1e-9,))
-    for _, covariance, _ in given.covariances(sites.points, sites.directions):
-        assert float(covariance.diagonal().max()) < 1e-6 * float(given.values.abs().square().max())
-    assert torch.allclose(gains_at(given, sites), given.values, rtol=1e-3, atol=1e-4)
-
-
 def test_shares_are_of_the_families_that_modes_come_from():
     shares = model().shares()
     assert torch.allclose(shares.sum(0), torch.ones(MODES, dtype=torch.float64))
@@ -178,25 +169,6 @@ def test_scaled_gains_scale_the_model(factor):
     assert torch.allclose(other.noise(), abs(factor) * one.noise(), rtol=1e-5)
 
 
-def test_the_order_of_contacts_and_modes_does_not_matter():
-    sites, contacts, modes = impacts(12, seed=1), torch.randperm(12), torch.tensor([2, 0, 4, 1, 3])
-    gains = measured(sites)
-    turned = replace(
-        gains,
-        values=gains.values[contacts][:, modes],
-        **{name: getattr(gains, name)[modes] for name in ("variance", "frequency", "damping")},
-    )
-    one = fit_mixture(families(sites), gains, sites.points.float(), directional=True)
-    other = fit_mixture(families(sites.take(contacts)), turned, sites.points.float(), directional=True)
-    assert torch.allclose(gains_at(other), gains_at(one)[:, modes], rtol=1e-4, atol=1e-5)
-    assert torch.allclose(other.leave_one_out(), one.leave_one_out()[contacts][:, modes], rtol=1e-4, atol=1e-5)
-
-
-def test_noise_goes_with_its_mode_and_part():
-    error = model().mixture.standard_error()
-    assert torch.equal(model().noise(), torch.stack([error[:MODES], error[MODES:]], dim=1))
-
-
 def test_take_takes_modes_in_their_order():
     given, rows = replace(model(), measured=2.0 * model().values), torch.tensor([3, 0, 4])
     taken = given.take(rows)
@@ -224,15 +196,6 @@ def test_without_contacts_the_rest_predicts():
     for row, share, series in torch.nonzero(rest.mixture.weights).tolist():
         mean[:, series] += rest.mixture.weights[row, share, series] * dense(rest, kernels[row], share, series)[0]
     assert torch.allclose(series_of(gains_at(rest)), mean, rtol=1e-5, atol=1e-6)
-
-
-def test_the_mean_is_linear_in_the_values():
-    given = model()
-    other = torch.view_as_complex(draw(14, MODES, 2, seed=8))
-    both = gains_at(given.with_values(2.0 * given.values - 3.0 * other))
-    assert torch.allclose(both, 2.0 * gains_at(given) - 3.0 * gains_at(given.with_values(other)), rtol=1e-4, atol=1e-5)
-    assert torch.equal(given.with_values(other).values, other)
-    assert torch.equal(given.with_values(given.values).mixture.weights, given.mixture.weights)
 
 
 def test_mode_shapes_predict_what_positions_cannot_and_know_how_well():
