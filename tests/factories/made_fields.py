@@ -8,12 +8,11 @@ from pathlib import Path
 import torch
 
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.kernels import KernelFamily, Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import BodyGains
@@ -21,24 +20,13 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from factories.made_modes import sliding_plate
+from factories.gain_cases import SIDES, SIZE, draw, families, plate
 
-SIDES = (0.24, 0.17, 0.004)
-DIAGONAL = sum(side**2 for side in SIDES) ** 0.5
 BANK = ModalBank(
     torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64),
     torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64),
 )
 """Measured modes, each a little off one of the plate's elastic ones."""
-
-
-@cache
-def plate() -> ElasticModes:
-    return sliding_plate()
-
-
-def draw(*size: int, seed: int) -> torch.Tensor:
-    return torch.rand(*size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 0.5
 
 
 def places(count: int, *, seed: int) -> torch.Tensor:
@@ -84,10 +72,11 @@ def attention(*, spatial_damping: bool = False) -> AttentionGains:
 
 def mixture(sites: Sites, values: torch.Tensor, *more: KernelFamily, directional: bool) -> MixtureGains:
     """Return a model of the positional families and some more."""
-    families = [each(sites, DIAGONAL) for each in (Unstructured, Smooth, ThinPlate)]
     variance = torch.full((len(BANK),), 1e-4, dtype=torch.float64)
     measured = MeasuredGains(values, variance, BANK.frequency, BANK.damping)
-    return fit_mixture([*families, *more], measured, places(150, seed=0).float(), directional=directional)
+    return fit_mixture(
+        [*families(sites, elastic=False), *more], measured, places(150, seed=0).float(), directional=directional
+    )
 
 
 def positional(count: int = 20, *, noise: float = 0.05) -> MixtureGains:
@@ -106,7 +95,7 @@ def directional() -> MixtureGains:
 def elastic() -> MixtureGains:
     """Return a model with the plate's own mode shapes, fitted to gains a little off the measured ones."""
     impacts, values = struck(9)
-    body = Elastic(impacts, DIAGONAL, plate())
+    body = Elastic(impacts, SIZE, plate())
     return replace(mixture(impacts, 1.1 * values, body, directional=True), measured=values)
 
 

@@ -1,17 +1,62 @@
-"""The network and its training in the paper's own form: each switch against the equation that it selects."""
+"""Training of the network: AdamW beside torch's own class, and each switch to the paper's form."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 
 from avmsf.field.config import AttentionShape, FitConfig
 from avmsf.field.gains.attention import Attention, AttentionGains
 from avmsf.field.gains.data import gain_data
-from avmsf.field.training import Targets, TrainingRun
+from avmsf.field.training import AdamW, Targets, TrainingRun
 from avmsf.modal.residual_noise import noise_power
 from avmsf.modal.spectra import magnitude_stft
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
+
+
+def drawn() -> list[nn.Parameter]:
+    generator = torch.Generator().manual_seed(0)
+    return [nn.Parameter(torch.randn(size, generator=generator)) for size in ((3, 4), (5,), (2, 2))]
+
+
+def differentiate(parameters: list[nn.Parameter], step: int) -> None:
+    for each in parameters:
+        each.grad = None
+    # The last has no gradient at every other step.
+    used = parameters if step % 2 else parameters[:2]
+    torch.stack([(each - row).pow(4).sum() for row, each in enumerate(used)]).sum().backward()
+
+
+def test_steps_are_those_of_torch_also_from_a_state_of_before() -> None:
+    ours, theirs = drawn(), drawn()
+    optimizer = AdamW(ours, 0.1, 0.3)
+    reference = torch.optim.AdamW(theirs, 0.1, weight_decay=0.3, fused=True)
+    for step in range(20):
+        reference.param_groups[0]["lr"] = 0.1 / (1 + step)
+        for parameters in (ours, theirs):
+            differentiate(parameters, step)
+        optimizer.step(1 / (1 + step))
+        reference.step()
+        if step == 10:
+            moments, optimizer = optimizer.moments, AdamW(ours, 0.1, 0.3)
+            optimizer.resume(moments)
+    for one, other in zip(ours, theirs, strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.slow
+def test_a_step_brings_no_compiler_in() -> None:
+    program = (
+        "import sys, torch; from avmsf.field.training import AdamW; "
+        "p = torch.nn.Parameter(torch.ones(2)); p.square().sum().backward(); AdamW([p], 0.1).step(1.0); "
+        "assert float(p[0]) < 0.95; print('torch._dynamo' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"
+
 
 SHORT = replace(QUICK, warmup_steps=2, steps=2)
 

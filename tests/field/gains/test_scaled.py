@@ -1,18 +1,24 @@
-"""Gains times a factor a mode: what the contract of all gain fields does not say."""
+"""Gains times a factor a mode, and positions on the body that gains have."""
 
 import pytest
 import torch
 
 from avmsf._utils.text import RecordError
-from avmsf.field.gains.scaled import ScaledGains
+from avmsf.field.gains.scaled import BodyGains, ScaledGains
+from avmsf.field.positions import off_surface, off_surface_gains, points_on_object
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual_noise import Residual
-from factories.made_fields import BANK, FIELDS, blows, places
+from factories.believing_field import LENGTH, bar, bar_points
+from factories.made_fields import BANK, FIELDS, blows, places, positional
 from factories.raising import raises
 
 FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.0, 3.0], dtype=torch.float64)
+
+
 PLACES = places(7, seed=8)
+
+
 BLOWS = blows(PLACES, seed=9)
 
 
@@ -65,3 +71,46 @@ def test_lengths_and_inner_fields_that_cannot_be_are_refused():
     record = ScaledGains(inner, FACTORS).record()
     with raises(RecordError, name="fitted_kind", value="scaled"):
         ScaledGains.skeleton(record | {"fitted_kind": "scaled"})
+
+
+HEIGHT = 0.05
+
+
+"""Of a false floor above the bar's sheet, meters: an eighth of the length, more than the tolerance."""
+
+
+def closed() -> BodyGains:
+    """Return gains on the bar's sheet whose points lie on the sheet and on a false floor above it."""
+    points = bar_points()
+    return BodyGains(torch.cat([points, points + torch.tensor([0.0, 0.0, HEIGHT])]).float(), bar())
+
+
+def test_a_place_on_a_false_floor_is_off_the_body_by_its_height() -> None:
+    above = torch.tensor([[0.2, 0.05, 0.0], [0.2, 0.05, HEIGHT]])
+    ((row, distance),) = off_surface(above, closed())
+    assert row == 1
+    assert abs(distance - HEIGHT) < 1e-6
+
+
+def test_only_a_body_has_the_gains_of_its_nearest_point() -> None:
+    assert off_surface_gains(closed()) != off_surface_gains(positional())
+    assert off_surface_gains(ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)) == off_surface_gains(
+        closed()
+    )
+
+
+def test_points_of_the_false_floor_are_no_contacts() -> None:
+    assert torch.equal(points_on_object(closed()), bar_points().float())
+    # Gains without a body are known at all of their points.
+    assert torch.equal(points_on_object(positional()), positional().points)
+
+
+def test_an_edited_body_is_scaled() -> None:
+    large = ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)
+    surface = large.surface
+    assert surface is not None
+    assert float(surface.vertices[:, 0].max()) == 2.0 * float(torch.tensor(LENGTH))
+    assert len(points_on_object(large)) == len(bar_points())
+    ((_, distance),) = off_surface(torch.tensor([[0.4, 0.1, 2.0 * HEIGHT]]), large)
+    assert abs(distance - 2.0 * HEIGHT) < 1e-6
+    assert positional().surface is None

@@ -1,0 +1,323 @@
+"""A stage runs when something that decides its output changed, only then, and in one process at a time."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+import trimesh
+
+import avmsf.pipeline.fit as module
+from avmsf._utils.progress import ProgressListener
+from avmsf.capture import read_capture
+from avmsf.cli import main
+from avmsf.editing import guided
+from avmsf.errors import CaptureError, FolderInUseError, SimulationError
+from avmsf.fem import candidate_bodies as nominal
+from avmsf.fem.candidate_bodies import CandidateBodies, SurfaceBodies
+from avmsf.field import fit as field_fit
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fingerprint
+from avmsf.field.gains.data import gain_data
+from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.store import load
+from avmsf.mesh.surface import Surface
+from avmsf.pipeline.bodies import candidate_bodies
+from avmsf.pipeline.config import CACHE, BodyConfig, PipelineConfig
+from avmsf.pipeline.fit import fit_in_stages
+from avmsf.pipeline.stages import Pipeline, Stage, StageFolder, digest_files
+from avmsf.simulate import recipe
+from factories.plate_capture import fill_plate
+from factories.plate_field import plate_extraction, plate_features, plate_impacts
+from factories.raising import raises
+from factories.ringing_field import ringing_field
+
+
+class Maker:
+    """Writes its words, and counts how often it was asked to."""
+
+    def __init__(self, words: str = "made") -> None:
+        self.words, self.runs = words, 0
+
+    def __call__(self, path: Path) -> None:
+        self.runs += 1
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.words)
+
+
+def stage(make: Callable[[Path], object], *, name: str = "cloud.ply", **recipe: object) -> Stage:
+    return Stage(name, make, recipe=lambda: recipe)
+
+
+def test_an_unchanged_recipe_runs_once(tmp_path: Path) -> None:
+    make = Maker()
+    first = StageFolder(tmp_path / "kept").keep(stage(make, steps=3))
+    second = StageFolder(tmp_path / "kept").keep(stage(make, steps=3))
+    assert (make.runs, first.fresh, second.fresh) == (1, True, False)
+    assert second.digest == first.digest
+    assert second.seconds == pytest.approx(first.seconds, abs=1e-3)  # seconds; the record rounds to milliseconds
+
+
+@pytest.mark.parametrize("recipe", [{"steps": 4}, {"steps": 3, "more": None}, {}])
+def test_another_recipe_runs_again(tmp_path: Path, recipe: dict) -> None:
+    make, folder = Maker(), StageFolder(tmp_path)
+    folder.keep(stage(make, steps=3))
+    assert folder.keep(stage(make, **recipe)).fresh
+    # Tuples are the lists that they are read back as.
+    folder.keep(stage(make, sizes=(1, 2)))
+    assert not folder.keep(stage(make, sizes=(1, 2))).fresh
+    assert make.runs == 3
+
+
+def test_a_stage_is_made_once_after_those_that_it_depends_on_and_again_when_these_change(tmp_path: Path) -> None:
+    read, log = list[str](), list[str]()
+
+    def join(path: Path, *inputs: Path) -> None:
+        read.extend(each.name for each in inputs)
+        path.write_text("".join(each.read_text() for each in inputs))
+
+    def run(words: str) -> Pipeline:
+        stages = (Stage("b.txt", join, ("a.txt", "c.txt")), Stage("a.txt", Maker(words)), Stage("c.txt", Maker("c")))
+        listener = ProgressListener(ready=lambda name, seconds: log.append(name if seconds is None else f"{name} made"))
+        return Pipeline(StageFolder(tmp_path), stages, listener=listener)
+
+    pipeline = run("a")
+    assert pipeline["b.txt"].path.read_text() == "ac"
+    assert not run("a")["b.txt"].fresh
+    assert read == ["a.txt", "c.txt"]
+    assert list(pipeline.made) == ["a.txt", "c.txt", "b.txt"]
+    assert log == ["a made", "c made", "b made", "a", "c", "b"]
+    (tmp_path / "a.txt").write_text("changed")
+    (tmp_path / "a.txt.stage.json").unlink()
+    assert run("other")["b.txt"].path.read_text() == "otherc"
+
+
+def test_an_output_that_was_changed_or_lost_is_made_again(tmp_path: Path) -> None:
+    make, folder = Maker(), StageFolder(tmp_path)
+    kept = folder.keep(stage(make))
+    kept.path.write_text("changed")
+    assert folder.keep(stage(make)).fresh
+    assert kept.path.read_text() == "made"
+    kept.path.unlink()
+    assert folder.keep(stage(make)).fresh
+
+
+def test_a_stage_that_fails_midway_runs_again_even_under_an_older_recipe(tmp_path: Path) -> None:
+    make, folder = Maker("old"), StageFolder(tmp_path)
+    folder.keep(stage(make, steps=1))
+
+    def fail(path: Path) -> None:
+        path.write_text("half of the new")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        folder.keep(stage(fail, steps=2))
+    assert folder.keep(stage(make, steps=1)).fresh
+    assert folder.path("cloud.ply").read_text() == "old"
+
+
+def test_a_record_of_another_version_or_code_or_a_damaged_one_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make, folder = Maker(), StageFolder(tmp_path)
+    folder.keep(stage(make))
+    monkeypatch.setattr("avmsf.__version__", "0.0.0")
+    assert folder.keep(stage(make)).fresh
+    monkeypatch.setattr("avmsf.pipeline.stages.source_digest", lambda module: "other code")
+    assert folder.keep(stage(make)).fresh
+    assert not folder.keep(stage(make)).fresh
+    (tmp_path / "cloud.ply.stage.json").write_text("[]")
+    assert folder.keep(stage(make)).fresh
+
+
+def test_a_folder_counts_by_the_names_and_contents_of_its_files(tmp_path: Path) -> None:
+    def make(path: Path) -> None:
+        path.mkdir(exist_ok=True)
+        (path / "a.png").write_text("a")
+
+    folder = StageFolder(tmp_path)
+    kept = folder.keep(stage(make, name="frames"))
+    assert not folder.keep(stage(make, name="frames")).fresh
+    (kept.path / "a.png").rename(kept.path / "b.png")
+    assert folder.keep(stage(make, name="frames")).fresh
+
+
+def test_the_order_of_files_does_not_matter_but_what_stands_in_which_does(tmp_path: Path) -> None:
+    for name, words in (("a", "1"), ("b", "2"), ("c", "12")):
+        (tmp_path / name).write_text(words)
+    a, b = tmp_path / "a", tmp_path / "b"
+    digest = digest_files([a, b], root=tmp_path)
+    assert digest == digest_files([b, a], root=tmp_path)
+    a.write_text("2")
+    b.write_text("1")
+    assert digest != digest_files([a, b], root=tmp_path)
+
+
+def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed(tmp_path: Path) -> None:
+    folder = StageFolder(tmp_path)
+    checkpoint = folder.checkpoint("cloud.ply")
+
+    def stop(path: Path) -> None:
+        checkpoint.write_text("halfway")
+        raise KeyboardInterrupt
+
+    found: list[bool] = []
+
+    def go_on(path: Path) -> None:
+        found.append(checkpoint.exists())
+        path.write_text("done")
+
+    for begun, ended in ((1, 1), (2, 3)):
+        with pytest.raises(KeyboardInterrupt):
+            folder.keep(stage(stop, steps=begun))
+        folder.keep(stage(go_on, steps=ended))
+        assert not checkpoint.exists()
+    assert found == [True, False]
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    make = Maker()
+    (tmp_path / "cloud.ply.stage.json").mkdir()
+    with raises(CaptureError, file=tmp_path / "cloud.ply"):
+        StageFolder(tmp_path).keep(stage(make))
+    assert make.runs == 0
+
+
+def body_key() -> set[str]:
+    """Return the names of the cached files of the bodies of a triangle with a wall."""
+    with TemporaryDirectory() as folder:
+        surface = Surface(torch.eye(3), torch.tensor([[0, 1, 2]]))
+        SurfaceBodies(surface, count=2, dofs=1000, cache=Path(folder)).modes(0.01)
+        return {each.name for each in Path(folder).iterdir()}
+
+
+def fit_key() -> str:
+    impacts = plate_impacts(6, seconds=0.1)
+    case = gain_data(impacts, plate_features(60), plate_extraction(impacts), FitConfig())
+    return fingerprint(case, MixtureEstimator())
+
+
+def edit_key() -> dict[str, str]:
+    field = ringing_field()
+    return guided.checkpoint_identity(field, field.gain_field.points[:2], {}, {})
+
+
+@pytest.mark.parametrize(
+    ("module", "key"),
+    [
+        (recipe, lambda: recipe.ObjectRecipe().elastic_values()),
+        (nominal, body_key),
+        (field_fit, fit_key),
+        (guided, edit_key),
+    ],
+    ids=["elastic modes", "body", "fit", "edit"],
+)
+def test_other_code_has_another_key(
+    module: ModuleType, key: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = key()
+    assert key() == before
+    monkeypatch.setattr(module, "source_digest", lambda module: "changed")
+    assert key() != before
+
+
+def test_the_checkpoint_of_an_edit_is_of_one_field_alone() -> None:
+    field, changed = ringing_field(), ({"pitch": 1.001}, {"damping": 1.001}, {"level": 1.001}, {"seconds": 0.501})
+    others = [*(ringing_field(**each) for each in changed), replace(field, phase=field.phase + 0.001)]
+    contacts = field.gain_field.points[:2]
+    keys = [guided.checkpoint_identity(each, contacts, {}, {})["field"] for each in (field, *others)]
+    assert len(set(keys)) == len(keys)
+
+
+@pytest.mark.slow
+def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are_bodies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = read_capture(fill_plate(tmp_path / "plate"))
+    failures: list[Exception | None] = []
+
+    def bodies(*arguments: Any, **named: Any) -> CandidateBodies:
+        if (failure := failures.pop()) is not None:
+            raise failure
+        return candidate_bodies(*arguments, **named)
+
+    monkeypatch.setattr(module, "candidate_bodies", bodies)
+    settings = FitConfig(steps=2, fft_sizes=(1024, 256))
+    config = PipelineConfig(body=BodyConfig(wall=0.004, shapes=8, dofs=1000), fit=settings, modes=6)
+    folder = StageFolder(tmp_path / "cache")
+
+    def run(failure: Exception | None = None) -> bool:
+        """Return whether the field was made now."""
+        failures[:] = [failure]
+        return module.fit_in_stages(capture, config, folder).stages["field.safetensors"].fresh
+
+    assert run(SimulationError("3.1 GB are free"))
+    assert not run(SimulationError("2.9 GB are free"))
+    assert run()
+    assert load(folder.path("field.safetensors")).origin.report["unavailable"] == {}
+    assert not run()
+    # Bodies were not asked for.
+    assert failures == [None]
+
+
+Streams = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for no other writer."""
+    monkeypatch.setitem(StageFolder.lock.__kwdefaults__, "wait", 0.0)
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Let another thread make stages in a folder."""
+    begun, done = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with StageFolder(folder).lock("avmsf fit mug"):
+            begun.set()
+            done.wait()
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    begun.wait()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+@pytest.mark.parametrize("stage", ["gaussians", "features"])
+def test_a_command_is_refused_while_another_one_makes_stages(stage: str, tmp_path: Path, capsys: Streams) -> None:
+    trimesh.creation.icosphere(subdivisions=1, radius=0.05).export(tmp_path / "surface.ply")
+    with held(tmp_path / CACHE):
+        assert main(["fit", str(tmp_path), "--until", stage]) == 2
+    assert "avmsf fit mug" in capsys.readouterr().err
+    assert not (tmp_path / CACHE / "views").exists()
+
+
+def test_a_folder_that_shows_nothing_is_left_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    assert main(["fit", str(tmp_path), "--until", "gaussians"]) == 2
+    assert [each.name for each in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_only_the_cache_that_is_written_is_locked(tmp_path: Path) -> None:
+    with held(tmp_path / "one" / "cache"), StageFolder(tmp_path / "other" / "cache").lock("me", wait=0.0):
+        assert (tmp_path / "other" / "cache").is_dir()
+
+
+def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path) -> None:
+    capture = read_capture(fill_plate(tmp_path / "plate"))
+    with held(tmp_path / "cache"), pytest.raises(FolderInUseError) as refused:
+        fit_in_stages(capture, PipelineConfig("smooth", modes=4), StageFolder(tmp_path / "cache"))
+    assert refused.value.value["command"] == "avmsf fit mug"
+    assert sorted(each.name for each in (tmp_path / "cache").iterdir()) == ["stages.lock"]
