@@ -17,7 +17,8 @@ from avmsf.capture import Capture, CaptureSettings, read_capture
 from avmsf.cli import VERBS, main
 from avmsf.errors import CaptureError
 from avmsf.field.store import load
-from factories.plate_capture import CONTACT_TIME, HIGHEST, PLATE, RATE, TINY, fill_plate
+from factories.plate_capture import PLATE, TINY, fill_plate
+from factories.plate_field import CONTACT_TIME, HIGHEST, RATE
 from factories.raising import raises
 from factories.settings import sets
 from factories.verbs import run_verb

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from avmsf.evaluation import report
 from avmsf.evaluation.results import ResultsFolder
-from factories.plate_set import RATE, fill_plates
+from factories.plate_field import RATE
+from factories.plate_set import fill_plates
 from factories.verbs import run_verb
 
 CHEAP = ("--methods", "knn3,nearest", "--no-cdpam")

@@ -11,6 +11,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
+from avmsf.mesh import Surface
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -33,12 +34,13 @@ QUICK = FitConfig(
 )
 
 
-def plate_impacts(count: int = 12, *, seconds: float = 0.3, forces: bool = False) -> Impacts:
-    generator = torch.Generator().manual_seed(0)
-    contacts = sample_contacts(PLATE, count, generator=generator)
+def plate_impacts(
+    count: int = 12, *, seconds: float = 0.3, forces: bool = False, plate: Plate = PLATE, seed: int = 0
+) -> Impacts:
+    generator = torch.Generator().manual_seed(seed)
     impacts = strike(
-        PLATE,
-        contacts,
+        plate,
+        sample_contacts(plate, count, generator=generator),
         sample_rate=RATE,
         seconds=seconds,
         generator=generator,
@@ -47,6 +49,13 @@ def plate_impacts(count: int = 12, *, seconds: float = 0.3, forces: bool = False
         contact_time=CONTACT_TIME,
     )
     return replace(impacts, forces=torch.full((count,), 2.0)) if forces else impacts
+
+
+def rectangle(plate: Plate = PLATE) -> Surface:
+    """Return the plate's outline as two triangles."""
+    a, b = plate.length, plate.width
+    corners = torch.tensor([[0.0, 0.0, 0.0], [a, 0.0, 0.0], [a, b, 0.0], [0.0, b, 0.0]])
+    return Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
 def plate_features(count: int = 600) -> FeatureField:

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.capture import Capture, write_capture
 from avmsf.errors import SceneError, SimulationError
@@ -13,11 +11,9 @@ from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.mesh import Surface
 from avmsf.simulate.ground_truth import TRUTH, Truth, write_truth
-from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
-
-RATE, HIGHEST = 8000.0, 2500.0
+from factories.plate_field import CONTACT_TIME, HIGHEST, plate_impacts, rectangle
+from oracles.plate import Plate, plate_modes, plate_surface_points
 
 
 def plate_named(name: str) -> Plate:
@@ -37,31 +33,15 @@ def fill_plates(
     `recordings` makes a recording's name from its row.
     """
     for number, name in enumerate(names):
-        generator = torch.Generator().manual_seed(number)
         plate = plate_named(name)
-        impacts = strike(
-            plate,
-            sample_contacts(plate, count, generator=generator),
-            sample_rate=RATE,
-            seconds=0.25,
-            generator=generator,
-            noise_db=-40.0,
-            highest=HIGHEST,
-            contact_time=5e-4,
-        )
+        impacts = plate_impacts(count, seconds=0.25, plate=plate, seed=number)
         impacts = replace(impacts, names=tuple(map(recordings.format, range(count))))
-        write_capture(Capture(name, impacts, _surface(plate) if truth else None), folder / name)
+        write_capture(Capture(name, impacts, rectangle(plate) if truth else None), folder / name)
         if truth:
-            modes = plate_modes(plate, impacts.contacts, highest=HIGHEST, contact_time=5e-4)
+            modes = plate_modes(plate, impacts.contacts, highest=HIGHEST, contact_time=CONTACT_TIME)
             known = Truth(modes.frequency, modes.damping, modes.gains + 0j, impacts.names)
             write_truth(known, folder / name / TRUTH)
     return folder
-
-
-def _surface(plate: Plate) -> Surface:
-    a, b = plate.length, plate.width
-    corners = torch.tensor([[0.0, 0.0, 0.0], [a, 0.0, 0.0], [a, b, 0.0], [0.0, b, 0.0]])
-    return Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
 
 
 class PlateInputs(ObjectInputs):
