@@ -3,35 +3,51 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
 from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.material import DISCREPANCY, MATERIALS, NOMINAL, largest_factor
-from avmsf.fem.thickness import search_thickness
+from avmsf.fem.thickness import ThicknessPosterior, search_thickness
 from factories.made_dome import bodies
 
-
-def evidence(known: Sequence[CandidateBody], *, of: Callable[[float], float], filled: float) -> list[float]:
-    return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
-
-
-def walled(wall: float | None) -> CandidateBody:
-    return replace(bodies()[0], thickness=wall)
-
-
 GRID = (0.001, 0.0016, 0.0025, 0.004, 0.0063)
+"""Meters; None is the filled body."""
 
 
-@pytest.mark.parametrize(("true", "deviation"), [(0.0029, 0.07), (0.0029, 0.2), (0.0018, 0.1)])
+def searched(
+    of: Callable[[float], float], *, filled: float = -1000.0, walls: Sequence[float | None] = GRID, made: bool = True
+) -> tuple[Sequence[CandidateBody], ThicknessPosterior | None, list[float]]:
+    """Search by the evidence of a log thickness and of the filled body; return the walls that were asked for, too."""
+    asked: list[float] = []
+
+    def walled(wall: float | None) -> CandidateBody:
+        return replace(bodies()[0], thickness=wall)
+
+    def evidence(known: Sequence[CandidateBody]) -> list[float]:
+        return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
+
+    def make(wall: float) -> CandidateBody | None:
+        asked.append(wall)
+        return walled(wall) if made else None
+
+    return *search_thickness([walled(each) for each in walls], evidence, make), asked
+
+
+def normal(true: float, deviation: float) -> Callable[[float], float]:
+    return lambda log: -0.5 * ((log - math.log(true)) / deviation) ** 2
+
+
+@pytest.mark.parametrize(
+    ("true", "deviation"),
+    # The last is thinner than all walls given.
+    [(0.0029, 0.07), (0.0029, 0.2), (0.0018, 0.1), (0.55 * GRID[0], 0.1)],
+)
 def test_the_posterior_of_a_normal_evidence_is_normal_with_the_variance_of_shapes_added(
     true: float, deviation: float
 ) -> None:
-    normal = partial(evidence, of=lambda log: -0.5 * ((log - math.log(true)) / deviation) ** 2, filled=-50.0)
-    found, thickness = search_thickness([walled(each) for each in (None, *GRID)], normal, walled)
-    assert thickness is not None
+    found, thickness, _ = searched(normal(true, deviation), walls=(None, *GRID))
     assert thickness.median == pytest.approx(true, rel=0.03)
     both = math.hypot(deviation, 0.2)
     assert math.log(thickness.high / thickness.low) == pytest.approx(2 * 1.645 * both, rel=0.15)
@@ -43,61 +59,27 @@ def test_a_maximum_between_distant_walls_is_found() -> None:
     # As of a dish from photographs: gently up to 4.2 mm, then steeply down.
     steps = np.log([0.000625, 0.0014, 0.00306, 0.0036, 0.0042, 0.005, 0.006, 0.0068, 0.015])
     table = [-81.0, -60.0, -9.0, -4.0, 0.0, -6.0, -49.0, -73.0, -240.0]
-    skewed = partial(evidence, of=lambda log: float(np.interp(log, steps, table)), filled=-148.0)
-    grid = (0.000625, 0.001383, 0.003061, 0.006775, 0.014997)
-    found, _ = search_thickness([walled(each) for each in (None, *grid)], skewed, walled)
+    walls = (None, 0.000625, 0.001383, 0.003061, 0.006775, 0.014997)
+    found, _, _ = searched(lambda log: float(np.interp(log, steps, table)), filled=-148.0, walls=walls)
     assert found[0].thickness == pytest.approx(0.0042, rel=0.08)
 
 
-def test_thicker_walls_than_the_views_allow_are_not_tried() -> None:
-    asked: list[float] = []
-
-    def wall(thickness: float) -> CandidateBody:
-        asked.append(thickness)
-        return walled(thickness)
-
-    rising = partial(evidence, of=lambda log: 20.0 * log, filled=-1000.0)
-    _, thickness = search_thickness([walled(each) for each in GRID], rising, wall)
-    assert thickness is not None
-    assert asked
+def test_neither_thicker_walls_than_the_views_allow_are_tried_nor_ever_thinner_ones() -> None:
+    _, thickness, asked = searched(lambda log: 20.0 * log)
     assert max(asked) < GRID[-1] == pytest.approx(thickness.median, rel=0.1)
-
-
-def test_walls_thinner_than_the_first_ones_are_found() -> None:
-    true = 0.55 * GRID[0]
-    normal = partial(evidence, of=lambda log: -0.5 * ((log - math.log(true)) / 0.1) ** 2, filled=-500.0)
-    _, thickness = search_thickness([walled(each) for each in GRID], normal, walled)
-    assert thickness is not None
-    assert thickness.median == pytest.approx(true, rel=0.03)
-
-
-def test_walls_are_not_made_ever_thinner() -> None:
-    asked: list[float] = []
-
-    def wall(thickness: float) -> CandidateBody:
-        asked.append(thickness)
-        return walled(thickness)
-
-    falling = partial(evidence, of=lambda log: -20.0 * log, filled=-1000.0)
-    search_thickness([walled(each) for each in GRID], falling, wall)
+    _, _, asked = searched(lambda log: -20.0 * log)
     assert GRID[0] / 4 <= min(asked) < GRID[0]
 
 
 def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable() -> None:
-    flat = partial(evidence, of=lambda log: 0.0, filled=10.0)
-    found, thickness = search_thickness(
-        [walled(each) for each in (None, *GRID)], flat, lambda wall: pytest.fail("made")
-    )
-    assert thickness is None
+    found, thickness, asked = searched(lambda log: 0.0, filled=10.0, walls=(None, *GRID))
+    assert (thickness, asked) == (None, [])
     assert [body.thickness for body in found] == [None]
 
 
 def test_other_thicknesses_are_tried_where_a_body_cannot_be_had() -> None:
-    normal = partial(evidence, of=lambda log: -((log - math.log(0.0029)) ** 2), filled=-50.0)
-    asked: list[float] = []
-    _, thickness = search_thickness([walled(each) for each in GRID], normal, lambda wall: asked.append(wall))
+    _, thickness, asked = searched(lambda log: -((log - math.log(0.0029)) ** 2), made=False)
     assert len({round(each, 9) for each in asked}) == len(asked) > 1
-    assert thickness is not None
     assert thickness.low < 0.0029 < thickness.high
 
 

@@ -64,8 +64,6 @@ def test_facets_may_cut_across_a_wall_whose_thickness_is_known():
     radius, wall = 0.05, 0.001
     mesh = weld(tube(radius, wall, 0.15, sides=96, rings=16))
     unknown, known = wall_of(mesh), wall_of(mesh, wall)
-    assert unknown is not None
-    assert known is not None
     with pytest.raises(SimulationError):
         unknown.solid(unknown.length(9_000))
     lowest = float(elastic_modes(known.solid(known.length(9_000)), STEEL, count=1).frequency[0])
@@ -77,7 +75,6 @@ def test_prisms_fill_a_wall_of_uneven_thickness():
     shape = make_shape("tray", seed=14)
     mesh = weld(shape.surface)
     wall = wall_of(mesh)
-    assert wall is not None
     assert wall.thickness == pytest.approx(shape.thickness, rel=0.1)
     solid = wall.solid(wall.length(12_000))
     assert solid.volume == pytest.approx(mesh.volume, rel=0.02)
@@ -87,7 +84,6 @@ def test_prisms_fill_a_wall_of_uneven_thickness():
 def test_prisms_of_a_thick_block_have_several_layers():
     mesh = weld(box(0.1, 0.06, 0.04))
     wall = wall_of(mesh)
-    assert wall is not None
     length = wall.length(12_000)
     solid = wall.solid(length)
     assert solid.volume == pytest.approx(0.1 * 0.06 * 0.04)

@@ -138,7 +138,6 @@ def test_bands_hold_what_the_gains_intervals_hold() -> None:
     field = replace(field, bank=lone, phase=field.phase[:1], gain_field=gains.take(torch.tensor([0])))
     far = torch.tensor([0.1, 0.0, 0.0])
     known, spread = field.known(far[None]), field.gain_field.posterior(far[None]).std
-    assert spread is not None
     mean = known.parts[0, 0]
     drawn = mean + spread[0, 0] * torch.randn(20000, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     power = 10 * torch.log10(drawn.square().sum(1))

@@ -92,7 +92,6 @@ def case(count: int = 12, **changes: torch.Tensor | None) -> GainData:
 def test_bodies_halve_the_error_between_impacts() -> None:
     impacts, modes = recorded(10)
     others, _ = recorded(40, seed=3)
-    assert others.directions is not None
     _, gains = modes_of(others.contacts, others.directions.double())
 
     def error(gain_recipe: MixtureEstimator) -> float:
@@ -289,7 +288,6 @@ def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity(
     searched = candidate_bodies(Cup(), config)
     assert searched.searches_thickness
     body = searched.with_thickness(0.007)
-    assert body is not None
     assert body.thickness == 0.007
     known = candidate_bodies(Cup(), BodyConfig(wall=0.005, shapes=6, dofs=4000))
     assert (known.searches_thickness, [each.thickness for each in known.bodies]) == (False, [0.005])

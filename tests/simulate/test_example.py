@@ -25,7 +25,6 @@ def test_the_example_was_made_by_its_recipe() -> None:
 
 def test_the_example_sounds_as_its_truth_says() -> None:
     truth, rate = read_truth(EXAMPLE_FOLDER), float(EXAMPLE.sample_rate)
-    assert truth.starts is not None
     assert truth.names == read_capture(EXAMPLE_FOLDER).impacts.names
     # Each recording from its first sample after the impact on, and the truth as much later.
     firsts = truth.starts.ceil().long().tolist()
@@ -52,7 +51,6 @@ def test_the_example_shows_its_shape_in_photographs_alone() -> None:
     assert read_capture(EXAMPLE_FOLDER).surface is None
     shape = example_mesh().surface
     contacts = read_truth(EXAMPLE_FOLDER).contacts
-    assert contacts is not None
     nearest = ClosestPoints(shape.vertices.double().numpy()[shape.faces.numpy()])
     assert float(nearest(contacts.numpy()).distances.max()) < 1e-6  # meters
     for view in read_views(EXAMPLE_FOLDER)[::12]:

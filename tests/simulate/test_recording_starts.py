@@ -51,12 +51,10 @@ def test_starts_have_the_asked_mean_and_spread_and_any_fraction_of_a_sample() ->
 
 def test_a_recording_holds_room_noise_alone_before_its_impact(simulation: Simulation) -> None:
     starts = simulation.truth.starts
-    assert starts is not None
     rate = float(simulation.recipe.sample_rate)
     assert float(starts.min()) > 0.04 * rate
     quiet = torch.stack([row[: int(start)][:1400] for row, start in zip(simulation.recordings, starts, strict=True)])
     forces = simulation.capture.impacts.forces
-    assert forces is not None
     levels = (quiet * forces[:, None]).std(dim=1)
     assert float(levels.min()) > 0.0
     # One room: alike before all impacts, though short pieces of rumble differ.
@@ -68,7 +66,6 @@ def test_a_recording_holds_room_noise_alone_before_its_impact(simulation: Simula
 def test_the_truth_names_the_impact_in_every_file(simulation: Simulation, tmp_path: Path) -> None:
     write_simulation(simulation, tmp_path / "plate")
     truth = read_truth(tmp_path / "plate")
-    assert truth.starts is not None
     assert simulation.truth.starts is not None
     assert torch.equal(truth.starts, simulation.truth.starts)
     recordings = [
@@ -124,7 +121,6 @@ def test_contact_times_follow_the_speed_by_hertzs_law(pulse: str, power: float, 
 def test_the_defaults_vary_force_and_contact_time_as_impacts_by_hand_do(recipe: ObjectRecipe, cache: Path) -> None:
     made = simulate_object(replace(recipe, impacts=80, noise_db=None), cache=cache)
     forces = made.capture.impacts.forces
-    assert forces is not None
     # Of the aircraft's 74 impacts by hand: .37; eighty numbers have it to 8 %.
     assert float(forces.log().std()) == pytest.approx(0.37, rel=0.2)
 

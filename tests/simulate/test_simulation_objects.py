@@ -45,7 +45,6 @@ def rings(simulation: Simulation) -> torch.Tensor:
 
 def test_recordings_are_the_truth_and_noise_of_the_asked_level(simulation: Simulation) -> None:
     impacts = simulation.capture.impacts
-    assert impacts.forces is not None
     # As the recorder heard them, before they were divided by the forces.
     clean = rings(simulation) * impacts.forces.double()[:, None]
     noise = simulation.recordings.double() * impacts.forces.double()[:, None] - clean
@@ -68,7 +67,6 @@ def test_without_noise_recordings_are_the_truth_to_the_last_bit_of_float32(
     assert float((found - expected).abs().max()) < 1e-7 * float(expected.abs().max())
     # Without imperfections they start with their impacts, too.
     assert simulation.capture.settings.align == (imperfections != Imperfections.none())
-    assert simulation.truth.starts is not None
     assert bool(simulation.truth.starts.any()) == simulation.capture.settings.align
 
 
@@ -78,7 +76,6 @@ def test_the_truth_says_what_was_struck_and_not_what_was_written(simulation: Sim
     off = (truth.contacts - impacts.contacts).norm(dim=1)
     assert 0.0005 < float(off.square().mean().sqrt()) < 0.003
     # At the written places and forces one would expect other gains, by some per cent.
-    assert impacts.directions is not None
     blind = simulation.body.gains(impacts.contacts, impacts.directions.double())
     assert 0.01 < float((blind - truth.amplitudes).norm() / truth.amplitudes.norm()) < 0.5
 
@@ -88,8 +85,6 @@ def test_a_perfect_recorder_writes_what_was_struck_and_how_hard(recipe: ObjectRe
     simulation = simulate_object(replace(recipe, imperfections=perfect), cache=cache)
     truth, impacts = simulation.truth, simulation.capture.impacts
     assert truth.contacts is not None
-    assert impacts.directions is not None
-    assert impacts.forces is not None
     assert torch.equal(truth.contacts, impacts.contacts)
     # Hertz: the force goes with the speed to the power 6/5, and a harder blow is a brighter one.
     usual = simulation.body.forces(torch.ones(1, dtype=torch.float64))
@@ -207,7 +202,6 @@ def test_a_written_object_is_an_ordinary_capture_with_views_and_truth(simulation
         assert torch.equal(getattr(capture.impacts, name), getattr(impacts, name))
     assert capture.impacts.names == simulation.truth.names
     assert capture.name == simulation.capture.name == "tile-ceramic"
-    assert capture.surface is not None
     assert torch.equal(capture.surface.vertices, simulation.mesh.vertices)
     views = read_views(folder)
     assert len(views) == 3

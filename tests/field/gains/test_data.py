@@ -96,11 +96,8 @@ def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(
 
 def test_recordings_in_double_precision_are_recognized_by_their_alignment(delayed: tuple[Impacts, Extraction]) -> None:
     train = delayed[0]
-    assert train.before is not None
-    assert train.after is not None
     double = replace(train, sounds=train.sounds.double(), before=train.before.double(), after=train.after.double())
     modes = extract_modes(double)
-    assert modes.alignment is not None
     aligned = double.delayed(modes.alignment.delays).sounds.float()
     assert torch.equal(gain_data(double, FEATURES, modes, CONFIG).train.sounds, aligned)
 

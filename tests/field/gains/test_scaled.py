@@ -108,7 +108,6 @@ def test_points_of_the_false_floor_are_no_contacts() -> None:
 def test_an_edited_body_is_scaled() -> None:
     large = ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)
     surface = large.surface
-    assert surface is not None
     assert float(surface.vertices[:, 0].max()) == 2.0 * float(torch.tensor(LENGTH))
     assert len(points_on_object(large)) == len(bar_points())
     ((_, distance),) = off_surface(torch.tensor([[0.4, 0.1, 2.0 * HEIGHT]]), large)

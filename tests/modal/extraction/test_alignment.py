@@ -63,7 +63,6 @@ def error(found: Tensor, starts: Tensor) -> float:
 def test_delays_are_recovered(deviation: float, modes: int, noise_db: float) -> None:
     starts = jitter(12, deviation)
     found = align(damped(gains(12, modes), starts, noise_db=noise_db))
-    assert found is not None
     assert (found.agreement > 0.9).all()
     assert error(found.delays, starts) < 0.05
     assert found.coherence_after > max(0.98, found.coherence_before)
@@ -72,7 +71,6 @@ def test_delays_are_recovered(deviation: float, modes: int, noise_db: float) -> 
 def test_recordings_that_are_aligned_stay_as_they_are() -> None:
     impacts = damped(gains(12, 6), torch.zeros(12, dtype=torch.float64), noise_db=-60.0)
     found = align(impacts)
-    assert found is not None
     assert torch.equal(found.delays, torch.zeros(12, dtype=torch.float64))
     assert torch.equal(found.apply(impacts).sounds, impacts.sounds)
 
@@ -87,7 +85,6 @@ def test_loud_and_faint_recordings_and_signs_are_alike() -> None:
         after=impacts.after * scale[:, None],
     )
     found = align(loud)
-    assert found is not None
     assert error(found.delays, starts) < 0.02
 
 
@@ -96,7 +93,6 @@ def test_another_recording_is_aligned_by_the_phases_of_the_first() -> None:
     impacts = damped(gains(14, 6), starts, noise_db=-50.0)
     known, other = impacts.take(range(10)), impacts.take(range(10, 14))
     found = align(known)
-    assert found is not None
     common = starts[:10] - found.delays
     aligned = found.apply(other)
     expected = other.delayed(starts[10:] - common.median())
@@ -111,7 +107,6 @@ def test_a_recording_with_phases_of_its_own_is_named_and_moved_as_most_are() -> 
     phase = PHASE.repeat(10, 1)
     phase[4] = torch.tensor([2.1, 0.2, 1.0, 0.8, 1.5, 0.4])
     found = align(damped(gains(10, 6), starts, phase=phase, noise_db=-50.0))
-    assert found is not None
     kept = found.agreement > 0.5
     assert kept.tolist() == [row != 4 for row in range(10)]
     assert abs(found.delays[4] - found.phases.start) < found.phases.jitter
@@ -122,7 +117,6 @@ def test_phases_without_anything_in_common_hardly_move_starts() -> None:
     phase = 2 * math.pi * torch.rand(8, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     impacts = damped(1 + gains(8, 6).abs(), torch.zeros(8, dtype=torch.float64), phase=phase, noise_db=-50.0)
     found = align(impacts)
-    assert found is not None
     assert found.agreement.mean() < 0.6
     assert found.delays.std() < 1.0
     assert max(found.coherence_before, found.coherence_after) < 0.7
@@ -134,7 +128,6 @@ def test_the_common_start_does_not_depend_on_where_between_samples_impacts_fall(
     for common in (0.0, 0.3, 0.6):
         # Without phases sounds begin without a jump, which would not be limited to half the rate.
         each = align(damped(amplitudes, starts + common, phase=torch.zeros_like(PHASE), noise_db=-50.0))
-        assert each is not None
         found.append(float((each.delays - starts).median()) - common)
     assert max(found) - min(found) < 0.15
 
@@ -144,7 +137,6 @@ def test_files_that_begin_within_the_sound_start_with_the_latest() -> None:
     whole = damped(gains(8, 6), torch.zeros(8, dtype=torch.float64))
     trimmed = replace(whole.delayed(cut), before=torch.full((8, LEAD), torch.nan), after=torch.zeros(8, 0))
     found = align(trimmed)
-    assert found is not None
     assert torch.allclose(found.delays, 12.0 - cut, atol=0.05)
 
 
@@ -163,8 +155,6 @@ def test_extraction_aligns_first_and_its_file_keeps_the_alignment(tmp_path: Path
     assert extract_modes(plain, HighResolution()).alignment is None
     once, again = (extract_once(impacts, HighResolution(), tmp_path / "modes.safetensors") for _ in range(2))
     assert found.alignment is not None
-    assert once.alignment is not None
-    assert again.alignment is not None
     assert torch.equal(once.alignment.delays, again.alignment.delays)
     assert torch.equal(once.aligned(impacts).sounds, again.aligned(impacts).sounds)
     assert torch.equal(once.aligned(impacts.take([3])).sounds, again.aligned(impacts).sounds[3:4])
@@ -193,7 +183,6 @@ def test_measured_impulse_responses_cut_by_a_threshold_get_their_starts_back() -
         after=torch.zeros(len(files_), 0),
     )
     found = align(impacts)
-    assert found is not None
     assert len(set(onsets)) > 1
     assert error(found.delays, -torch.tensor(onsets, dtype=torch.float64)) < 0.05
     assert found.coherence_after > 0.99 > found.coherence_before
