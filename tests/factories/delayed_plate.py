@@ -36,14 +36,19 @@ def strikes(count: int, *, starts: Tensor | None = None) -> Impacts:
     waves = torch.exp(-DAMPING[:, None] * times.clamp(min=0)) * angles.sin() * (times >= 0)
     files = (gains[:, :, None] * waves).sum(1)
     files += 1e-4 * torch.randn(files.shape, dtype=torch.float64, generator=generator)
+    return cut(files, rate=RATE, lead=LEAD, samples=SAMPLES, contacts=contacts)
+
+
+def cut(files: Tensor, *, rate: float, lead: int, samples: int, contacts: Tensor | None = None) -> Impacts:
+    """Return recordings whose sounds start after `lead` samples of their files."""
     files = files.float()
     return Impacts(
-        contacts=contacts,
-        sounds=files[:, LEAD : LEAD + SAMPLES].contiguous(),
-        sample_rate=RATE,
-        names=tuple(f"{row:02d}.wav" for row in range(count)),
-        before=files[:, :LEAD].contiguous(),
-        after=files[:, LEAD + SAMPLES :].contiguous(),
+        contacts=torch.zeros(len(files), 3) if contacts is None else contacts,
+        sounds=files[:, lead : lead + samples].contiguous(),
+        sample_rate=rate,
+        names=tuple(f"{row:02d}.wav" for row in range(len(files))),
+        before=files[:, :lead].contiguous(),
+        after=files[:, lead + samples :].contiguous(),
     )
 
 

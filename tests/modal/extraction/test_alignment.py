@@ -15,6 +15,7 @@ from avmsf.capture.onset import find_onset
 from avmsf.modal.extraction.alignment import align, coherence
 from avmsf.modal.extraction.extract import extract_modes, extract_once
 from avmsf.modal.extraction.finders import HighResolution
+from factories.delayed_plate import cut
 
 RATE, SAMPLES, LEAD = 16000.0, 6000, 320
 FREQUENCY = torch.tensor([431.0, 902.5, 1370.0, 2204.0, 3317.0, 4750.0], dtype=torch.float64)
@@ -37,15 +38,7 @@ def damped(amplitudes: Tensor, starts: Tensor, *, phase: Tensor = PHASE, noise_d
     if noise_db is not None:
         noise = torch.randn(files.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(7))
         files = files + files.square().mean().sqrt() * 10 ** (noise_db / 20) * noise
-    files = files.float()
-    return Impacts(
-        contacts=torch.zeros(len(files), 3),
-        sounds=files[:, LEAD : LEAD + SAMPLES].contiguous(),
-        sample_rate=RATE,
-        names=tuple(f"{row:03d}.wav" for row in range(len(files))),
-        before=files[:, :LEAD].contiguous(),
-        after=files[:, LEAD + SAMPLES :].contiguous(),
-    )
+    return cut(files, rate=RATE, lead=LEAD, samples=SAMPLES)
 
 
 def jitter(contacts: int, deviation: float, *, seed: int = 3) -> Tensor:

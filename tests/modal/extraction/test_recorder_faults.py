@@ -14,6 +14,7 @@ from avmsf.modal.extraction.polarity import inverted_recordings
 from avmsf.modal.extraction.recorder_faults import gain_changes, noise_drop, rate_factors, uneven_decay
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
+from factories.delayed_plate import cut
 
 RATE, SAMPLES, LEAD, COUNT = 16000.0, 6000, 320, 10
 
@@ -37,15 +38,7 @@ def files(factors: Tensor) -> Tensor:
 
 
 def recorded(sounds: Tensor) -> tuple[Extraction, Impacts]:
-    sounds = sounds[:, :, 0].float()
-    impacts = Impacts(
-        contacts=torch.zeros(COUNT, 3),
-        sounds=sounds[:, LEAD:].contiguous(),
-        sample_rate=RATE,
-        names=tuple(f"{row:03d}.wav" for row in range(COUNT)),
-        before=sounds[:, :LEAD].contiguous(),
-        after=torch.zeros(COUNT, 0),
-    )
+    impacts = cut(sounds[:, :, 0], rate=RATE, lead=LEAD, samples=SAMPLES)
     return extract_modes(impacts, HighResolution(modes=32)), impacts
 
 
@@ -71,7 +64,7 @@ def test_a_recording_of_another_rate_is_named_with_the_ratio(factor: float) -> N
     factors = ONES.clone()
     factors[3] = factor
     modes, impacts = recorded(files(factors))
-    assert rate_factors(modes, modes.aligned(impacts)) == {"003.wav": pytest.approx(factor)}
+    assert rate_factors(modes, modes.aligned(impacts)) == {"03.wav": pytest.approx(factor)}
 
 
 def test_a_fade_out_and_a_noise_gate_are_no_decays() -> None:
@@ -98,7 +91,7 @@ def test_another_gain_changes_noise_and_sound_alike() -> None:
     sounds = files(ONES)
     gain = torch.ones(COUNT, 1, 1, dtype=torch.float64)
     gain[3] = 0.1
-    assert gain_changes(recorded(sounds * gain)[1]) == {"003.wav": pytest.approx(-20.0, abs=1.5)}
+    assert gain_changes(recorded(sounds * gain)[1]) == {"03.wav": pytest.approx(-20.0, abs=1.5)}
     # A louder room alone is another thing, and so is a softer impact.
     loud = sounds.clone()
     loud[3, :LEAD] *= 10.0
