@@ -15,28 +15,20 @@ RATE = 8000.0
 SHAPES = ("half-sine", "hertz")
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("contact_time", [0.0, 1e-5, 1.7e-4, 1e-3, 3.1e-3])
-def test_the_impulse_is_one_whatever_the_contact_time(shape, contact_time):
-    pulse = ForcePulse(contact_time, shape).samples(RATE)
-    assert float(pulse.sum()) == pytest.approx(1.0, abs=1e-12)
-    assert float(pulse.min()) >= 0.0
-    assert len(pulse) == max(1, math.ceil(contact_time * RATE))
-
-
 @pytest.mark.parametrize(("shape", "power"), [("half-sine", 1.0), ("hertz", 1.5)])
-def test_each_sample_holds_the_force_of_its_time(shape, power):
+@pytest.mark.parametrize("contact", [0.08, 1.36, 10.4, 24.8])
+def test_each_sample_holds_the_force_of_its_time_of_an_impulse_of_one(shape, power, contact):
     """Against numerical integration of sin^power, whole samples and the last, cut one."""
-    contact = 10.4
     pulse = ForcePulse(contact / RATE, shape).samples(RATE)
+    assert len(pulse) == math.ceil(contact)
 
     def force(time: float) -> float:
         return math.sin(math.pi * time / contact) ** power
 
     whole = quad(force, 0, contact)[0]
-    for row in (0, 3, 5, 10):
-        part = quad(force, row, min(row + 1, contact))[0]
-        assert float(pulse[row]) == pytest.approx(part / whole, abs=1e-9)
+    parts = [quad(force, row, min(row + 1, contact))[0] for row in range(len(pulse))]
+    assert pulse.tolist() == pytest.approx([part / whole for part in parts], abs=1e-9)
+    assert ForcePulse(0.0, shape).samples(RATE).tolist() == [1.0]
 
 
 @pytest.mark.parametrize("shape", SHAPES)

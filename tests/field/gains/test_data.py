@@ -73,14 +73,6 @@ def exact(delayed: tuple[Impacts, Extraction]) -> tuple[Impacts, Extraction]:
     return train, extract_modes(train)
 
 
-def test_gains_to_spread_do_not_depend_on_delays(
-    delayed: tuple[Impacts, Extraction], exact: tuple[Impacts, Extraction]
-) -> None:
-    cases = [gain_data(train, FEATURES, modes, CONFIG) for train, modes in (delayed, exact)]
-    assert distance(*(each.train.sounds for each in cases)) < ALIGNED
-    assert distance(*(each.gains for each in cases)) < ALIGNED
-
-
 def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(
     delayed: tuple[Impacts, Extraction], exact: tuple[Impacts, Extraction]
 ) -> None:
