@@ -30,8 +30,6 @@ from factories.made_dome import STIFFER, WALLS, bodies, dome, points, truth
 from factories.raising import raises
 
 RATE, SAMPLES, LEVEL = 12000.0, 2400, 0.01
-
-
 CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, damping="shared")
 
 

@@ -16,21 +16,13 @@ from avmsf.simulate.thickness_variation import vary_thickness
 from factories.raising import raises
 
 HANDLES = {"mug": 1, "jug": 1, "bracket": 2, "tube": 1}
-
-
 """Holes through a shape, as through a ring."""
-
-
 SYMMETRIC = (
     {"bell", "bottle", "bowl", "goblet", "lid", "plate", "tube"},
     {"channel", "fluted", "platter", "pot", "tray"},
     {"boomerang", "mug", "scallop", "skillet", "spoon"},
 )
-
-
 """Kinds of every angle, of a few turns, and with mirror planes alone; the others have none."""
-
-
 SIDES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 

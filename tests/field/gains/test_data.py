@@ -53,11 +53,7 @@ def test_unknown_directions_turn_nothing():
 
 
 COUNT = 12
-
-
 FEATURES = FeatureField.from_contacts(strikes(COUNT).contacts)
-
-
 CONFIG = FitConfig(steps=0, damping="shared")
 
 

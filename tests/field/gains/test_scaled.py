@@ -14,11 +14,7 @@ from factories.made_fields import BANK, FIELDS, blows, places, positional
 from factories.raising import raises
 
 FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.0, 3.0], dtype=torch.float64)
-
-
 PLACES = places(7, seed=8)
-
-
 BLOWS = blows(PLACES, seed=9)
 
 
@@ -74,8 +70,6 @@ def test_lengths_and_inner_fields_that_cannot_be_are_refused():
 
 
 HEIGHT = 0.05
-
-
 """Of a false floor above the bar's sheet, meters: an eighth of the length, more than the tolerance."""
 
 

@@ -17,12 +17,8 @@ from avmsf.modal.residual_noise import Residual
 from factories.delayed_plate import cut
 
 RATE, SAMPLES, LEAD, COUNT = 16000.0, 6000, 320, 10
-
-
 # The first two beat within the sounds.
 FREQUENCY = torch.tensor([431.0, 436.0, 902.5, 1370.0, 2204.0, 3317.0], dtype=torch.float64)
-
-
 DAMPING = torch.tensor([12.0, 13.0, 18.0, 15.0, 30.0, 40.0], dtype=torch.float64)
 
 
