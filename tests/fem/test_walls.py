@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from avmsf.errors import SimulationError
 from avmsf.fem.body_meshes import count_dofs, filled_solid
@@ -15,35 +16,20 @@ from avmsf.fem.meshing import checked, weld
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 from avmsf.simulate.shapes import make_shape
+from factories.looked_at import surface_of
+from oracles.block import block
 
 
 def box(*sides: float) -> Surface:
     """Twelve triangles."""
-    corners = torch.cartesian_prod(*(torch.tensor([0.0, side]) for side in sides))
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
-    faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-    return Surface(corners, torch.tensor(faces))
+    return block(sides, (1, 1, 1)).surface
 
 
 def tube(radius: float, wall: float, length: float, *, sides: int = 48, rings: int = 8) -> Surface:
     """A tube open at both ends, its wall's two sides and its rims meshed."""
-    radii = [radius + wall / 2] * rings + [radius - wall / 2] * rings
     heights = np.linspace(0.0, length, rings)
-    profile = np.stack([radii, np.concatenate([heights, heights[::-1]])], axis=1)
-    angles = 2 * math.pi * np.arange(sides) / sides
-    points = np.stack(
-        [
-            np.outer(profile[:, 0], np.cos(angles)),
-            np.outer(profile[:, 0], np.sin(angles)),
-            np.outer(profile[:, 1], np.ones(sides)),
-        ],
-        axis=-1,
-    )
-    a = np.arange(2 * rings * sides).reshape(2 * rings, sides)
-    b, c = np.roll(a, -1, axis=1), np.roll(a, -1, axis=0)
-    d = np.roll(b, -1, axis=0)
-    faces = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
-    return Surface(torch.from_numpy(points.reshape(-1, 3)).float(), torch.from_numpy(faces))
+    outer, inner = (np.stack([np.full(rings, radius + side * wall / 2), heights], axis=1) for side in (1, -1))
+    return surface_of(trimesh.creation.revolve(np.concatenate([outer, inner[::-1], outer[:1]]), sections=sides))
 
 
 def silent(words: str) -> None:
