@@ -194,7 +194,7 @@ def put(keys: str, *value: object) -> Change:
         # Nothing that a record lacks is made up.
         (put("config.seed"), "config.seed"),
         (put("gains.shape.layers"), "shape.layers"),
-        (put("origin.report"), "origin.report"),
+        (put("origin.report"), "report"),
     ],
 )
 def test_a_damaged_file_is_refused_with_what_is_wrong(tmp_path, change, name):
