@@ -3,12 +3,10 @@
 import math
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-from avmsf.baselines.diffsound import material_fit
 from avmsf.baselines.diffsound.body_family import BodyFamily, body_family
 from avmsf.baselines.diffsound.losses import ClipSpectra, divergence
 from avmsf.baselines.diffsound.material_fit import (
@@ -17,6 +15,7 @@ from avmsf.baselines.diffsound.material_fit import (
     MaterialFit,
     clip_spectra,
     fit_material,
+    minimize_within,
     predicted_sound,
 )
 from avmsf.baselines.diffsound.renderer import DiffSound, leveled
@@ -246,13 +245,14 @@ def test_recordings_that_are_too_dull_are_refused():
         DampingCurve.of(ModalBank(frequency, torch.full_like(frequency, 2000.0)))
 
 
-def test_a_search_starts_on_its_bounds():
-    """Whatever rounding makes of the bounds, a start on one of them is a place to search from."""
-
+def test_a_search_may_start_on_its_bounds_and_finds_the_least():
     generator = torch.Generator().manual_seed(0)
     for _ in range(40):
         low = torch.randn(3, dtype=torch.float64, generator=generator)
         bounds = torch.stack([low, low + torch.rand(3, dtype=torch.float64, generator=generator)])
-        bowl = SimpleNamespace(bounds=bounds, loss=lambda point: float(point.square().sum()))
-        found = material_fit._Problem.searched(bowl, bounds[1], 1)
+        # Whatever rounding makes of the bounds, a start on one of them is a place to search from.
+        found = minimize_within(bounds, lambda point: float(point.square().sum()), bounds[1], generations=1)
         assert bool(((found >= bounds[0]) & (found <= bounds[1])).all())
+    middle = bounds.mean(0)
+    found = minimize_within(bounds, lambda point: float((point - middle).square().sum()), bounds[0], generations=60)
+    torch.testing.assert_close(found, middle, rtol=0, atol=1e-3)

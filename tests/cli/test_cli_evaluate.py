@@ -8,8 +8,8 @@ import pytest
 
 from avmsf.cli import main, options_of
 from avmsf.errors import AvmsfError, EvaluationError, FitError
-from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.field_methods import FieldMethod
+from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.task import Task
 from avmsf.modal.extraction.finders import ShortTime

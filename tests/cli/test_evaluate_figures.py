@@ -29,7 +29,7 @@ def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(report, "save_picture", keep)
     monkeypatch.setattr(
-        "avmsf.evaluation.case_run.CaseRun.outcome", lambda *_, **__: pytest.fail("a method was run again")
+        "avmsf.evaluation.runner.CaseRun.outcome", lambda *_, **__: pytest.fail("a method was run again")
     )
     assert run_verb("evaluate", *words, "--figures") == 0
     assert list(drawn) == ["a.png", "b.png"]

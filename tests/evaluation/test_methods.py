@@ -16,8 +16,7 @@ from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError, SceneError
 from avmsf.evaluation.field_methods import PAPER_GRID, FieldMethod, Grid, random_modes
-from avmsf.evaluation.methods import diffsound, method_named
-from avmsf.evaluation.recorded import RecordedMethod
+from avmsf.evaluation.methods import RecordedMethod, diffsound, method_named
 from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Renderer, Task, report_of

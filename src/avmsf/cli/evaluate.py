@@ -16,8 +16,7 @@ from avmsf.cli.paths import CacheFolder, ContactData, Existing, OutputFolder, ar
 from avmsf.cli.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.config import EvaluationSettings
-from avmsf.evaluation.registry import PROTOCOLS, expect_suited, method_entry, protocol_named
+from avmsf.evaluation.registry import PROTOCOLS, EvaluationSettings, expect_suited, method_entry, protocol_named
 from avmsf.pipeline.config import TimeZero, ViewsConfig
 
 if TYPE_CHECKING:
@@ -115,10 +114,10 @@ def run(options: Options) -> int:
     from avmsf.evaluation.methods import method_named
     from avmsf.evaluation.objects import SUBSETS, choose_objects, members
     from avmsf.evaluation.plan import dataset_title, plan_evaluation
+    from avmsf.evaluation.registry import MetricSettings
     from avmsf.evaluation.report import write_figures, write_page, write_summary
     from avmsf.evaluation.results import IDENTITY, ResultsFolder
     from avmsf.evaluation.runner import run_objects
-    from avmsf.evaluation.scores import MetricSettings
 
     protocol = _protocol_of(options)
     methods = tuple(method_named(name) for name in words_of(options.methods) or protocol.methods)
@@ -211,7 +210,7 @@ def _protocol_of(options: Options) -> "Protocol":
 def _note_start(methods: "Sequence[Method]", time_zero: TimeZero | None) -> None:
     """Print which methods are configured for, or may have, another start of sounds than the evaluation has."""
     from avmsf.evaluation.field_methods import FieldMethod
-    from avmsf.evaluation.recorded import RecordedMethod
+    from avmsf.evaluation.methods import RecordedMethod
 
     for method in methods:
         if isinstance(method, RecordedMethod) and time_zero == "peak":

@@ -4,19 +4,19 @@ In go recordings with their contacts; out come one value for each metric, method
 
 - `Renderer` (`task`): anything that turns contacts into sounds. A *method* fits one to a `Task`: the training
   recordings of one object, and what may be made of them (modes, features, elastic bodies, Gaussians).
-- `registry`: the tables of all methods, protocols and metrics. A new one is a function and a line.
+- `registry`: the tables of all methods, protocols and metrics, and settings. A new one is a function and a line.
 - `splits`: farthest-point, leave-one-out and other splits of contacts, `Case`s as data. `scores`: a renderer's values.
 - Metrics: spectral, log-mel and envelope distance (`metrics`); CDPAM (`cdpam`; Manocha et al., ICASSP 2021); CLAP score
   (`clap`); modal assurance criterion and errors of modes and gains against a simulation's (`modal_metrics`); error of
   located contacts (`localization`).
 - Methods: k nearest recordings, mean gains, thin-plate splines (`simple_methods`, `methods`), DiffSound and SonicGauss
-  (`avmsf.baselines`), files of other systems (`recorded`), and configurations of the sound field (`field_methods`).
-- `plan_evaluation` (`plan`) makes an `Evaluation` (`case_run`) of the settings that its methods share (`config`).
-  `run_objects` (`runner`) runs it in this process or on ray, into a `ResultsFolder` (`results`) that a stopped run goes
-  on with; `summary`, `report_tables` and `report` make means, ratios to `knn3`, and
-  one report, as Markdown and as a page. `published` has the paper's values.
+  (`avmsf.baselines`), files of other systems (`methods`), and configurations of the sound field (`field_methods`).
+- `plan_evaluation` (`plan`) makes an `Evaluation`; `objects` makes what its methods read of objects. `run_objects`
+  (`runner`) runs it in this process or on ray, into a `ResultsFolder` (`results`) that a stopped run goes on with;
+  `summary`, `report_tables` and `report` make means, ratios to `knn3`, and one report, as Markdown and as a page.
+  `published` has the paper's values.
 
-Start at `evaluate` in `scores`, then `case_run.CaseRun.outcome`.
+Start at `evaluate` in `scores`, then `runner.CaseRun.outcome`.
 """
 
 import lazy_loader

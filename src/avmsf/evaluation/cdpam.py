@@ -28,7 +28,6 @@ from avmsf.evaluation.metrics import PerContact, validate, validate_sounds
 Scaling = Literal["benchmark", "authors"]
 SAMPLE_RATE = 22050.0
 """Hz that sounds are resampled to (polyphase)."""
-_FULL_SCALE = 32768.0
 _LAYERS = 16
 """Convolutions of the encoder; every fourth keeps every second sample and has twice as many channels."""
 _TAPS = 15
@@ -50,9 +49,8 @@ def find_weights() -> Path:
     # Importing the package would fail: it needs modules that it does not install, and names that numpy has dropped.
     found = importlib.util.find_spec("cdpam")
     if found is None or not found.submodule_search_locations:
-        raise EvaluationError.expected(
-            "an installed package", name="cdpam", advice="pip install 'avmsf[eval]', or omit CDPAM with --no-cdpam"
-        )
+        advice = "pip install 'avmsf[eval]', or omit CDPAM with --no-cdpam"
+        raise EvaluationError.expected("an installed package", name="cdpam", advice=advice)
     return Path(found.submodule_search_locations[0]) / _FILE
 
 
@@ -63,12 +61,8 @@ def read_weights(path: Path) -> Mapping[str, Tensor]:
     except OSError as error:
         found = str(error)
     if found:
-        raise EvaluationError.expected(
-            "the trained weights of CDPAM",
-            got=found,
-            file=path,
-            advice="install them again: pip install --force-reinstall 'cdpam==0.0.6'",
-        )
+        advice = "install them again: pip install --force-reinstall 'cdpam==0.0.6'"
+        raise EvaluationError.expected("the trained weights of CDPAM", got=found, file=path, advice=advice)
     weights: Mapping[str, Tensor] = torch.load(path, map_location="cpu", weights_only=False)["state"]
     return weights
 
@@ -145,7 +139,7 @@ class Cdpam:
     ) -> Float64[Tensor, " features"]:
         scaled = resampled(sound[None], sample_rate=sample_rate, wanted=SAMPLE_RATE)[0]
         if scaling == "authors":
-            scaled = torch.round(scaled * _FULL_SCALE)
+            scaled = torch.round(scaled * 32768.0)
         with torch.no_grad():
             features = self._features(scaled.float())
         if not bool(torch.isfinite(features).all()):

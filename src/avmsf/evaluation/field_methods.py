@@ -10,6 +10,7 @@ import torch
 
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import FitError
+from avmsf.evaluation.metrics import envelope_distance
 from avmsf.evaluation.task import Task, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig, GainModelName
@@ -21,16 +22,21 @@ from avmsf.modal.extraction.extract import Extraction, extract_sounds
 from avmsf.modal.extraction.finders import finder_named, lowest_frequency
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.modal.spectra import envelope
 from avmsf.pipeline.config import PRESETS, PipelineConfig
 
 NETWORK = PipelineConfig(gain_model="network")
 """The attention network with the quick settings of the fit."""
-_FEWEST_TO_VALIDATE = 6
+_MIN_VALIDATED_POSITIONS = 6
 """Training positions from which on a part of them is held out to choose settings by, as in `fit` itself."""
 _UNINFORMED_RATE = 0.03
 """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings without extracted modes:
 frequencies, dampings and noise have to find where they belong."""
+_MAX_FREQUENCY_RATIO = 0.9
+"""Highest random frequency over half the sample rate."""
+_MIN_QUALITY = 10.0
+"""Quality factor, pi f / d, of the fastest random decay."""
+_NOISE_RATIO = 0.01
+"""Noise beside random modes over the sounds' root mean square: 40 dB down."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +101,9 @@ class FieldMethod:
         if self.grid is not None:
             config, report["grid"] = self._choose(self.grid, task, features, modes)
         if not self.informed:
-            modes = random_modes(
-                task.train,
-                modes=len(modes.bank),
-                bins=len(modes.residual.magnitude),
-                generator=torch.Generator().manual_seed(task.seed),
-            )
+            count, bins = len(modes.bank), len(modes.residual.magnitude)
+            generator = torch.Generator().manual_seed(task.seed)
+            modes = random_modes(task.train, modes=count, bins=bins, generator=generator)
             steps = config.warmup_steps + config.steps
             config = replace(config, warmup_steps=0, steps=steps, correction_rate=_UNINFORMED_RATE)
         field = self._fitted(task, task.train, features, modes, config)
@@ -127,20 +130,19 @@ class FieldMethod:
     ) -> tuple[FitConfig, dict[str, Any]]:
         """Return the best settings of a grid, and the report of the choice."""
         base, train = self.pipeline.fit, task.train
-        held = held_out(train.contacts, base.validation)
-        if len(rows_by_place(train.contacts)) < _FEWEST_TO_VALIDATE or not held:
+        rows = held_out(train.contacts, base.validation)
+        if len(rows_by_place(train.contacts)) < _MIN_VALIDATED_POSITIONS or not rows:
             return base, {"validated": False}
-        learnt = [row for row in range(len(train)) if row not in held]
-        taken = modes.take(learnt)
-        candidates = list(grid.candidates(base))
-        errors = [
-            _envelope_error(self._fitted(task, train.take(learnt), features, taken, config), train.take(held))
-            for config in candidates
-        ]
+        learnt, held = [row for row in range(len(train)) if row not in rows], train.take(rows)
+        candidates, errors = list(grid.candidates(base)), []
+        for config in candidates:
+            field = self._fitted(task, train.take(learnt), features, modes.take(learnt), config)
+            sounds = field.render(held.contacts, directions=held.directions)
+            errors.append(float(envelope_distance(sounds, held.sounds, sample_rate=held.sample_rate).mean()))
         chosen = candidates[min(range(len(candidates)), key=errors.__getitem__)]
         return chosen, {
             "validated": True,
-            "validation_contacts": [train.names[row] for row in held],
+            "validation_contacts": list(held.names),
             "validation_envelope": errors,
             "chosen": {each.name: getattr(chosen, each.name) for each in fields(grid)},
         }
@@ -170,19 +172,6 @@ def network(
     return FieldMethod(name, pipeline, visual_input, published, informed, candidates if grid else None)
 
 
-def _envelope_error(field: SoundField, held: Impacts) -> float:
-    difference = envelope(field.render(held.contacts, directions=held.directions)) - envelope(held.sounds.float())
-    return float(difference.square().mean(dim=1).sqrt().mean())
-
-
-_MAX_FREQUENCY = 0.9
-"""Highest frequency over half the sample rate."""
-_MIN_QUALITY = 10.0
-"""Quality factor, pi f / d, of the fastest decay."""
-_NOISE = 0.01
-"""Noise over the sounds' root mean square: 40 dB down."""
-
-
 def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Generator) -> Extraction:
     """Return modes drawn at random in place of extracted ones, with flat noise of `bins` bands.
 
@@ -192,7 +181,7 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
     energy, the rate and the length are taken from `train`. Raises FitError for too short recordings.
     """
     rate, samples = train.sample_rate, train.sounds.shape[1]
-    lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY * rate / 2
+    lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY_RATIO * rate / 2
     if lowest >= highest:
         got, advice = f"{samples} samples", "use more seconds after the onset"
         raise FitError.expected("longer recordings", samples, got=got, name="train", advice=advice)
@@ -205,5 +194,5 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
     # A mode of gain one has the energy 1 / (4 d) over time, and so the mean power 1 / (4 d) over the duration.
     gain = math.sqrt(power * train.duration / float((1 / (4 * damping)).sum()))
     gains = torch.full((len(train), modes), gain) + 0j
-    residual = Residual(torch.full((bins,), _NOISE * math.sqrt(power)))
+    residual = Residual(torch.full((bins,), _NOISE_RATIO * math.sqrt(power)))
     return Extraction(ModalBank(frequency, damping), gains, residual)

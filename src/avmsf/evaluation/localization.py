@@ -65,20 +65,21 @@ def located(
     """
     points = points[farthest_points(points, min(CANDIDATES, len(points)))].double()
     diagonal = float((points.amax(0) - points.amin(0)).norm())
-    names = ("rmed", "rmed_posterior") if isinstance(renderer, SoundField) else ("rmed",)
-    find = _finder(renderer, train, points, vertices, published)
-    rows, maps = [], {}
+    find, maps = _finder(renderer, train, points, vertices, published), {}
+    errors: dict[str, list[float]] = {"rmed": []}
+    if isinstance(renderer, SoundField):
+        errors["rmed_posterior"] = []
     for row, (sound, truth) in enumerate(zip(test.sounds, test.contacts.double(), strict=True)):
         try:
-            points_found, found = find(sound)
+            positions, found = find(sound)
         except (LocationError, EvaluationError):
-            points_found, found = {}, None
+            positions, found = {}, None
         chance = random_distance(points, truth)
-        distances = [float((truth - points_found[name]).norm()) if name in points_found else chance for name in names]
-        rows.append([distance / diagonal for distance in distances])
+        for name, values in errors.items():
+            values.append((float((truth - positions[name]).norm()) if name in positions else chance) / diagonal)
         if found is not None and row in map_rows:
             maps[row] = found
-    return {name: tuple(row[number] for row in rows) for number, name in enumerate(names)}, maps
+    return {name: tuple(values) for name, values in errors.items()}, maps
 
 
 def _finder(
@@ -92,7 +93,10 @@ def _finder(
     if isinstance(renderer, SoundField):
         return _field_finder(renderer, points, published)
     if isinstance(renderer, DiffSound):
-        searched = points if vertices is None else _fewer(vertices.double())
+        searched = points
+        if vertices is not None:
+            rows = torch.linspace(0, len(vertices) - 1, min(MAX_VERTICES, len(vertices)), dtype=torch.float64)
+            searched = vertices.double()[rows.round().long()]
         gains = renderer.gains(searched)
         return lambda sound: ({"rmed": searched[int(renderer.distance(gains, sound).argmin())]}, None)
     if isinstance(renderer, NearestRecording):
@@ -119,11 +123,6 @@ def _field_finder(field: SoundField, points: Float64[Tensor, "points 3"], publis
     return find
 
 
-def _fewer(vertices: Float64[Tensor, "vertices 3"]) -> Float64[Tensor, "points 3"]:
-    count = min(MAX_VERTICES, len(vertices))
-    return vertices[torch.linspace(0, len(vertices) - 1, count, dtype=torch.float64).round().long()]
-
-
 def published_distance(
     field: SoundField, gains: Float64[Tensor, "points modes"], sound: Float[Tensor, " samples"]
 ) -> Float64[Tensor, " points"]:
@@ -136,9 +135,8 @@ def published_distance(
     given = sound.detach().cpu()[None, : field.samples]
     recorded = ShortTime().gains(given, field.bank, field.sample_rate)[0]
     if not bool(recorded.any()):
-        raise LocationError.expected(
-            "one of the field's modes", name="sound", advice="record the impact louder, or with less noise"
-        )
+        advice = "record the impact louder, or with less noise"
+        raise LocationError.expected("one of the field's modes", name="sound", advice=advice)
     return 1.0 - torch.nn.functional.cosine_similarity(gains, recorded[None], dim=1)
 
 

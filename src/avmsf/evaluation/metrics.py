@@ -8,7 +8,7 @@ error. Every metric calls `validate` first, which raises EvaluationError with th
 - `relative_stft_error`: differences of STFT magnitudes in proportion to the truth's. Free of unit and level: 0 is
   perfect, 1 is silence. The measure that objects and methods are compared by here.
 - `spectrogram_distance` (L1), `log_mel_distance` (L1-log) and `envelope_distance` (ENV): the paper's three. Sizes in
-  samples are given at 44.1 and 48 kHz, by default the paper's, and go as `scaled_fft_size` at other rates.
+  samples are the paper's at 44.1 and 48 kHz, and go as `scaled_fft_size` at other rates.
 
 CDPAM is in `avmsf.evaluation.cdpam`; modes are compared with true ones in `avmsf.evaluation.modal_metrics`.
 """
@@ -37,20 +37,15 @@ def validate(predicted: Sounds, truth: Sounds, *, names: Sequence[str] | None = 
 
     The message names a row by `names`, or else by its index.
     """
-    both = {"predicted": predicted, "truth": truth}
-    for what, sounds in both.items():
-        _expect_rows(sounds, what)
+    _expect_rows(predicted, "predicted")
+    _expect_rows(truth, "truth")
     if len(predicted) != len(truth):
         raise EvaluationError.expected(f"one for each of {len(truth)} true sounds", len(predicted), name="predicted")
     if predicted.shape[1] != truth.shape[1]:
-        raise EvaluationError.expected(
-            f"sounds of {truth.shape[1]} samples as the true ones",
-            list(predicted.shape),
-            name="predicted",
-            advice="check sample rates and durations",
-        )
-    for what, sounds in both.items():
-        _expect_numbers(sounds, what, names)
+        wanted, advice = f"sounds of {truth.shape[1]} samples as the true ones", "check sample rates and durations"
+        raise EvaluationError.expected(wanted, list(predicted.shape), name="predicted", advice=advice)
+    _expect_numbers(predicted, "predicted", names)
+    _expect_numbers(truth, "truth", names)
 
 
 def validate_sounds(sounds: Sounds, *, sample_rate: float, wanted: float) -> None:
@@ -61,9 +56,8 @@ def validate_sounds(sounds: Sounds, *, sample_rate: float, wanted: float) -> Non
     _expect_rows(sounds, "sounds")
     _expect_numbers(sounds, "sounds", None)
     if not (math.isfinite(sample_rate) and sample_rate >= 1e-3 * wanted):
-        raise EvaluationError.expected(
-            f"a rate of {1e-3 * wanted:g} Hz or more to resample to {wanted:g} Hz", sample_rate, name="sample_rate"
-        )
+        rates = f"a rate of {1e-3 * wanted:g} Hz or more to resample to {wanted:g} Hz"
+        raise EvaluationError.expected(rates, sample_rate, name="sample_rate")
 
 
 def default_fft_sizes(sample_rate: float) -> tuple[int, ...]:
@@ -85,8 +79,7 @@ def relative_stft_error(
     is silent throughout.
     """
     validate(predicted, truth)
-    error = torch.zeros(len(truth), dtype=torch.float64)
-    sizes = default_fft_sizes(sample_rate) if fft_sizes is None else tuple(fft_sizes)
+    error, sizes = torch.zeros(len(truth), dtype=torch.float64), fft_sizes or default_fft_sizes(sample_rate)
     for size in sizes:
 
         def sums(a: Sounds, b: Sounds, size: int = size) -> Float64[Tensor, "contacts 2"]:
@@ -113,15 +106,13 @@ magnitudes; on squared magnitudes it would be 12 to 15. It remains an inference:
 not absolute values."""
 
 
-def spectrogram_distance(
-    predicted: Sounds, truth: Sounds, *, sample_rate: float, fft_size: int = PAPER_FFT_SIZE, hop: int = PAPER_HOP
-) -> PerContact:
+def spectrogram_distance(predicted: Sounds, truth: Sounds, *, sample_rate: float) -> PerContact:
     """Return the mean absolute difference of the STFT magnitudes, in the sounds' unit (L1).
 
     Magnitudes as `avmsf.modal.spectra` has them, unscaled.
     """
     validate(predicted, truth)
-    size, step = (scaled_fft_size(each, sample_rate=sample_rate) for each in (fft_size, hop))
+    size, step = (scaled_fft_size(each, sample_rate=sample_rate) for each in (PAPER_FFT_SIZE, PAPER_HOP))
 
     def distance(a: Sounds, b: Sounds) -> PerContact:
         spectra = [magnitude_stft(sounds, fft_size=size, hop=step) for sounds in (a, b)]
@@ -130,28 +121,20 @@ def spectrogram_distance(
     return _blockwise(distance, predicted, truth)
 
 
-def log_mel_distance(
-    predicted: Sounds,
-    truth: Sounds,
-    *,
-    sample_rate: float,
-    fft_size: int = PAPER_FFT_SIZE,
-    hop: int = PAPER_HOP,
-    mel_count: int = PAPER_MELS,
-    floor: float = PAPER_FLOOR,
-) -> PerContact:
+def log_mel_distance(predicted: Sounds, truth: Sounds, *, sample_rate: float) -> PerContact:
     """Return the mean absolute difference of the natural logarithms of mel magnitudes, in nepers (L1-log).
 
-    HTK triangles of height one from 0 Hz to half the rate, `mel_count` of them at most; magnitudes below `floor`, in
-    the sounds' unit, count as `floor`.
+    HTK triangles of height one from 0 Hz to half the rate, `PAPER_MELS` of them at most; magnitudes below
+    `PAPER_FLOOR`, in the sounds' unit, count as that.
     """
     validate(predicted, truth)
-    size, step, bands = (scaled_fft_size(each, sample_rate=sample_rate) for each in (fft_size, hop, mel_count))
-    bands = min(bands, mel_count)
+    sizes = PAPER_FFT_SIZE, PAPER_HOP, PAPER_MELS
+    size, step, bands = (scaled_fft_size(each, sample_rate=sample_rate) for each in sizes)
+    bands = min(bands, PAPER_MELS)
     filters = htk_filters(bands, fft_size=size, sample_rate=sample_rate, lowest=0.0, highest=sample_rate / 2)
 
     def mels(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts mels frames"]:
-        return log_mel(sounds, filters, fft_size=size, hop=step, floor=floor)
+        return log_mel(sounds, filters, fft_size=size, hop=step, floor=PAPER_FLOOR)
 
     return _blockwise(lambda a, b: (mels(a) - mels(b)).abs().mean(dim=(1, 2)), predicted, truth)
 
@@ -178,10 +161,8 @@ def _expect_numbers(sounds: Sounds, what: str, names: Sequence[str] | None) -> N
     if len(bad):
         row, sample = bad[0].tolist()
         value = float(sounds[row, sample])
-        sound = "" if names is None else f" of {names[row]}"
-        raise EvaluationError.expected(
-            "finite samples", value, got=f"{value} at sample {sample}{sound}", row=row, name=what
-        )
+        got = f"{value} at sample {sample}" + ("" if names is None else f" of {names[row]}")
+        raise EvaluationError.expected("finite samples", value, got=got, row=row, name=what)
 
 
 def _blockwise(

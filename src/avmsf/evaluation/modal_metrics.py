@@ -17,7 +17,7 @@ Both are chosen so that `gain_error` is least.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -36,8 +36,8 @@ from avmsf.modal.inner_products import poles_of
 from avmsf.modal.modes import ModalBank
 from avmsf.simulate.ground_truth import TRUTH, Truth, read_truth
 
-LONGEST_DELAY = 0.005
-"""Seconds by which the first sample of recordings may differ from the true impact. Onsets that a threshold finds are
+MAX_DELAY_SECONDS = 0.005
+"""By which the first sample of recordings may differ from the true impact. Onsets that a threshold finds are
 off by up to three samples on measured objects, which is 3 ms at 1000 Hz, the lowest rate that is simulated."""
 
 
@@ -57,12 +57,9 @@ def truth_at(truth: Truth, names: tuple[str, ...]) -> Truth:
     rows = {name: row for row, name in enumerate(truth.names)}
     unknown = [name for name in names if name not in rows]
     if unknown:
+        wanted, got = "the ground truth of all recordings", f"none of {', '.join(unknown[:3])}"
         raise EvaluationError.expected(
-            "the ground truth of all recordings",
-            tuple(unknown),
-            got=f"none of {', '.join(unknown[:3])}",
-            name="names",
-            advice="simulate the object again",
+            wanted, tuple(unknown), got=got, name="names", advice="simulate the object again"
         )
     taken = [rows[name] for name in names]
     tables: dict[str, Any] = {name: getattr(truth, name) for name in ("gains", "contacts", "starts")}
@@ -84,12 +81,12 @@ def common_delay(truth: Truth, impacts: Impacts) -> float:
     """Return the seconds from t = 0 of the truth to the first sample of these recordings of it, row for row.
 
     The one delay of all recordings for which the true modes come nearest to them, in the sum of squares, within
-    `LONGEST_DELAY` on either side; so much of the sounds is left out, where they may not have started yet. Energies are
-    summed mode by mode, as if modes were orthogonal: their overlaps change slowly with the delay and hardly move the
-    minimum, which the modes' phases decide.
+    `MAX_DELAY_SECONDS` on either side; so much of the sounds is left out, where they may not have started yet. Energies
+    are summed mode by mode, as if modes were orthogonal: their overlaps change slowly with the delay and hardly move
+    the minimum, which the modes' phases decide.
     """
     bank = ModalBank(truth.frequency, truth.damping)
-    skipped = min(math.ceil(LONGEST_DELAY * impacts.sample_rate), impacts.sounds.shape[1] // 2)
+    skipped = min(math.ceil(MAX_DELAY_SECONDS * impacts.sample_rate), impacts.sounds.shape[1] // 2)
     equations = NormalEquations.of(impacts.sounds[:, skipped:], poles_of(bank, impacts.sample_rate))
     sines, cosines = equations.products.chunk(2, dim=1)
     products = (truth.amplitudes * torch.complex(cosines, sines)).sum(dim=0)
@@ -120,9 +117,9 @@ def _path(dataset: Dataset, identifier: str) -> Path | None:
     return source.folder / TRUTH if source is not None and (source.folder / TRUTH).is_file() else None
 
 
-_SAME_FREQUENCY = 0.002
+_SAME_FREQUENCY_RATIO = 0.002
 """Difference of two frequencies of one mode, over the frequency, however narrow the mode is."""
-_TURNS = 100
+_MAX_ROUNDS = 100
 """Most rounds in which phases and polarities are chosen in turn; a few suffice."""
 
 
@@ -143,56 +140,17 @@ class ModalRenderer(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class ModalScores:
-    """A method's modes compared with the true ones, one entry a true mode."""
-
-    weight: Float64[Tensor, " modes"]
-    """Part of the true energy, 0 to 1."""
-    match: Int[Tensor, " modes"]
-    """The method's mode that was taken for this one, or -1."""
-    frequency_error: Float64[Tensor, " modes"]
-    """(found - true) / true; NaN without a match, as in the next."""
-    damping_error: Float64[Tensor, " modes"]
-    """ln(found / true)."""
-    gain_error: Float64[Tensor, " modes"]
-    """Norm over contacts of the amplitudes' difference, over the true norm: 0 is perfect, 1 is silence."""
-    mac: Float64[Tensor, " modes"]
-    """Modal assurance criterion, the squared correlation of the amplitudes over contacts, 0 to 1."""
-    false_modes: int
-    """The method's modes that were taken for none."""
-    false_energy: float
-    """Their energy at the contacts, over the true energy."""
-
-    def figures(self) -> dict[str, float | None]:
-        """Return the means that tables have, each mode weighing by its true energy.
-
-        `found` (part of the energy whose modes were found), `frequency_error` and `damping_error` (absolute, over the
-        modes found; None if there are none), `gain_error` (root of the mean square), `mac`, `false_modes` and
-        `false_energy`.
-        """
-        found = self.match >= 0
-        share = float(self.weight[found].sum())
-        errors: dict[str, float | None] = {"found": share}
-        for name, values in (("frequency_error", self.frequency_error), ("damping_error", self.damping_error)):
-            total = float((self.weight * values.abs())[found].sum())
-            errors[name] = total / share if share > 0.0 else None
-        return errors | {
-            "gain_error": math.sqrt(float((self.weight * self.gain_error.square()).sum())),
-            "mac": float((self.weight * self.mac).sum()),
-            "false_modes": float(self.false_modes),
-            "false_energy": self.false_energy,
-        }
-
-
 def compare_modes(
-    renderer: ModalRenderer,
-    contacts: Contacts,
-    truth: Truth,
-    *,
-    directions: Contacts | None = None,
-) -> ModalScores:
+    renderer: ModalRenderer, contacts: Contacts, truth: Truth, *, directions: Contacts | None = None
+) -> dict[str, float | None]:
     """Compare a method's modes and its gains at the contacts with the true ones, row for row.
+
+    Returns means over the true modes, each weighing by its part of the energy: `found` (part of the energy whose modes
+    were found), `frequency_error` (absolute, relative to the true one) and `damping_error` (absolute, of logarithms),
+    both over the modes found and None if there are none, `gain_error` (root of the mean square; of a mode the norm over
+    contacts of the amplitudes' difference, over the true norm: 0 is perfect, 1 is silence), `mac` (the squared
+    correlation over contacts, 0 to 1), and of the method's modes that were taken for none their number `false_modes`
+    and `false_energy`, their energy at the contacts over the true energy.
 
     `directions` are the unit vectors of the impacts, which the true gains belong to. Raises EvaluationError where rows
     differ in number, for values that are not finite, and where the truth is silence at all contacts.
@@ -205,34 +163,33 @@ def compare_modes(
         advice = "take the ground truth of these recordings, in their order"
         raise EvaluationError.expected(f"gains at {len(predicted)} contacts", len(true), name="truth", advice=advice)
     energy = true.abs().square().sum(dim=0) / (4 * truth.damping)
-    if not float(energy.sum()) > 0.0:
+    total = energy.sum()
+    if not float(total) > 0.0:
         raise EvaluationError.expected("modes with energy", 0.0, got="zero gains at all contacts", name="truth")
-    match = match_modes(bank, ModalBank(truth.frequency, truth.damping))
+    weight, match = energy / total, match_modes(bank, ModalBank(truth.frequency, truth.damping))
     found = match >= 0
-    partner = match[found]
-    frequency_error, damping_error = torch.full((2, len(match)), math.nan, dtype=torch.float64)
-    frequency_error[found] = bank.frequency.detach()[partner] / truth.frequency[found] - 1
-    damping_error[found] = torch.log(bank.damping.detach()[partner] / truth.damping[found])
+    partner, part = match[found], float(weight[found].sum())
+    frequency = (bank.frequency.detach()[partner] / truth.frequency[found] - 1).abs()
+    damping = torch.log(bank.damping.detach()[partner] / truth.damping[found]).abs()
     paired = torch.zeros_like(true)
     paired[:, found] = predicted[:, partner]
     cross = _free_agreement(paired.conj() * true, 1 / (4 * truth.damping))
     squares, true_squares = paired.abs().square().sum(dim=0), true.abs().square().sum(dim=0)
     # A mode that is silent at all contacts weighs nothing; any figure will do.
-    floor = torch.finfo(torch.float64).tiny
-    remaining = (squares + true_squares - 2 * cross).clamp(min=0.0)
+    tiny = torch.finfo(torch.float64).tiny
+    errors = (squares + true_squares - 2 * cross).clamp(min=0.0) / true_squares.clamp(min=tiny)
     false = torch.ones(len(bank), dtype=torch.bool)
     false[partner] = False
     false_energy = (predicted.abs().square().sum(dim=0) / (4 * bank.damping.detach()))[false].sum()
-    return ModalScores(
-        weight=energy / energy.sum(),
-        match=match,
-        frequency_error=frequency_error,
-        damping_error=damping_error,
-        gain_error=(remaining / true_squares.clamp(min=floor)).sqrt(),
-        mac=cross.square() / (squares * true_squares).clamp(min=floor),
-        false_modes=int(false.sum()),
-        false_energy=float(false_energy / energy.sum()),
-    )
+    return {
+        "found": part,
+        "frequency_error": float((weight[found] * frequency).sum()) / part if part > 0.0 else None,
+        "damping_error": float((weight[found] * damping).sum()) / part if part > 0.0 else None,
+        "gain_error": math.sqrt(float((weight * errors).sum())),
+        "mac": float((weight * (cross.square() / (squares * true_squares).clamp(min=tiny))).sum()),
+        "false_modes": float(false.sum()),
+        "false_energy": float(false_energy / total),
+    }
 
 
 def match_modes(found: ModalBank, true: ModalBank) -> Int[Tensor, " modes"]:
@@ -242,7 +199,7 @@ def match_modes(found: ModalBank, true: ModalBank) -> Int[Tensor, " modes"]:
     Hz) or, if that is more, .2 % of its frequency. Of all ways to pair them that is taken in which the sum over pairs
     of 1 - (difference / allowed)^2 is largest: many pairs, and close ones rather than a chain of bad ones.
     """
-    allowed = torch.maximum(true.damping / math.pi, _SAME_FREQUENCY * true.frequency)
+    allowed = torch.maximum(true.damping / math.pi, _SAME_FREQUENCY_RATIO * true.frequency)
     distance = (found.frequency.detach()[None] - true.frequency[:, None]).abs() / allowed[:, None]
     possible = (distance <= 1.0).numpy()
     worth = np.where(possible, 1.0 - distance.square().numpy(), 0.0)
@@ -264,7 +221,7 @@ def _free_agreement(products: Amplitudes, weights: Float64[Tensor, " modes"]) ->
     pattern = torch.linalg.svd(torch.cat([weighted.real, weighted.imag], dim=1), full_matrices=False)[0][:, 0]
     ends = []
     for polarity in (torch.ones_like(pattern), _signs(pattern)):
-        for _ in range(_TURNS):
+        for _ in range(_MAX_ROUNDS):
             sums = polarity.to(weighted) @ weighted
             better = _signs((weighted * torch.sgn(sums).conj()).real.sum(dim=1))
             if torch.equal(better, polarity):
@@ -279,8 +236,8 @@ def _signs(values: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]
 
 
 def _expect_amplitudes(amplitudes: Complex128[Tensor, "..."], frequency: Float[Tensor, " modes"], what: str) -> None:
-    if amplitudes.ndim != 2 or amplitudes.shape[1] != len(frequency) or not len(amplitudes):
-        shape = list(amplitudes.shape)
+    shape = list(amplitudes.shape)
+    if amplitudes.ndim != 2 or shape[1] != len(frequency) or not shape[0]:
         wanted = f"gains [contacts, {len(frequency)} modes] at one contact or more"
         raise EvaluationError.expected(wanted, shape, got=f"the shape {shape}", name=what)
     bad = torch.nonzero(~torch.isfinite(amplitudes.abs()))

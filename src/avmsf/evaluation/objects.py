@@ -36,16 +36,7 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate import recipe
 
-NAMES: Mapping[VisualInput, str] = {
-    "unaligned": "unaligned.safetensors",
-    "paper": "paper.safetensors",
-    "paper-positions": "paper.safetensors",
-    "paper-unaligned": "paper-unaligned.safetensors",
-}
-"""What the files of features are called, where they are not those of the fields without ablation."""
-
-
-NOISE = 0.02
+_NOISE_RATIO = 0.02
 """Displacement of a noisy mesh's vertices over the object's size."""
 
 
@@ -90,7 +81,10 @@ class ObjectInputs:
             # Positions do not depend on the encoder.
             lift = replace(lift, encoder=DESCRIPTORS)
         lift = replace(lift, symmetry=not visual_input.endswith("unaligned"))
-        name = NAMES.get(visual_input, FEATURES)
+        # The ablated features lie beside those of the fields without ablation.
+        name = f"{visual_input.removesuffix('-positions')}.safetensors"
+        if visual_input in ("surface", "positions", "visual"):
+            name = FEATURES
         with self._stages(identifier, replace(self.scene, lift=lift), views, name) as stages:
             features = load_features(stages.features.path)
         return FeatureField.from_points(features.points) if bare else features
@@ -118,7 +112,7 @@ class ObjectInputs:
         surface = self.dataset.capture(identifier).surface
         if surface is None or not len(surface.faces):
             raise SceneError.expected("a mesh in the dataset", name=identifier, advice="take geometry from Gaussians")
-        return surface if self.geometry == "mesh" else roughened(surface, NOISE, seed=0)
+        return surface if self.geometry == "mesh" else roughened(surface, _NOISE_RATIO, seed=0)
 
     @property
     def _best_views(self) -> SceneConfig:

@@ -1,25 +1,87 @@
-"""From a dataset, a protocol and methods to the `Evaluation` that runs them, with the encoders that are available."""
+"""An evaluation: a dataset, a protocol, methods, and the settings that their results depend on."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
+from avmsf._utils.caching import source_digest
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.case_run import Evaluation
-from avmsf.evaluation.config import EvaluationSettings
 from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
-from avmsf.evaluation.registry import Protocol
-from avmsf.evaluation.scores import MetricSettings
+from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, table_modules
+from avmsf.evaluation.results import ENCODER, ResultsFolder
+from avmsf.evaluation.scores import expect_metrics
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.features.descriptors import ImageDescriptors
-from avmsf.modal.extraction.finders import finder_named
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder, finder_named
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Data set, protocol, methods and settings of an evaluation."""
+
+    dataset: Dataset
+    title: str
+    """Name of the dataset in reports; one folder of results has one."""
+    protocol: Protocol
+    methods: tuple[Method, ...]
+    inputs: ObjectInputs
+    seed: int = 0
+    """Random seed of the methods."""
+    metric_settings: MetricSettings = field(default_factory=MetricSettings)
+    finder: ModeFinder = field(default_factory=HighResolution)
+    """Extraction of modes, once per case."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the features, as plain values."""
+    device: str | None = None
+    """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
+    encoder: str | None = None
+    """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
+    time_zero: str | None = None
+    """Start of the dataset's sounds, `onset` or `peak`, on which all methods are scored; None for the dataset's own."""
+    own_starts: Dataset | None = None
+    """The same dataset with its own starts, for fields that are not of the paper's configuration; None where all
+    methods are fitted to the sounds that they are scored on."""
+
+    def begin(self, results: ResultsFolder) -> None:
+        """Take a folder for this evaluation's results.
+
+        Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
+        """
+        if not self.protocol.locating:
+            expect_metrics(self.metric_settings)
+        identity = {
+            "version": version("avmsf"),
+            "source": [source_digest(module) for module in (f"{__package__}.runner", *table_modules())],
+            "protocol": self.protocol.name,
+            "choosing": repr(self.protocol.choosing),
+            "dataset": self.title,
+            "seed": self.seed,
+            "time_zero": self.time_zero,
+            "metrics": _plain(self.metric_settings),
+            "columns": list(METRICS),
+            "modes": _plain(self.finder),
+            "settings": dict(self.settings),
+        }
+        results.begin(identity, {method.name: self._described(method) for method in self.methods})
+
+    def _described(self, method: Method) -> str:
+        """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
+        read = self.encoder is not None and isinstance(method, FieldMethod) and method.visual_input != "surface"
+        return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
+
+
+def _plain(settings: Any) -> dict[str, Any]:
+    """Return the values of a dataclass, with the name of its class as `kind`."""
+    return {"kind": type(settings).__name__, **asdict(settings)}
 
 
 def plan_evaluation(

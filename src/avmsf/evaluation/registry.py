@@ -1,6 +1,7 @@
-"""The tables of methods, protocols and metrics: a name, a title, and the import path of what makes it.
+"""What an evaluation is chosen from: tables of methods, protocols and metrics, and settings that methods share.
 
-A row is all that a new method or metric needs besides its function. Importing this module loads nothing that computes.
+A row has a title and the import path of what makes it, and is all that a new method or metric needs besides its
+function. Importing this module loads nothing that computes.
 """
 
 import difflib
@@ -10,10 +11,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from avmsf.errors import EvaluationError
+from avmsf.gaussians.config import SplatConfig
+from avmsf.modal.config import ExtractionMethod, expect_modes
+from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
 
 if TYPE_CHECKING:
     from avmsf.evaluation.splits import Choosing
 
+AmplitudeScale = Literal["full-scale", "raw"]
 BASELINE = "knn3"
 """The method that all others are compared with."""
 
@@ -129,7 +134,7 @@ METHODS: dict[str, MethodEntry] = {
     ),
     "recorded": MethodEntry(
         "sounds of another system, from files",
-        make="recorded:RecordedMethod",
+        make="methods:RecordedMethod",
         path="a folder with a folder of wav files for every object",
         is_folder=True,
     ),
@@ -250,13 +255,9 @@ def method_entry(name: str) -> MethodEntry:
 def expect_suited(method: str, protocol: str) -> None:
     """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
     if kind_of(method) == "recorded" and protocol == "shots":
-        raise EvaluationError.expected(
-            f"a protocol that tests each recording once for {method}",
-            method,
-            got=f"{protocol}, which trains on several sets of recordings, and the folder holds the sounds of one",
-            name="method",
-            advice="choose farthest, closest, predefined or leave-one-out",
-        )
+        wanted, advice = f"a protocol that tests each recording once for {method}", "choose another, such as farthest"
+        got = f"{protocol}, which trains on several sets of recordings, and the folder holds the sounds of one"
+        raise EvaluationError.expected(wanted, method, got=got, name="method", advice=advice)
 
 
 def kind_of(method: str) -> str:
@@ -268,3 +269,45 @@ def _unknown(kind: str, name: str, known: Iterable[str]) -> EvaluationError:
     near = difflib.get_close_matches(name, known, n=1)
     wanted, advice = f"one of {', '.join(known)}", f"did you mean {near[0]}?" if near else ""
     return EvaluationError.expected(wanted, name, name=kind, advice=advice)
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What methods share."""
+
+    geometry: Geometry = "mesh"
+    """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
+    noisy: its mesh with vertices displaced by 2 % of its size."""
+    amplitude_scale: AmplitudeScale = "full-scale"
+    """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
+    values of different objects can be averaged. raw: in the recordings' unit."""
+    extraction: ExtractionMethod = "high-resolution"
+    """How the modes that methods share are extracted; see `avmsf modes --help`. The methods `paper` have their own."""
+    modes: int = 128
+    """Maximum number of the modes that methods share."""
+    splat: SplatConfig = field(default_factory=SplatConfig)
+    """How Gaussians are fitted."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """How features are made. The methods `paper` use the paper's own settings and only the encoder given here: DINOv2
+    without `lift.encoder`, which then has to be installed."""
+    body: BodyConfig = field(default_factory=BodyConfig)
+    """Elastic bodies."""
+
+    def __post_init__(self) -> None:
+        expect_modes(self.modes)
+
+
+@dataclass(frozen=True)
+class MetricSettings:
+    """Which metrics are computed."""
+
+    level: AmplitudeScale = "full-scale"
+    """As `EvaluationSettings.amplitude_scale`; methods do not depend on it."""
+    cdpam: bool = True
+    """Whether to compute CDPAM, the slowest metric."""
+    cdpam_contacts: int = 8
+    """Number of test contacts per case, evenly spaced, at which CDPAM is computed; 0 for all."""
+
+    def __post_init__(self) -> None:
+        if self.cdpam_contacts < 0:
+            raise EvaluationError.expected("0 (all) or more", self.cdpam_contacts, name="cdpam_contacts")

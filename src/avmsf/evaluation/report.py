@@ -1,11 +1,12 @@
 """The files of a results folder: summary, times, and one report as Markdown and as a page that stands on its own."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, select_autoescape
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
@@ -48,7 +49,7 @@ def write_summary(
     summary = summarize(records, identity, subsets=subsets, missing=missing)
     write_json(results.path / SUMMARY, summary)
     write_json(results.path / TIMES, times_of(records))
-    _write_text(results.path / TABLES, markdown(sections(records, identity, missing=missing)))
+    write_whole(results.path / TABLES, markdown(sections(records, identity, missing=missing)), raising=EvaluationError)
     return summary
 
 
@@ -59,7 +60,7 @@ def write_page(results: ResultsFolder) -> list[Section]:
     opening, *others = parts
     values = {"listening": _listening(records, results.path), "range_db": f"{RANGE_DB:g}", "is_text": _is_text}
     whole = _render("report.html.jinja", opening=opening, parts=others, **values)
-    _write_text(results.path / PAGE, with_policy(whole, report_directives(whole)))
+    write_whole(results.path / PAGE, with_policy(whole, report_directives(whole)), raising=EvaluationError)
     return parts
 
 
@@ -88,10 +89,12 @@ _Card = dict[str, str]
 
 
 def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[tuple[str, list[_Card]]]]:
-    """Return the names of contacts and their sounds by the titles of their objects, as many as fit the page."""
+    """Return contacts' names and sounds by the titles of their objects, as many as fit: one of each object first."""
+    stored = [record for record in records if any(case.sounds for case in record.cases)]
+    chosen = [stored_contacts(stored[row]) for row in evenly_spaced(len(stored), MAX_PAGE_OBJECTS)]
     found: dict[str, list[tuple[str, list[_Card]]]] = {}
     size = 0
-    for contact in _contacts(records):
+    for contact in filter(None, chain.from_iterable(zip_longest(*chosen))):
         cards = list(_cards(contact, folder))
         size += sum(len(card["picture"]) + len(card["sound"]) for card in cards)
         if size > MAX_PAGE_CHARACTERS:
@@ -124,14 +127,6 @@ def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
         yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[contact.name]))
 
 
-def _contacts(records: Sequence[ObjectRecord]) -> Iterator[StoredContact]:
-    """Yield contacts with sounds: one of each object first, then a second one, and so on."""
-    stored = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [list(stored_contacts(stored[row])) for row in evenly_spaced(len(stored), MAX_PAGE_OBJECTS)]
-    for contacts in zip_longest(*chosen):
-        yield from filter(None, contacts)
-
-
 def write_figures(results: ResultsFolder) -> list[Path]:
     """Draw what is stored, and return the files.
 
@@ -143,43 +138,37 @@ def write_figures(results: ResultsFolder) -> list[Path]:
     return [path for record in results.records() for draw in drawn for path in draw(record, results.path)]
 
 
-def _write_spectrograms(record: ObjectRecord, folder: Path) -> list[Path]:
+def _write_spectrograms(record: ObjectRecord, folder: Path) -> Iterator[Path]:
     labels = list(dict.fromkeys(case.label for case in record.cases if case.sounds))
-    paths = []
     for label in labels:
         rows: dict[str, dict[str, Tensor]] = {}
         for contact in stored_contacts(record):
-            files = {outcome.method: outcome.sounds for case, outcome in contact.made if case.label == label}
-            if files:
-                sound = StoredSound.read(folder / contact.recorded)
-                made = {
-                    method: StoredSound.read(folder / sounds[contact.name]).samples for method, sounds in files.items()
-                }
-                rows[contact.name] = {RECORDED: sound.samples, **made}
-        if not rows:
-            continue
-        methods = list(dict.fromkeys(method for row in rows.values() for method in row))
-        title = f"{record.identifier}: {label}"
-        figure = draw_spectrograms(
-            rows, methods, sample_rate=sound.sample_rate, highest=0.5 * record.sample_rate, title=title
-        )
-        name = record.identifier if len(labels) == 1 else f"{record.identifier} {file_word(label)}"
-        paths.append(folder / FIGURES / f"{name}.png")
-        save_picture(figure, paths[-1])
-    return paths
+            made = {each.method: each.sounds[contact.name] for case, each in contact.made if case.label == label}
+            if made:
+                files = {RECORDED: contact.recorded, **made}
+                sounds = {name: StoredSound.read(folder / file) for name, file in files.items()}
+                rate = sounds[RECORDED].sample_rate
+                rows[contact.name] = {name: sound.samples for name, sound in sounds.items()}
+        if rows:
+            methods = list(dict.fromkeys(method for row in rows.values() for method in row))
+            name = record.identifier if len(labels) == 1 else f"{record.identifier} {file_word(label)}"
+            highest, title = 0.5 * record.sample_rate, f"{record.identifier}: {label}"
+            figure = draw_spectrograms(rows, methods, sample_rate=rate, highest=highest, title=title)
+            yield _write_figure(figure, folder, name)
 
 
-def _write_maps(record: ObjectRecord, folder: Path) -> list[Path]:
-    paths = []
+def _write_maps(record: ObjectRecord, folder: Path) -> Iterator[Path]:
     for outcome in record.outcomes:
         for recording, file in outcome.maps.items():
             found, truth = read_map(folder / file)
             title = f"{record.identifier}: {recording} located by {outcome.method}"
             # The file's name has the row, which tells recordings of one case apart.
-            paths.append(folder / FIGURES / f"{record.identifier} {Path(file).stem}.png")
-            save_picture(draw_contact(found, title=title, truth=truth), paths[-1])
-    return paths
+            yield _write_figure(
+                draw_contact(found, title=title, truth=truth), folder, f"{record.identifier} {Path(file).stem}"
+            )
 
 
-def _write_text(path: Path, text: str) -> None:
-    write_whole(path, text, raising=EvaluationError)
+def _write_figure(figure: Figure, folder: Path, name: str) -> Path:
+    path = folder / FIGURES / f"{name}.png"
+    save_picture(figure, path)
+    return path

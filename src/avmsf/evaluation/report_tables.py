@@ -1,6 +1,6 @@
 """The content of a report: titles, paragraphs and tables of text."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import fmean
@@ -59,7 +59,7 @@ class _Report:
 
     @cached_property
     def tables(self) -> dict[str, Values]:
-        """Values of each experiment by its label, with the methods in the requested order."""
+        """Values of each experiment by its label, the main one first, with the methods in the requested order."""
         order = list(self.identity["methods"])
         return {
             label: {
@@ -71,7 +71,6 @@ class _Report:
 
     @property
     def label(self) -> str | None:
-        """That of the main experiment."""
         return next(iter(self.tables), None)
 
     @property
@@ -97,7 +96,7 @@ class _Report:
         return Section(
             f"{name} on {dataset}",
             (
-                *([self._incomplete()] if self.missing else []),
+                *self._incomplete(),
                 f"{about}Objects: {len(self.records)}; training recordings of each: "
                 f"{_span([len(case.train) for case in cases])}; test recordings in total: "
                 f"{sum(len(case.test) for case in cases)}{several}; avmsf {self.identity['version']}, seed "
@@ -114,14 +113,12 @@ class _Report:
             ),
         )
 
-    def _incomplete(self) -> str:
+    def _incomplete(self) -> list[str]:
         """Return the sentence on missing results: methods are named only of objects that are begun."""
         begun = {record.identifier for record in self.records}
-        listed = ", ".join(
-            f"{name} ({', '.join(methods)})" if name in begun else name for name, methods in self.missing.items()
-        )
-        objects = counted(len(self.missing), "object")
-        return f"Incomplete: results of {objects} are missing: {listed}. Run the same command again to compute them."
+        listed = [f"{name} ({', '.join(each)})" if name in begun else name for name, each in self.missing.items()]
+        objects, advice = counted(len(listed), "object"), "Run the same command again to compute them."
+        return [f"Incomplete: results of {objects} are missing: {', '.join(listed)}. {advice}"] if listed else []
 
     def main_table(self) -> Section:
         found, (dataset, _) = means(self.main), self.experiment
@@ -133,22 +130,16 @@ class _Report:
             )
             for method, values in found.items()
         ]
-        paper = PUBLISHED.get(self.experiment, ())
-        rows += [
-            (f"paper: {row.title}", *(format_number(row.values.get(metric)) for metric in self.shown), _DASH)
-            for row in paper
-            if row.label in (None, self.label)
-        ]
-        remark = (
-            f"Rows that begin with “paper:” are the paper's values on {dataset}. {WARNING}"
-            if paper
-            else f"The paper has no values of this experiment on {dataset}."
-        )
+        paper = [row for row in PUBLISHED.get(self.experiment, ()) if row.label in (None, self.label)]
+        rows += [(*_row(f"paper: {row.title}", row.values, self.shown), _DASH) for row in paper]
+        remark = f"The paper has no values of this experiment on {dataset}."
+        if self.experiment in PUBLISHED:
+            remark = f"Rows that begin with “paper:” are the paper's values on {dataset}. {WARNING}"
         titles = "; ".join(f"{each}: {METHODS[kind_of(each)].title}" for each in found if kind_of(each) in METHODS)
         return Section(
             "All methods" + (f": {self.label}" if len(self.tables) > 1 else ""),
             (),
-            ("method", *self._headings(self.shown), "objects"),
+            ("method", *(METRICS[metric].heading for metric in self.shown), "objects"),
             tuple(rows),
             self._best(found),
             (*self._of_fewer(), remark, *([f"{titles}."] if titles else [])),
@@ -157,26 +148,18 @@ class _Report:
     def ratio_table(self) -> Section:
         found, (dataset, protocol) = ratios(self.main), self.experiment
         falling = [metric for metric in self.shown if any(metric in values for values in found.values())]
-        rows = [
-            (method, *(format_number(values.get(metric)) for metric in falling)) for method, values in found.items()
-        ]
+        rows = [_row(method, values, falling) for method, values in found.items()]
         for source, methods in published_ratios(protocol).items():
             if self.experiment not in PUBLISHED or dataset.startswith(source):
-                rows += [
-                    (f"paper, {source}: {method}", *(format_number(values.get(metric)) for metric in falling))
-                    for method, values in methods.items()
-                    if method in map(kind_of, found)
-                ]
-        return Section(
-            f"Ratio to {BASELINE}",
-            (
-                "Below 1 is better than the mean of the three nearest recordings. Our values are geometric means of "
-                "the objects' ratios; the paper's are ratios of its means, since it gives no ratios, from its main "
-                "tables where its table of this experiment has no KNN.",
-            ),
-            ("method", *self._headings(falling)),
-            tuple(rows),
+                known = [method for method in methods if method in map(kind_of, found)]
+                rows += [_row(f"paper, {source}: {method}", methods[method], falling) for method in known]
+        text = (
+            "Below 1 is better than the mean of the three nearest recordings. Our values are geometric means of "
+            "the objects' ratios; the paper's are ratios of its means, since it gives no ratios, from its main "
+            "tables where its table of this experiment has no KNN."
         )
+        columns = ("method", *(METRICS[metric].heading for metric in falling))
+        return Section(f"Ratio to {BASELINE}", (text,), columns, tuple(rows))
 
     def case_table(self, metric: str) -> Section:
         found = {label: means(table) for label, table in self.tables.items()}
@@ -184,19 +167,17 @@ class _Report:
         rows = [(method, *(_mean(each.get(method, {}).get(metric)) for each in found.values())) for method in methods]
         paper = PUBLISHED.get(self.experiment, ())
         for title in dict.fromkeys(row.title for row in paper):
-            own = {row.label: row.values.get(metric) for row in paper if row.title == title}
-            if any(own.get(label) is not None for label in found):
-                rows.append((f"paper: {title}", *(format_number(own.get(label)) for label in found)))
+            own = {row.label: row.values[metric] for row in paper if row.title == title and metric in row.values}
+            if own.keys() & found.keys():
+                rows.append(_row(f"paper: {title}", own, found))
         return Section(f"{METRICS[metric].heading} by case", (), ("method", *found), tuple(rows))
 
     def times(self) -> Section:
-        times, rows = list(times_of(self.records).values()), []
+        times, rows, steps = list(times_of(self.records).values()), [], ("fit", "render")
         for method in self.identity["methods"]:
             found = [each["methods"][method] for each in times if method in each["methods"]]
             if found:
-                rows.append(
-                    (method, *(format_number(fmean(each[name] for each in found)) for name in ("fit", "render")))
-                )
+                rows.append(_row(method, {step: fmean(each[step] for each in found) for step in steps}, steps))
         if times:
             rows.append(("shared: modes and features", format_number(fmean(each["shared"] for each in times)), _DASH))
         text = (
@@ -208,15 +189,11 @@ class _Report:
         return Section("Time per object", (text,), ("method", "fit", "render the test contacts"), tuple(rows))
 
     def failures(self) -> Section:
-        failures = failures_of(self.records)
+        failures, columns = failures_of(self.records), ("object", "case", "method", "failure")
         if not failures:
             return Section("Failures", ("None.",))
-        columns = ("object", "case", "method", "failure")
         rows = tuple(tuple(each[column] or "all" for column in columns) for each in failures)
         return Section("Failures", (), (*columns[:-1], "reason"), rows)
-
-    def _headings(self, metrics: Sequence[str]) -> list[str]:
-        return [METRICS[metric].heading for metric in metrics]
 
     def _best(self, found: Mapping[str, Mapping[str, Mean]]) -> frozenset[tuple[int, int]]:
         """Return the best cells of each metric's column, among the methods that have it of all objects that have it."""
@@ -229,16 +206,19 @@ class _Report:
                 best.add(((max if is_rising(metric) else min)(complete, key=complete.__getitem__), column))
         return frozenset(best)
 
-    def _of_fewer(self) -> tuple[str, ...]:
-        """Return the sentence on methods without results of some objects; nothing where there are none."""
+    def _of_fewer(self) -> list[str]:
+        """Return the sentence on methods without results of some objects."""
         methods = dict.fromkeys(method for values in self.main.values() for method in values)
         fewer = [method for method in methods if any(method not in values for values in self.main.values())]
-        if not fewer:
-            return ()
-        return (
+        text = (
             f"Not of all {len(self.main)} objects: {', '.join(fewer)}. Their means are of other objects than those of "
-            "the other rows, and not marked as best; ratios are of the same objects.",
+            "the other rows, and not marked as best; ratios are of the same objects."
         )
+        return [text] if fewer else []
+
+
+def _row(name: str, values: Mapping[Any, float], columns: Iterable[str]) -> tuple[str, ...]:
+    return name, *(format_number(values.get(column)) for column in columns)
 
 
 def _listed(settings: Mapping[str, Any]) -> str:

@@ -4,7 +4,7 @@ import json
 import math
 import re
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import read_json
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.evaluation.splits import Case
 
 IDENTITY, OBJECTS = "protocol.json", "objects"
 """The file that identifies the evaluation, and the folder of the objects' files."""
@@ -19,6 +20,8 @@ ENCODER = ", encoder "
 """What comes between a method's description and the encoder of the features that it reads."""
 _MAX_BYTES = 64 << 20
 """Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
+_MAX_SHOWN = 160
+"""Characters of a setting in a message."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,12 @@ class CaseRecord:
     shared_seconds: float = 0.0
     """Time of modes and features, which all methods share."""
 
+    @classmethod
+    def of(cls, case: Case, names: Sequence[str]) -> "CaseRecord":
+        """Return the record of a case of recordings of these names."""
+        train, test = (tuple(names[row] for row in rows) for rows in (case.train, case.test))
+        return cls(case.key, case.label, train, test)
+
 
 @dataclass(frozen=True)
 class ObjectRecord:
@@ -101,8 +110,7 @@ class ResultsFolder:
         `identity` holds plain values that determine the results; `methods` describes each method. Methods may be added
         later. Raises EvaluationError where the folder's results are of another identity, or a method has changed.
         """
-        wanted = json.loads(json.dumps(dict(identity)))
-        path = self.path / IDENTITY
+        wanted, path = json.loads(json.dumps(dict(identity))), self.path / IDENTITY
         # A kill may leave a hidden part of the file behind.
         if not path.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
             asked, advice = f"an empty folder or one with {IDENTITY}", "choose a new --output"
@@ -110,18 +118,18 @@ class ResultsFolder:
         known = self.identity() if path.exists() else {**wanted, "methods": {}}
         stored = known.pop("methods")
         if wanted != known:
-            name, asked, found = _first_difference(wanted, known)
-            ours, theirs = f"of {name} {_brief(asked)}", _brief(found)
+            name, ours, theirs = _first_difference(wanted, known)
+            told = f"of {name} {_brief(ours)}", _brief(theirs)
             if name == "source":
-                ours, theirs = "made by this version of avmsf", "those of another, whose code differs"
-            raise self._of_another(name, found, ours, theirs)
+                told = "made by this version of avmsf", "those of another, whose code differs"
+            raise self._of_another(name, theirs, *told)
         for name in methods:
-            if name in stored and stored[name] != methods[name]:
-                parts = [each.partition(ENCODER) for each in (methods[name], stored[name])]
-                ours, theirs = "these settings and weights", "others"
-                if parts[0][0] == parts[1][0]:
-                    ours, theirs = (f"--set lift.encoder={each[2]}" for each in parts)
-                raise self._of_another(name, stored[name], f"of {name} made with {ours}", f"those made with {theirs}")
+            if stored.get(name, methods[name]) != methods[name]:
+                (ours, _, encoder), (theirs, _, other) = (each[name].partition(ENCODER) for each in (methods, stored))
+                made = "these settings and weights", "others"
+                if ours == theirs:
+                    made = f"--set lift.encoder={encoder}", f"--set lift.encoder={other}"
+                raise self._of_another(name, stored[name], f"of {name} made with {made[0]}", f"those with {made[1]}")
         write_json(path, {**wanted, "methods": {**stored, **methods}})
 
     def _of_another(self, name: str, value: object, wanted: str, found: str) -> EvaluationError:
@@ -130,10 +138,9 @@ class ResultsFolder:
 
     def identity(self) -> dict[str, Any]:
         """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
-        path = self.path / IDENTITY
-        read = self._read(path)
+        read = self._read(self.path / IDENTITY)
         if not isinstance(read.get("methods"), dict):
-            raise self._damaged(path, "it names no methods")
+            raise _damaged(self.path / IDENTITY, "it names no methods")
         return read
 
     def read(self, identifier: str) -> ObjectRecord | None:
@@ -148,7 +155,7 @@ class ResultsFolder:
     def records(self) -> tuple[ObjectRecord, ...]:
         """Return all objects' records, in natural order."""
         paths = sorted((self.path / OBJECTS).glob("[!.]*.json"), key=lambda path: natural(path.stem))
-        return tuple(self._record(path) for path in paths)
+        return tuple(map(self._record, paths))
 
     def _path_of(self, identifier: str) -> Path:
         return self.path / OBJECTS / f"{identifier}.json"
@@ -156,30 +163,29 @@ class ResultsFolder:
     def _record(self, path: Path) -> ObjectRecord:
         read = self._read(path)
         try:
-            cases = tuple(
-                CaseRecord(**{**each, "train": tuple(each["train"]), "test": tuple(each["test"])})
-                for each in read.pop("cases")
-            )
-            outcomes = tuple(
-                Outcome(**{**each, "values": {name: tuple(values) for name, values in each["values"].items()}})
+            cases = [{**each, "train": tuple(each["train"]), "test": tuple(each["test"])} for each in read.pop("cases")]
+            outcomes = [
+                {**each, "values": {name: tuple(values) for name, values in each["values"].items()}}
                 for each in read.pop("outcomes")
-            )
-            return ObjectRecord(**read, cases=cases, outcomes=outcomes)
+            ]
+            parts = tuple(CaseRecord(**each) for each in cases), tuple(Outcome(**each) for each in outcomes)
+            return ObjectRecord(**read, cases=parts[0], outcomes=parts[1])
         except (KeyError, TypeError, AttributeError) as error:
-            raise self._damaged(path, error) from error
+            raise _damaged(path, error) from error
 
     def _read(self, path: Path) -> dict[str, Any]:
         try:
             read = read_json(path, max_bytes=_MAX_BYTES)
         except (OSError, ValueError) as error:
-            raise self._damaged(path, error) from error
+            raise _damaged(path, error) from error
         if not isinstance(read, dict):
-            raise self._damaged(path, "no JSON object")
+            raise _damaged(path, "no JSON object")
         return read
 
-    def _damaged(self, path: Path, error: object) -> EvaluationError:
-        advice = "delete the file to compute them again, or choose another --output"
-        return EvaluationError.expected("results of this version", got=str(error), file=path, advice=advice)
+
+def _damaged(path: Path, error: object) -> EvaluationError:
+    advice = "delete the file to compute them again, or choose another --output"
+    return EvaluationError.expected("results of this version", got=str(error), file=path, advice=advice)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -198,13 +204,13 @@ def failure_of(error: Exception) -> str:
 
 def file_word(name: str) -> str:
     """Return a name for files: methods that read a folder have its path in their name."""
-    return "".join(mark if mark.isalnum() or mark in "-_" else "-" for mark in name)
+    return re.sub(r"[^\w-]", "-", name)
 
 
-def natural(name: str) -> tuple[tuple[int, int, str], ...]:
+def natural(name: str) -> list[tuple[bool, int, str]]:
     """Return a key that sorts numbers within names by value."""
     parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
+    return [(not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
 
 
 def _finite(value: Any) -> Any:
@@ -227,5 +233,5 @@ def _first_difference(wanted: Mapping[str, Any], found: Mapping[str, Any]) -> tu
 
 
 def _brief(value: object) -> str:
-    text = json.dumps(value, ensure_ascii=False) if not isinstance(value, str) else value
-    return text if len(text) <= 160 else f"{text[:157]}..."
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _MAX_SHOWN else f"{text[: _MAX_SHOWN - 3]}..."

@@ -1,26 +1,264 @@
-"""Running an evaluation: all methods on one object after the other, or on several at a time by ray.
+"""Running an evaluation: all methods in all cases of one object after the other, or of several at a time by ray.
 
 Each result is stored at once; what has results already is not computed again.
 """
 
+import hashlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from avmsf._utils.caching import Given, Result, once
 from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.evaluation.case_run import CaseRun, Evaluation, ObjectData
-from avmsf.evaluation.recorded import RecordedMethod
+from avmsf.evaluation.field_methods import FieldMethod
+from avmsf.evaluation.localization import located, write_map
+from avmsf.evaluation.methods import RecordedMethod
+from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
+from avmsf.evaluation.objects import draw_other_recording
+from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.registry import METRICS, MetricEntry
-from avmsf.evaluation.results import CaseRecord, ObjectRecord, ResultsFolder, failure_of
-from avmsf.evaluation.splits import Case
+from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of, file_word
+from avmsf.evaluation.scores import Values, metric_values
+from avmsf.evaluation.splits import Case, align_split, evenly_spaced
+from avmsf.evaluation.stored_sounds import RECORDED, listening_gain, write_sound
+from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
+from avmsf.modal.extraction.extract import extract_once
+from avmsf.modal.extraction.finders import ModeFinder
 
+MAX_STORED_SOUNDS = 3
+"""Test contacts of an experiment whose sounds are stored to be listened to."""
 Progress = Callable[[str, int, int], None]
 """Gets what has begun or ended, the number of finished objects, and of all."""
+
+
+class ObjectData:
+    """What all cases of an object share, each made once; so is the error of what cannot be made."""
+
+    def __init__(self, evaluation: Evaluation, identifier: str) -> None:
+        """Read an object. Raises AvmsfError, OSError or ValueError where it is damaged."""
+        dataset, inputs = evaluation.dataset, evaluation.inputs
+        capture = dataset.capture(identifier)
+        surface = capture.surface
+        self.identifier, self.facts = identifier, dataset.facts(identifier)
+        self.impacts = capture.impacts
+        """Recordings on which all methods are scored."""
+        self.own_starts = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier).impacts
+        """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are
+        not of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the
+        signs of the gains, and which the truth of all does not have."""
+        truth = None if evaluation.time_zero == "peak" else truth_of(dataset, identifier)
+        digest = hashlib.sha256(self.impacts.digest().encode())
+        for tensor in () if truth is None else (truth.frequency, truth.damping, truth.gains.real, truth.gains.imag):
+            digest.update(tensor.contiguous().numpy().tobytes())
+        self.digest = digest.hexdigest()
+        """Of all that values depend on of the object's recordings and truth."""
+        if truth is not None:
+            truth = truth_from_first_sample(truth_at(truth, self.impacts.names), self.impacts)
+        self.truth = truth
+        self.vertices = None if surface is None or not len(surface.faces) else surface.vertices
+        self.features = once(partial(inputs.features, identifier))
+        self.bodies = once(partial(inputs.bodies, identifier))
+        self.family = once(partial(inputs.family, identifier))
+        self.gaussians = once(partial(inputs.cloud, identifier))
+        self.other_recording = once(
+            partial(draw_other_recording, dataset, identifier, self.impacts, seed=evaluation.seed)
+        )
+
+
+class _Recordings:
+    """A case's recordings from one kind of start, aligned when first asked for, and their modes, stored in a file."""
+
+    def __init__(self, impacts: Impacts, case: Case, finder: ModeFinder, path: Path) -> None:
+        self.train, self.test = impacts.take(case.train), impacts.take(case.test)
+        self.modes = once(lambda: extract_once(self.train, finder, path))
+
+    def align(self) -> None:
+        """Give all recordings the starts that the training ones have in common."""
+        self.train, self.test = align_split(self.train, self.test, modes=self.modes)
+
+
+class CaseRun:
+    """Runs methods in one case, with modes that are found once and stored in a file."""
+
+    def __init__(
+        self, evaluation: Evaluation, data: ObjectData, case: Case, *, folder: Path, number: int, stores_sounds: bool
+    ) -> None:
+        """Prepare the `number`-th case of an object; with `stores_sounds`, some of its sounds go into `folder`."""
+        self.evaluation, self.data, self.case, self.folder = evaluation, data, case, folder
+        self.name = f"{data.identifier}/{number:02d}"
+        path, finder = folder / "modes" / f"{self.name}.safetensors", evaluation.finder
+        self.scored = self.own = _Recordings(data.impacts, case, finder, path)
+        if data.own_starts is not None:
+            own_path = path.with_name(f"{number:02d} own starts.safetensors")
+            self.own = _Recordings(data.own_starts, case, finder, own_path)
+        self.truth = None if data.truth is None else truth_at(data.truth, self.scored.test.names)
+        self.stored_rows = evenly_spaced(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
+        self.shared = 0.0
+        """Seconds of modes and features, which count to no method: whichever asks first would seem the slowest."""
+
+    def outcome(self, method: Method) -> Outcome:
+        """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
+        begun, shared = time.perf_counter(), self.shared
+        published = isinstance(method, FieldMethod) and method.published
+        recordings = self.own if isinstance(method, FieldMethod) and not published else self.scored
+        try:
+            for each in (self.scored, recordings):
+                self._shared(each.align)()
+            renderer = expect_renderer(method.fit(self._task(recordings)))
+            fit_seconds = time.perf_counter() - begun - (self.shared - shared)
+            begun = time.perf_counter()
+            with torch.no_grad():
+                sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
+            render_seconds = time.perf_counter() - begun
+            if self.evaluation.protocol.locating:
+                values, maps = self._located(method.name, recordings, renderer, published)
+                figures: Mapping[str, float | None] = {}
+            else:
+                loudest, maps = float(self.data.impacts.sounds.abs().max()), {}
+                settings, test = self.evaluation.metric_settings, self.scored.test
+                values, figures = metric_values(settings, renderer, sounds, test, self.truth, loudest=loudest)
+        except Exception as error:  # A fault in one method must not cost the others their hours.
+            return Outcome(self.case.key, method.name, failure=failure_of(error))
+        return Outcome(
+            self.case.key,
+            method.name,
+            values,
+            figures,
+            round(fit_seconds, 4),
+            round(render_seconds, 4),
+            self._write_sounds(method.name, sounds),
+            report_of(renderer),
+            maps,
+        )
+
+    def described(self, known: CaseRecord) -> CaseRecord:
+        """Return the case's record with the recordings' files and with the time of modes and features so far."""
+        sounds = known.sounds or self._write_sounds(RECORDED, self.scored.test.sounds)
+        seconds, self.shared = known.shared_seconds + self.shared, 0.0
+        return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
+
+    def _located(
+        self, name: str, recordings: _Recordings, renderer: Renderer, published: bool
+    ) -> tuple[Values, dict[str, str]]:
+        """Return the errors of located contacts, and the files of contacts' maps by the names of their recordings."""
+        points = self._shared(self.data.features)("surface", self.case.views).points
+        train, test, rows = recordings.train, recordings.test, self.stored_rows
+        errors, found = located(
+            renderer, train, test, points, vertices=self.data.vertices, published=published, map_rows=rows
+        )
+        maps = {}
+        for row, each in found.items():
+            file = f"maps/{self.name}/{row:03d} {file_word(name)}.safetensors"
+            write_map(self.folder / file, each, truth=test.contacts[row])
+            maps[test.names[row]] = file
+        return dict(errors), maps
+
+    def _task(self, recordings: _Recordings) -> Task:
+        data, views = self.data, self.case.views
+        return Task(
+            name=data.identifier,
+            train=recordings.train,
+            contacts=data.impacts.contacts,
+            names=data.impacts.names,
+            seed=self.evaluation.seed,
+            modes=self._shared(recordings.modes),
+            features=self._shared(lambda visual_input: data.features(visual_input, views)),
+            bodies=self._shared(data.bodies),
+            other_recording=self._shared(data.other_recording),
+            family=self._shared(data.family),
+            gaussians=self._shared(lambda: data.gaussians(views)),
+            material=data.facts.material,
+            device=self.evaluation.device,
+        )
+
+    def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:
+        """Return `make`, whose time is added to `shared`."""
+
+        def made(*given: Given.args, **named: Given.kwargs) -> Result:
+            begun = time.perf_counter()
+            try:
+                return make(*given, **named)
+            finally:
+                self.shared += time.perf_counter() - begun
+
+        return made
+
+    def _write_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
+        """Write the sounds to listen to, and return their files by the names of their recordings."""
+        stored, test = {}, self.scored.test
+        for row in self.stored_rows:
+            file, gain = f"sounds/{self.name}/{row:03d} {file_word(name)}.flac", listening_gain(test.sounds[row])
+            write_sound(self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=gain)
+            stored[test.names[row]] = file
+        return stored
+
+
+def run_object(
+    evaluation: Evaluation, identifier: str, results: ResultsFolder, log: Callable[[str], None] = lambda message: None
+) -> None:
+    """Evaluate all methods on one object, on one thread, except those with stored results.
+
+    Failures of an object or a method are stored as their results. `log` is called with a message for each method that
+    begins. Raises EvaluationError where stored results are of other recordings.
+    """
+    with one_thread():
+        record = results.read(identifier) or ObjectRecord(identifier)
+        try:
+            data = ObjectData(evaluation, identifier)
+            cases = evaluation.protocol.choosing.cases(data.impacts)
+        except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
+            results.write(replace(record, failure=failure_of(error)))
+            return
+        record = _begun(record, data, cases, evaluation.title, results)
+        results.write(record)
+        firsts = {case.label: case.key for case in reversed(cases)}
+        for number, case in enumerate(cases, 1):
+            stores_sounds = firsts[case.label] == case.key
+            run = CaseRun(evaluation, data, case, folder=results.path, number=number, stores_sounds=stores_sounds)
+            for method in evaluation.methods:
+                digest = method.digest(identifier) if isinstance(method, RecordedMethod) else ""
+                if record.done(case.key, method.name, digest):
+                    continue
+                log(f"{identifier}: {case.key}, {method.name}")
+                outcome = replace(run.outcome(method), digest=digest)
+                described = tuple(run.described(each) if each.key == case.key else each for each in record.cases)
+                record = replace(record, cases=described).adding(outcome)
+                results.write(record)
+
+
+def _begun(
+    record: ObjectRecord, data: ObjectData, cases: Sequence[Case], title: str, results: ResultsFolder
+) -> ObjectRecord:
+    """Return an object's record with its cases and all else that is known; refuse values of other recordings."""
+    if record.digest != data.digest and all(each.failure is not None for each in record.outcomes):
+        record = ObjectRecord(record.identifier)
+    if record.digest not in ("", data.digest):
+        wanted, advice = f"results of the recordings of {record.identifier} in {title}", "choose another --output"
+        raise EvaluationError.expected(
+            wanted, record.digest, got="those of others", file=results.path, name=record.identifier, advice=advice
+        )
+    known, names = {case.key: case for case in record.cases}, data.impacts.names
+    return replace(
+        record,
+        digest=data.digest,
+        name=data.facts.name,
+        material=data.facts.material,
+        sample_rate=data.impacts.sample_rate,
+        cases=tuple(known.get(case.key) or CaseRecord.of(case, names) for case in cases),
+        failure=None,
+    )
 
 
 def run_objects(
@@ -41,13 +279,12 @@ def run_objects(
     """
     if workers < 1:
         raise EvaluationError.expected("1 worker or more", workers, name="workers")
-    if address is not None or workers > 1:
-        ray = _ray()
-        evaluation.begin(results)
+    ray = _ray() if address is not None or workers > 1 else None
+    evaluation.begin(results)
+    if ray is not None:
         with _cluster(ray, workers, address):
             _run_remotely(ray, evaluation, identifiers, results, progress)
         return
-    evaluation.begin(results)
     total = len(identifiers)
     for done, identifier in enumerate(identifiers):
 
@@ -58,77 +295,8 @@ def run_objects(
         progress(f"{identifier}: done", done + 1, total)
 
 
-def run_object(
-    evaluation: Evaluation, identifier: str, results: ResultsFolder, log: Callable[[str], None] = lambda message: None
-) -> None:
-    """Evaluate all methods on one object, on one thread, except those with stored results.
-
-    Failures of an object or a method are stored as their results. `log` is called with a message for each method that
-    begins. Raises EvaluationError where stored results are of other recordings.
-    """
-    with one_thread():
-        record = results.read(identifier) or ObjectRecord(identifier)
-        try:
-            data = ObjectData(evaluation, identifier)
-            cases = evaluation.protocol.choosing.cases(data.impacts)
-        except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
-            results.write(replace(record, failure=failure_of(error)))
-            return
-        record = _begun(record, data, cases, evaluation, results)
-        results.write(record)
-        firsts = {case.label: case.key for case in reversed(cases)}
-        for number, case in enumerate(cases, 1):
-            stores_sounds = firsts[case.label] == case.key
-            run = CaseRun(evaluation, data, case, folder=results.path, number=number, stores_sounds=stores_sounds)
-            for method in evaluation.methods:
-                digest = method.digest(identifier) if isinstance(method, RecordedMethod) else ""
-                if record.done(case.key, method.name, digest):
-                    continue
-                log(f"{identifier}: {case.key}, {method.name}")
-                outcome = replace(run.outcome(method), digest=digest)
-                described = tuple(run.described(each) if each.key == case.key else each for each in record.cases)
-                record = replace(record, cases=described).adding(outcome)
-                results.write(record)
-
-
-def _begun(
-    record: ObjectRecord, data: ObjectData, cases: Sequence[Case], evaluation: Evaluation, results: ResultsFolder
-) -> ObjectRecord:
-    """Return an object's record with its cases and all else that is known; refuse values of other recordings."""
-    if record.digest != data.digest and all(each.failure is not None for each in record.outcomes):
-        record = ObjectRecord(record.identifier)
-    if record.digest not in ("", data.digest):
-        raise EvaluationError.expected(
-            f"results of the recordings of {record.identifier} in {evaluation.title}",
-            record.digest,
-            got="those of others",
-            file=results.path,
-            name=record.identifier,
-            advice="choose another --output",
-        )
-    known = {case.key: case for case in record.cases}
-    return replace(
-        record,
-        digest=data.digest,
-        name=data.facts.name,
-        material=data.facts.material,
-        sample_rate=data.impacts.sample_rate,
-        cases=tuple(known.get(case.key) or _named(case, data.impacts) for case in cases),
-        failure=None,
-    )
-
-
-def _named(case: Case, impacts: Impacts) -> CaseRecord:
-    train, test = (tuple(impacts.names[row] for row in rows) for rows in (case.train, case.test))
-    return CaseRecord(case.key, case.label, train, test)
-
-
 def _run_remotely(
-    ray: ModuleType,
-    evaluation: Evaluation,
-    identifiers: Sequence[str],
-    results: ResultsFolder,
-    progress: Progress,
+    ray: ModuleType, evaluation: Evaluation, identifiers: Sequence[str], results: ResultsFolder, progress: Progress
 ) -> None:
     # max_retries: a worker that was killed for memory would be killed again.
     remote = ray.remote(num_cpus=1, max_retries=0)(_run_elsewhere)
@@ -147,11 +315,10 @@ def _run_remotely(
                     cause = getattr(error, "cause", None)
                     if isinstance(cause, Exception) and not isinstance(cause, ray.exceptions.RayError):
                         raise cause from None
+                    got = f"one that ended early ({str(error).splitlines()[0]})"
+                    advice = "run the command again, with fewer --workers if memory ran out"
                     raise EvaluationError.expected(
-                        "a worker process that finishes",
-                        got=f"one that ended early ({str(error).splitlines()[0]})",
-                        name=identifier,
-                        advice="run the command again, with fewer --workers if memory ran out",
+                        "a worker process that finishes", got=got, name=identifier, advice=advice
                     ) from error
                 progress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers))
     finally:
@@ -167,13 +334,10 @@ def _run_elsewhere(shared: tuple[Evaluation, ResultsFolder, dict[str, MetricEntr
 
 @contextmanager
 def _cluster(ray: ModuleType, workers: int, address: str | None) -> Iterator[None]:
-    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-    if address is None:
-        settings |= {"num_cpus": workers, "include_dashboard": False, "address": "local"}
-    else:
-        settings["address"] = address
+    local = {"num_cpus": workers, "include_dashboard": False, "address": "local"}
+    settings = local if address is None else {"address": address}
     try:
-        ray.init(**settings)
+        ray.init(log_to_driver=False, logging_level="error", **settings)
     except (ConnectionError, RuntimeError, ValueError) as error:
         wanted, advice = "a cluster to connect to", "check that it runs and has this address"
         if address is None:
@@ -188,16 +352,12 @@ def _cluster(ray: ModuleType, workers: int, address: str | None) -> Iterator[Non
 
 def _ray() -> ModuleType:
     # One computer needs no authentication, and no usage is reported.
-    for name, value in {
-        "RAY_AUTH_MODE": "disabled",
-        "RAY_USAGE_STATS_ENABLED": "0",
-        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    }.items():
-        os.environ.setdefault(name, value)
+    os.environ.setdefault("RAY_AUTH_MODE", "disabled")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
     except ImportError as error:
-        raise EvaluationError.expected(
-            "an installed package", name="ray", advice="pip install 'avmsf[scale]', or omit --workers and --ray"
-        ) from error
+        advice = "pip install 'avmsf[scale]', or omit --workers and --ray"
+        raise EvaluationError.expected("an installed package", name="ray", advice=advice) from error
     return ray

@@ -71,13 +71,10 @@ class ModalBaseline(_Trained, ABC):
     """Start of the noise's chance."""
 
     def __post_init__(self) -> None:
-        if len(self.extraction.gains) != len(self.train):
-            raise EvaluationError.expected(
-                f"gains of {len(self.train)} training impacts",
-                len(self.extraction.gains),
-                name="extraction",
-                advice="extract the modes from these impacts",
-            )
+        wanted, count = f"gains of {len(self.train)} training impacts", len(self.extraction.gains)
+        if count != len(self.train):
+            advice = "extract the modes from these impacts"
+            raise EvaluationError.expected(wanted, count, name="extraction", advice=advice)
 
     @property
     def bank(self) -> ModalBank:

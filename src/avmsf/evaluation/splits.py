@@ -53,13 +53,13 @@ class Choosing(Protocol):
 
 @dataclass(frozen=True)
 class Farthest:
-    """Training contacts by farthest-point sampling, from the first one on (paper, section 4.1)."""
+    """Training contacts by farthest-point sampling, from the first one on (paper, section 4.1), as in `split`."""
 
     fraction: float = 0.2
     """Fraction of the contacts to train on, at least 2 contacts."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the one case, the same as that of `avmsf.evaluation.splits.split`."""
+        """Return the one case."""
         distinct = DistinctContacts.of(impacts)
         return (distinct.case("farthest", farthest_points(distinct.contacts, distinct.count_of(self.fraction))),)
 
@@ -88,17 +88,13 @@ class Predefined:
         """Return the one case. Raises EvaluationError for a name that no recording has."""
         unknown = sorted(set(self.test) - set(impacts.names))
         if unknown:
-            raise EvaluationError.expected(
-                f"names of {counted(len(impacts.names), 'recording')}, {impacts.names[0]} to {impacts.names[-1]}",
-                unknown[0],
-                name="test",
-            )
+            wanted = f"names of {counted(len(impacts), 'recording')}, {impacts.names[0]} to {impacts.names[-1]}"
+            raise EvaluationError.expected(wanted, unknown[0], name="test")
         distinct = DistinctContacts.of(impacts)
         tested = {row for row, name in enumerate(impacts.names) if name in self.test}
         chosen = [contact for contact, rows in enumerate(distinct.rows) if tested.isdisjoint(rows)]
         distinct.check_count(len(chosen))
-        case = distinct.case("predefined", chosen)
-        return (replace(case, test=tuple(sorted(tested))),)
+        return (replace(distinct.case("predefined", chosen), test=tuple(sorted(tested))),)
 
 
 @dataclass(frozen=True)
@@ -108,11 +104,11 @@ class LeaveOneOut:
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return a case for each contact, named by its first recording."""
         distinct = DistinctContacts.of(impacts)
-        count = len(distinct.rows)
-        distinct.check_count(count - 1)
-        others = ([other for other in range(count) if other != left] for left in range(count))
-        folds = (impacts.names[rows[0]] for rows in distinct.rows)
-        return tuple(distinct.case("leave-one-out", *pair) for pair in zip(others, folds, strict=True))
+        every = range(distinct.check_count(len(distinct.rows) - 1) + 1)
+        return tuple(
+            distinct.case("leave-one-out", [other for other in every if other != left], impacts.names[rows[0]])
+            for left, rows in enumerate(distinct.rows)
+        )
 
 
 @dataclass(frozen=True)
@@ -157,8 +153,7 @@ class FewerViews:
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the case of `Farthest`, once for each number of views."""
         (case,) = Farthest().cases(impacts)
-        labels = {views: "all views" if views is None else f"{views} views" for views in self.counts}
-        return tuple(replace(case, label=label, views=views) for views, label in labels.items())
+        return tuple(replace(case, label=f"{views or 'all'} views", views=views) for views in self.counts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,21 +174,12 @@ class DistinctContacts:
         rows = rows_by_place(impacts.contacts)
         return cls(impacts.contacts.double()[[each[0] for each in rows]], rows)
 
-    @property
-    def recordings(self) -> int:
-        """Number of recordings at all contacts."""
-        return sum(map(len, self.rows))
-
     def check_count(self, wanted: int, *, least: int = 1) -> int:
         """Return `wanted`, or raise EvaluationError for fewer training contacts than `least` or no test contact."""
         if not least <= wanted < len(self.rows):
-            there_are = f"{counted(self.recordings, 'recording')} at {counted(len(self.rows), 'contact')}"
-            raise EvaluationError.expected(
-                f"{least} to {len(self.rows) - 1} training contacts of {there_are}",
-                wanted,
-                name="count",
-                advice="choose another number or record more contacts",
-            )
+            total = f"{counted(sum(map(len, self.rows)), 'recording')} at {counted(len(self.rows), 'contact')}"
+            expected, advice = f"{least} to {len(self.rows) - 1} training contacts of {total}", "record more contacts"
+            raise EvaluationError.expected(expected, wanted, name="count", advice=f"choose another number or {advice}")
         return wanted
 
     def count_of(self, fraction: float) -> int:
@@ -204,9 +190,8 @@ class DistinctContacts:
         """Return the case that trains on the chosen contacts: first recordings first, then the repeated ones."""
         taken = [self.rows[int(contact)] for contact in chosen]
         train = [rows[0] for rows in taken] + sorted(row for rows in taken for row in rows[1:])
-        used = set(train)
-        test = tuple(row for row in range(self.recordings) if row not in used)
-        return Case(label, tuple(train), test, fold)
+        test = {row for rows in self.rows for row in rows} - set(train)
+        return Case(label, tuple(train), tuple(sorted(test)), fold)
 
 
 def split(
@@ -223,17 +208,16 @@ def split(
     """
     impacts = recordings if isinstance(recordings, Impacts) else recordings.impacts
     if isinstance(train_size, float) and not 0.0 < train_size < 1.0:
-        raise EvaluationError.expected(
-            "a fraction of the contacts between 0 and 1, or their whole number", train_size, name="train_size"
-        )
+        wanted = "a fraction of the contacts between 0 and 1, or their whole number"
+        raise EvaluationError.expected(wanted, train_size, name="train_size")
     if seed is not None:
         start = random.Random(seed).randrange(len(impacts))
     distinct = DistinctContacts.of(impacts)
-    wanted = distinct.count_of(train_size) if isinstance(train_size, float) else distinct.check_count(int(train_size))
+    count = distinct.count_of(train_size) if isinstance(train_size, float) else distinct.check_count(int(train_size))
     if not 0 <= start < len(impacts):
         raise EvaluationError.expected(f"the index of a recording, 0 to {len(impacts) - 1}", start, name="start")
     first = next(contact for contact, rows in enumerate(distinct.rows) if start in rows)
-    case = distinct.case("", farthest_points(distinct.contacts, wanted, start=first))
+    case = distinct.case("", farthest_points(distinct.contacts, count, start=first))
     train, test = impacts.take(case.train), impacts.take(case.test)
     if isinstance(recordings, Impacts):
         return cast("tuple[Recordings, Recordings]", (train, test))

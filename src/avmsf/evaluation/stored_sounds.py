@@ -26,11 +26,11 @@ RECORDED = "recorded"
 """What the recordings are called next to the methods."""
 _PEAK = 0.25
 """What recordings peak at, of full scale: louder sounds of a method have room above."""
-_LEAST_RATE = 8000.0
-"""Hz below which browsers do not play."""
-_FULL = 1 - 2**-15
-_LOWEST = 60.0
-"""Hz at the lower edge of pictures, which are logarithmic in frequency above it."""
+_MIN_RATE_HZ = 8000.0
+"""Below it browsers do not play."""
+_FULL_SCALE = 1 - 2**-15
+_LOWEST_HZ = 60.0
+"""Lower edge of pictures, which are logarithmic in frequency above it."""
 
 
 def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
@@ -44,13 +44,9 @@ def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: fl
 
     Sounds at rates that browsers do not play are resampled by a whole factor. Raises EvaluationError.
     """
-    samples = sound.double().numpy() * gain
-    factor = max(1, int(np.ceil(_LEAST_RATE / sample_rate)))
-    if factor > 1:
-        samples = resample_poly(samples, factor, 1)
-    peak = float(np.abs(samples).max(initial=0.0))
-    if peak > _FULL:
-        samples = samples * (_FULL / peak)
+    factor = max(1, int(np.ceil(_MIN_RATE_HZ / sample_rate)))
+    samples = resample_poly(sound.double().numpy() * gain, factor, 1)
+    samples = samples * min(1.0, _FULL_SCALE / max(float(np.abs(samples).max(initial=0.0)), _FULL_SCALE))
     memory = io.BytesIO()
     soundfile.write(memory, samples, round(sample_rate * factor), subtype="PCM_16", format="FLAC")
     write_whole(path, memory.getvalue(), raising=EvaluationError)
@@ -79,20 +75,18 @@ class StoredSound:
     @property
     def lowest(self) -> float:
         """Hz at the lower edge of its picture; the upper one is half the sample rate."""
-        return min(_LOWEST, self.sample_rate / 100)
+        return min(_LOWEST_HZ, self.sample_rate / 100)
 
     @cached_property
     def levels(self) -> Float64[Tensor, "height width"]:
         """Levels of its picture, dB."""
-        highest = self.sample_rate / 2
-        return log_spectrogram(
-            self.samples, sample_rate=self.sample_rate, lowest=self.lowest, highest=highest, width=240, height=120
-        )
+        band = {"lowest": self.lowest, "highest": self.sample_rate / 2}
+        return log_spectrogram(self.samples, sample_rate=self.sample_rate, width=240, height=120, **band)
 
     @property
     def address(self) -> str:
         """The file as an address that a page plays without any network."""
-        return f"data:audio/flac;base64,{base64.b64encode(self.content).decode()}"
+        return _address("audio/flac", self.content)
 
 
 def draw_spectrogram(sound: StoredSound, *, loudest: float) -> str:
@@ -106,7 +100,11 @@ def draw_spectrogram(sound: StoredSound, *, loudest: float) -> str:
     picture.putpalette(colors.tobytes())
     memory = io.BytesIO()
     picture.save(memory, format="PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(memory.getvalue()).decode()}"
+    return _address("image/png", memory.getvalue())
+
+
+def _address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,11 +122,6 @@ class StoredContact:
 def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
     """Yield an object's contacts with stored sounds."""
     files = {name: file for case in reversed(record.cases) for name, file in case.sounds.items()}
+    pairs = [(case, each) for case in record.cases for each in record.outcomes if each.case == case.key]
     for name, file in files.items():
-        made = tuple(
-            (case, each)
-            for case in record.cases
-            for each in record.outcomes
-            if each.case == case.key and name in each.sounds
-        )
-        yield StoredContact(record, name, file, made)
+        yield StoredContact(record, name, file, tuple(pair for pair in pairs if name in pair[1].sounds))

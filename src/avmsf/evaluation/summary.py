@@ -7,15 +7,18 @@ paper's tables allow, is given too.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, geometric_mean, stdev
-from typing import Any
+from typing import Any, TypeVar
 
 from avmsf.evaluation.registry import BASELINE, METRICS
 from avmsf.evaluation.results import ObjectRecord, Outcome
 
-Values = Mapping[str, Mapping[str, Mapping[str, float]]]
+Value = TypeVar("Value")
+Table = Mapping[str, Mapping[str, Value]]
+"""By method and metric."""
+Values = Mapping[str, Table[float]]
 """By object, method and metric."""
 
 
@@ -52,19 +55,17 @@ def object_values(record: ObjectRecord, label: str) -> dict[str, dict[str, float
     A method that failed in any of the experiment's parts has none.
     """
     keys = {case.key for case in record.cases if case.label == label}
-    figures = {}
+    table = {}
     for method in dict.fromkeys(each.method for each in record.outcomes):
         outcomes = [each for each in record.outcomes if each.method == method and each.case in keys]
         if len(outcomes) < len(keys) or any(each.failure is not None for each in outcomes):
             continue
         found: dict[str, list[float]] = {}
         for each in outcomes:
-            for metric, values in each.values.items():
+            for metric, values in (*each.values.items(), *((name, (one,)) for name, one in each.figures.items())):
                 found.setdefault(metric, []).extend(value for value in values if value is not None)
-            for metric, figure in each.figures.items():
-                found.setdefault(metric, []).extend([] if figure is None else [figure])
-        figures[method] = {metric: math.fsum(values) / len(values) for metric, values in found.items() if values}
-    return figures
+        table[method] = {metric: math.fsum(values) / len(values) for metric, values in found.items() if values}
+    return table
 
 
 def values_of(records: Iterable[ObjectRecord], label: str) -> dict[str, dict[str, dict[str, float]]]:
@@ -87,13 +88,12 @@ def ratios(table: Values, *, of_means: bool = False) -> dict[str, dict[str, floa
     """Return the geometric means of the ratios to the baseline, object by object, or the ratios `of_means`."""
     found: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for figures in table.values():
+        known = {metric: value for metric, value in figures.get(BASELINE, {}).items() if value > 0}
         for method, values in figures.items():
-            for metric, own in values.items():
-                other = figures.get(BASELINE, {}).get(metric, 0.0)
-                if other > 0:
-                    pairs = found.setdefault(method, {})
-                    if not is_rising(metric):
-                        pairs.setdefault(metric, []).append((own, other))
+            for metric in (each for each in values if each in known):
+                pairs = found.setdefault(method, {})
+                if not is_rising(metric):
+                    pairs.setdefault(metric, []).append((values[metric], known[metric]))
     return {
         method: {metric: _ratio(*zip(*each, strict=True), of_means=of_means) for metric, each in values.items()}
         for method, values in found.items()
@@ -130,20 +130,22 @@ def summarize(
         "test_contacts": sum(
             len({name for case in each.cases if case.label in labels[:1] for name in case.test}) for each in records
         ),
-        "methods": _plain(found, lambda each: each.mean),
-        "standard_errors": _plain(found, lambda each: each.standard_error),
+        "methods": _plain(found),
+        "standard_errors": _plain(found, "standard_error"),
         "counts": {method: max(each.objects for each in figures.values()) for method, figures in found.items()},
         f"ratio_to_{BASELINE}": ratios(main),
         f"ratio_of_means_to_{BASELINE}": ratios(main, of_means=True),
-        "cases": {label: _plain(means(table), lambda each: each.mean) for label, table in tables.items()},
+        "cases": {label: _plain(means(table)) for label, table in tables.items()},
         "subsets": {
-            name: {"objects": len(table), "methods": _plain(means(table), lambda each: each.mean)}
-            for name, table in parts.items()
-            if table
+            name: {"objects": len(table), "methods": _plain(means(table))} for name, table in parts.items() if table
         },
         "failures": failures_of(records),
         "missing": {name: list(methods) for name, methods in (missing or {}).items()},
     }
+
+
+def _plain(table: Table[Mean], name: str = "mean") -> dict[str, dict[str, Any]]:
+    return {method: {metric: getattr(each, name) for metric, each in row.items()} for method, row in table.items()}
 
 
 def missing_of(records: Iterable[ObjectRecord], wanted: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -151,8 +153,7 @@ def missing_of(records: Iterable[ObjectRecord], wanted: Mapping[str, Sequence[st
 
     A failure is an outcome. Objects that lack nothing are left out.
     """
-    known = {record.identifier: record for record in records}
-    missing = {}
+    known, missing = {record.identifier: record for record in records}, {}
     for name, methods in wanted.items():
         record = known.get(name)
         if record is None:
@@ -166,38 +167,35 @@ def missing_of(records: Iterable[ObjectRecord], wanted: Mapping[str, Sequence[st
 def failures_of(records: Iterable[ObjectRecord]) -> list[dict[str, str | None]]:
     """Return the failures with their reasons, each in one line."""
     found: list[dict[str, str | None]] = []
+
+    def add(failed: ObjectRecord | Outcome, name: str, case: str | None, method: str | None) -> None:
+        if failed.failure is not None:
+            reason = failed.failure.partition("\n")[0]
+            found.append({"object": name, "case": case, "method": method, "failure": reason})
+
     for record in records:
-        if record.failure is not None:
-            found.append({"object": record.identifier, "case": None, "method": None, "failure": _reason(record)})
+        add(record, record.identifier, None, None)
         order = {case.key: number for number, case in enumerate(record.cases)}
-        failed = [each for each in record.outcomes if each.failure is not None]
-        found += [
-            {"object": record.identifier, "case": each.case, "method": each.method, "failure": _reason(each)}
-            for each in sorted(failed, key=lambda each: (order.get(each.case, len(order)), each.method))
-        ]
+        for each in sorted(record.outcomes, key=lambda each: (order.get(each.case, len(order)), each.method)):
+            add(each, record.identifier, each.case, each.method)
     return found
-
-
-def _reason(failed: ObjectRecord | Outcome) -> str:
-    return (failed.failure or "").partition("\n")[0]
 
 
 def times_of(records: Iterable[ObjectRecord]) -> dict[str, dict[str, Any]]:
     """Return each object's seconds: what methods share, and each method's to fit and to render all test contacts."""
-    return {
-        record.identifier: {
+    times = {}
+    for record in records:
+        methods: dict[str, list[Outcome]] = {}
+        for each in record.outcomes:
+            methods.setdefault(each.method, []).append(each)
+        times[record.identifier] = {
             "shared": math.fsum(case.shared_seconds for case in record.cases),
             "methods": {
                 method: {
-                    "fit": math.fsum(each.fit_seconds for each in record.outcomes if each.method == method),
-                    "render": math.fsum(each.render_seconds for each in record.outcomes if each.method == method),
+                    "fit": math.fsum(each.fit_seconds for each in outcomes),
+                    "render": math.fsum(each.render_seconds for each in outcomes),
                 }
-                for method in dict.fromkeys(each.method for each in record.outcomes)
+                for method, outcomes in methods.items()
             },
         }
-        for record in records
-    }
-
-
-def _plain(figures: Mapping[str, Mapping[str, Mean]], read: Callable[[Mean], Any]) -> dict[str, dict[str, Any]]:
-    return {method: {metric: read(each) for metric, each in values.items()} for method, values in figures.items()}
+    return times

@@ -21,10 +21,6 @@ Contacts = Float[Tensor, "contacts 3"]
 """Points in the object frame, meters; or as directions, unit vectors."""
 Sounds = Float[Tensor, "contacts samples"]
 Amplitudes = Complex[Tensor, "contacts modes"]
-_WANTED = (
-    "an object with a number `sample_rate` (Hz) and a method `render(self, contacts, *, directions=None)` that returns "
-    "sounds [contacts, samples]"
-)
 
 
 @runtime_checkable
@@ -49,28 +45,31 @@ class Renderer(Protocol):
 
 def expect_renderer(given: Any) -> Renderer:
     """Return `given`, or raise EvaluationError that says what a renderer has unless it is one."""
+    kind = given if isinstance(given, type) else type(given)
+    lacking = [each for each in ("sample_rate", "render") if not hasattr(given, each)]
     fault = advice = ""
-    rate: Any = getattr(given, "sample_rate", None)
     if isinstance(given, type):
-        fault = f"the class {given.__name__}"
-        advice = "make an object of it, or give the training recordings as `train`"
-    elif not isinstance(given, Renderer):
-        lacking = [f"`{each}`" for each in ("sample_rate", "render") if not hasattr(given, each)]
-        fault = f"{type(given).__name__} without {' and '.join(lacking)}"
-    elif not isinstance(rate, int | float | np.number):
-        fault = f"{type(given).__name__} whose `sample_rate` is a {type(rate).__name__}"
+        fault, advice = "the class itself", "make an object of it, or give the training recordings as `train`"
+    elif lacking:
+        fault = f"one without {' and '.join(lacking)}"
+    elif not isinstance(given.sample_rate, int | float | np.number):
+        fault = f"one whose `sample_rate` is a {type(given.sample_rate).__name__}"
     else:
         try:
             inspect.signature(given.render).bind(None, directions=None)
         except ValueError:  # a compiled method has no signature to look at
             pass
         except TypeError as error:
-            fault = f"{type(given).__name__} whose `render` does not take these arguments ({error})"
-    if fault:
-        kind = given if isinstance(given, type) else type(given)
-        raise EvaluationError.expected(_WANTED, kind.__name__, got=fault, name="renderer", advice=advice)
-    renderer: Renderer = given
-    return renderer
+            fault = f"one whose `render` does not take these arguments ({error})"
+    if not fault:
+        renderer: Renderer = given
+        return renderer
+    wanted = (
+        "an object with a number `sample_rate` (Hz) and a method `render(self, contacts, *, directions=None)` that "
+        "returns sounds [contacts, samples]"
+    )
+    got = f"{kind.__name__}, {fault}"
+    raise EvaluationError.expected(wanted, kind.__name__, got=got, name="renderer", advice=advice)
 
 
 def report_of(renderer: Renderer) -> dict[str, Any]:

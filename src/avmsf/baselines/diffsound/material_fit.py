@@ -49,7 +49,7 @@ _TRANSPORT_RATE, _DIFFERENCE_RATE = 1e-3, 2e-3
 _TRANSPORT_DECAY, _DIFFERENCE_DECAY = 0.9, 0.95
 """Adam's rates, and their factor after each tenth and each twentieth of a stage."""
 _PUBLISHED_STEPS = 1000, 2000
-_LONGEST = 0.005
+_MAX_RATE = 0.005
 """Longest steps of a descent by differences: longer ones leave the basin that they start in."""
 _FASTEST_DECAY = 300.0
 """Largest damping of modes that the damping curve is made of, 1/s."""
@@ -191,15 +191,29 @@ def fit_material(
         lowest = float(family.bodies[0].modes(starts[0]).frequency[0])
         wanted, got = f"modes from {BAND[0]:g} to {BAND[1]:g} Hz", f"a lowest mode at {lowest:.3g} Hz"
         raise EvaluationError.expected(wanted, lowest, got=got, name="frequency", advice="give the mesh's unit")
-    best = problem.transported(best, config.transport_steps)
-    best = problem.descended(best, config.difference_steps)
+    count, steps = len(spectra.clips), config.transport_steps
+    best, _ = problem.descended(
+        best,
+        lambda point, step: spectra.transport(*problem.sound(point), row=step % count),
+        steps,
+        rate=_TRANSPORT_RATE * _PUBLISHED_STEPS[0] / max(steps, 1),
+        decay=_TRANSPORT_DECAY ** (10.0 / max(steps, 1)),
+    )
+    steps = config.difference_steps
+    _, best = problem.descended(
+        best,
+        lambda point, step: spectra.difference(problem.sound(point)[0]),
+        steps,
+        rate=min(_DIFFERENCE_RATE * _PUBLISHED_STEPS[1] / max(steps, 1), _MAX_RATE),
+        decay=_DIFFERENCE_DECAY ** (20.0 / max(steps, 1)),
+    )
     if config.search:
-        best = problem.searched(best, config.search)
+        best = minimize_within(problem.bounds, problem.loss, best, generations=config.search)
         for _ in range(_ROUNDS if family.walled else 0):
             # Between thicknesses frequencies are interpolated; at one that is computed they are exact.
             family = family.including(float(best[2].exp()))
             problem = replace(problem, family=family, bounds=_around(best, problem.bounds))
-            best = problem.searched(best, config.search // 2)
+            best = minimize_within(problem.bounds, problem.loss, best, generations=config.search // 2)
     thickness = float(best[2].exp()) if family.walled else family.thickness[0] if family.thickness else None
     return MaterialFit(float(best[0].exp()), float(best[1]), thickness, problem.loss(best), family.at(thickness))
 
@@ -224,10 +238,6 @@ def _around(point: Float64[Tensor, "3"], bounds: Float64[Tensor, "2 3"]) -> Floa
     return torch.stack([torch.maximum(point - reach, bounds[0]), torch.minimum(point + reach, bounds[1])])
 
 
-_Loss = Callable[[Float64[Tensor, "3"], int], Float[Tensor, ""]]
-"""Of a point, at a step."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Clips, dampings and bodies. A point is log(E / rho), Poisson's ratio and log(thickness)."""
@@ -250,40 +260,16 @@ class _Problem:
             except EvaluationError:
                 return math.inf
 
-    def transported(self, start: Float64[Tensor, "3"], steps: int) -> Float64[Tensor, "3"]:
-        """Return where a descent by optimal transport ends."""
-
-        def loss(point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
-            sound, audible = self.sound(point)
-            return self.spectra.transport(sound, audible, row=step % len(self.spectra.clips))
-
-        rate = _TRANSPORT_RATE * _PUBLISHED_STEPS[0] / max(steps, 1)
-        return self._descend(start, loss, steps, rate=rate, decay=_TRANSPORT_DECAY ** (10.0 / max(steps, 1)))[0]
-
-    def descended(self, start: Float64[Tensor, "3"], steps: int) -> Float64[Tensor, "3"]:
-        """Return the best place on a descent by differences of spectra."""
-
-        def loss(point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
-            return self.spectra.difference(self.sound(point)[0])
-
-        rate = min(_DIFFERENCE_RATE * _PUBLISHED_STEPS[1] / max(steps, 1), _LONGEST)
-        return self._descend(start, loss, steps, rate=rate, decay=_DIFFERENCE_DECAY ** (20.0 / max(steps, 1)))[1]
-
-    def searched(self, start: Float64[Tensor, "3"], generations: int) -> Float64[Tensor, "3"]:
-        """Return the place of the least difference within the bounds, as far as differential evolution finds it."""
-        # Just inside: scipy refuses a start on a bound that rounding puts outside.
-        low, high = self.bounds
-        inside = start.clamp(low + _INSIDE * (high - low), high - _INSIDE * (high - low))
-        found = scipy.optimize.differential_evolution(
-            lambda values: self.loss(torch.from_numpy(values)), self.bounds.T.numpy(), x0=inside.numpy(),
-            popsize=_POPULATION, maxiter=generations, polish=False, rng=0,
-        )  # fmt: skip
-        return torch.from_numpy(found.x)
-
-    def _descend(
-        self, start: Float64[Tensor, "3"], loss: _Loss, steps: int, *, rate: float, decay: float
+    def descended(
+        self,
+        start: Float64[Tensor, "3"],
+        loss: Callable[[Float64[Tensor, "3"], int], Float[Tensor, ""]],
+        steps: int,
+        *,
+        rate: float,
+        decay: float,
     ) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
-        """Return where Adam ends, and the place on the way where the loss was least."""
+        """Return where Adam ends on the loss of a point at a step, and the place on the way where it was least."""
         point = start.clone().requires_grad_()
         optimizer = torch.optim.Adam([point], lr=rate)
         schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, decay)
@@ -303,3 +289,21 @@ class _Problem:
             with torch.no_grad():
                 point.clamp_(*self.bounds)
         return point.detach(), kept
+
+
+def minimize_within(
+    bounds: Float64[Tensor, "2 dim"],
+    loss: Callable[[Float64[Tensor, " dim"]], float],
+    start: Float64[Tensor, " dim"],
+    *,
+    generations: int,
+) -> Float64[Tensor, " dim"]:
+    """Return the point of least loss between two others, as far as differential evolution finds it from a start."""
+    # Just inside: scipy refuses a start on a bound that rounding puts outside.
+    low, high = bounds
+    inside = start.clamp(low + _INSIDE * (high - low), high - _INSIDE * (high - low))
+    found = scipy.optimize.differential_evolution(
+        lambda values: loss(torch.from_numpy(values)), bounds.T.numpy(), x0=inside.numpy(),
+        popsize=_POPULATION, maxiter=generations, polish=False, rng=0,
+    )  # fmt: skip
+    return torch.from_numpy(found.x)

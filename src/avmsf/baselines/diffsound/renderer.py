@@ -11,7 +11,7 @@ publish neither gains by position nor a level; Li et al. compare with "position-
 the object's vibration modes" and add their learned residual noise, as here."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -62,8 +62,11 @@ class DiffSound:
     """Hz."""
     samples: int
     """Length of rendered sounds."""
-    report: dict[str, Any] = field(default_factory=dict)
-    """What was fitted, as plain values."""
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What was fitted, as plain values."""
+        return {name: getattr(self.fit, name) for name in ("stiffness", "poisson", "thickness", "difference")}
 
     def gains(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
@@ -119,10 +122,8 @@ def fit_diffsound(
 
     Raises EvaluationError as `clip_spectra`, `DampingCurve.of` and `fit_material` do.
     """
-    return leveled(
-        _fitted(train, family, extraction, config), DampingCurve.of(extraction.bank), train, extraction.residual,
-        weighted=weighted,
-    )  # fmt: skip
+    found, curve = _fitted(train, family, extraction, config), DampingCurve.of(extraction.bank)
+    return leveled(found, curve, train, extraction.residual, weighted=weighted)
 
 
 @lru_cache(maxsize=1)
@@ -146,10 +147,7 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
     elastic = replace(elastic, frequency=elastic.frequency[inside], shapes=elastic.shapes[:, inside].contiguous())
     bank = ModalBank(audible[inside], damping[inside])
     weight = _weights(_displacements(elastic, bank, train.contacts, train.directions), bank, train, weighted=weighted)
-    report = {
-        "stiffness": fit.stiffness, "poisson": fit.poisson, "thickness": fit.thickness, "difference": fit.difference,
-    }  # fmt: skip
-    return DiffSound(fit, elastic, bank, weight, residual, train.sample_rate, train.sounds.shape[1], report)
+    return DiffSound(fit, elastic, bank, weight, residual, train.sample_rate, train.sounds.shape[1])
 
 
 def _displacements(
@@ -178,8 +176,8 @@ def _weights(
     )  # fmt: skip
     size = scaled_fft_size(_FFT_SIZE, sample_rate=train.sample_rate)
     own = magnitude_stft(atoms, fft_size=size, hop=size // 4).flatten(1)
-    inner, gram, products = own @ own.T, torch.zeros(len(bank), len(bank), dtype=torch.float64), torch.zeros(len(bank))
-    products = products.double()
+    inner = own @ own.T
+    gram, products = torch.zeros_like(inner), torch.zeros(len(bank), dtype=torch.float64)
     for sound, row in zip(train.sounds.detach().cpu().double(), displacements.abs(), strict=True):
         recorded = magnitude_stft(sound[None], fft_size=size, hop=size // 4).flatten()
         gram += row[:, None] * row * inner

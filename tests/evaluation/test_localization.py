@@ -162,7 +162,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
         ObjectInputs, "features", lambda inputs, *given, **named: PlateInputs().features(*given, **named)
     )
     monkeypatch.setattr(FieldMethod, "fit", quick)
-    monkeypatch.setattr("avmsf.evaluation.case_run.located", watched)
+    monkeypatch.setattr("avmsf.evaluation.runner.located", watched)
     monkeypatch.setattr(report, "draw_contact", draw)
     words = ["evaluate", "localize", str(data), "--objects", "a", "--methods", "field-auto,paper-grid,paper,nearest"]
     words += ["--set", "lift.encoder=descriptors", "--output", str(results), "--figures"]

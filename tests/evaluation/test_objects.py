@@ -1,4 +1,4 @@
-"""What a dataset's objects look like is made once, from the views that were asked for."""
+"""What methods read of a dataset's objects is made once, from the views that were asked for."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +11,10 @@ from avmsf.capture.filenames import SPLATS
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
+from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset, VisualSource
-from avmsf.errors import SceneError
-from avmsf.evaluation.objects import ObjectInputs
+from avmsf.errors import EvaluationError, SceneError
+from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
@@ -22,6 +23,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.views import find_source
+from factories.plate_set import fill_plates
 from factories.raising import raises
 from factories.small_scene import slab, slab_views, write_surface_file
 
@@ -54,7 +56,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_looks_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
+def test_features_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
     inputs = ObjectInputs(OneObject(seen), tmp_path, CONFIG)
     aligned, bare, unaligned = (
         inputs.features("slab", visual_input) for visual_input in ("visual", "positions", "unaligned")
@@ -121,10 +123,8 @@ def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> Non
 def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) -> None:
     write_views(slab_views(), tmp_path)
     write_surface_file(tmp_path)
-    best, mesh = (find_source(tmp_path, CaptureSettings(), prefer=each) for each in ("best", "mesh"))
-    assert best is not None
-    assert mesh is not None
-    assert (best.kind, mesh.kind) == ("cameras", "mesh")
+    found = (find_source(tmp_path, CaptureSettings(), prefer=each) for each in ("best", "mesh"))
+    assert [source and source.kind for source in found] == ["cameras", "mesh"]
 
 
 def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Path) -> None:
@@ -137,3 +137,20 @@ def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Pat
 def test_the_surface_is_that_of_the_views_where_a_mesh_does_not_count(seen: Path, tmp_path: Path) -> None:
     inputs = ObjectInputs(OneObject(seen, slab()), tmp_path, CONFIG, geometry="gaussians")
     assert torch.equal(inputs.features("slab", "surface").points, inputs.features("slab", "positions").points)
+
+
+def test_another_recording_is_of_another_object_at_this_ones_rate_and_length(tmp_path: Path) -> None:
+    dataset = CaptureCollection(fill_plates(tmp_path))
+    train = dataset.capture("a").impacts
+    drawn = draw_other_recording(dataset, "a", train, seed=3)
+    others = torch.cat([dataset.capture(name).impacts.sounds for name in "bc"])
+    assert (others == drawn).all(dim=1).any()
+    assert torch.equal(drawn, draw_other_recording(dataset, "a", train, seed=3))
+    assert any(not torch.equal(drawn, draw_other_recording(dataset, "a", train, seed=seed)) for seed in range(4, 8))
+    # Half the rate and twice the length: resampled, then silence.
+    slow = replace(train, sample_rate=4000.0, sounds=torch.zeros(10, 1500))
+    drawn = draw_other_recording(dataset, "a", slow, seed=3)
+    assert drawn.shape == (1500,)
+    assert float(drawn[1001:].abs().max()) == 0.0 < float(drawn[:1000].abs().max())
+    with raises(EvaluationError, name="a"):
+        draw_other_recording(CaptureCollection(tmp_path / "a"), "a", train, seed=0)

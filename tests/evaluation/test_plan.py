@@ -1,4 +1,4 @@
-"""The paper's method in an evaluation: its own extraction, its features, and an encoder that is never replaced."""
+"""The paper's method in an evaluation, and encoders that are loaded once and never replaced unsaid."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,20 +9,14 @@ import torch
 
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
-from avmsf.evaluation.case_run import Evaluation
-from avmsf.evaluation.field_methods import NETWORK, FieldMethod
 from avmsf.evaluation.methods import method_named
-from avmsf.evaluation.plan import available_encoders, visual_inputs
-from avmsf.evaluation.registry import PROTOCOLS
+from avmsf.evaluation.plan import Evaluation, available_encoders, visual_inputs
+from avmsf.evaluation.registry import PROTOCOLS, MetricSettings
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.scores import MetricSettings
-from avmsf.evaluation.task import Task
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.encoder import Encoder
-from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.pipeline.features import DinoEncoder
-from factories.plate_field import QUICK, plate_features, plate_impacts
 from factories.plate_set import PlateInputs
 from factories.raising import raises
 
@@ -30,48 +24,20 @@ from factories.raising import raises
 @pytest.mark.parametrize(
     ("name", "damping"), [("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")]
 )
-def test_the_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
+def test_the_papers_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
     field: Any = method_named(name)
     preset = PRESETS["paper"]
     assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
     assert (field.visual_input, field.published) == ("paper", True)
 
 
-def test_a_method_may_find_modes_in_its_own_way() -> None:
-    impacts = plate_impacts()
-
-    def shared() -> Any:
-        raise AssertionError("the shared modes were asked for")
-
-    task = Task(
-        name="plate",
-        train=impacts,
-        contacts=impacts.contacts,
-        names=impacts.names,
-        seed=0,
-        modes=shared,
-        features=lambda look: plate_features(),
-        bodies=shared,
-        other_recording=shared,
-        family=shared,
-        gaussians=shared,
-    )
-    pipeline = replace(NETWORK, extraction="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
-    field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
-    expected = ShortTime().find(impacts.sounds, impacts.sample_rate)
-    assert torch.allclose(field.bank.frequency, expected.frequency)
-
-
-@pytest.fixture
-def no_dino(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def missing(*_: Any, **__: Any) -> DinoEncoder:
         raise SceneError("facebook/dinov2-base: no weights", value="facebook/dinov2-base")
 
     monkeypatch.setattr(DinoEncoder, "load", missing)
-
-
-@pytest.mark.usefixtures("no_dino")
-def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere() -> None:
     said = list[str]()
     with raises(SceneError, value="facebook/dinov2-base"):
         available_encoders(LiftConfig(), {"visual", "paper"}, log=said.append)
@@ -97,10 +63,10 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
 
     read = read_by("farthest", "knn3", "white-noise", "diffsound")
     assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0] == LiftConfig()
-    assert available_encoders(LiftConfig(), read_by("localize", "field-auto"), log=said.append)[0] == LiftConfig()
-    assert loaded == []
     # Recordings are located at the points that features have.
-    assert read_by("localize", "nearest") == {"surface"}
+    assert read_by("localize", "nearest") == read_by("localize", "field-auto") == {"surface"}
+    assert available_encoders(LiftConfig(), {"surface"}, log=said.append)[0] == LiftConfig()
+    assert loaded == []
     read = read_by("farthest", "field", "field-auto", "paper-grid")
     assert read == {"visual", "surface", "paper"}
     assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0].encoder == DINO
@@ -109,9 +75,10 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
 
 def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path) -> None:
     def begin(name: str, encoder: str | None) -> None:
+        methods, settings = (method_named(name),), MetricSettings(cdpam=False)
         evaluation = Evaluation(
-            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], (method_named(name),), PlateInputs(),
-            metric_settings=MetricSettings(cdpam=False), encoder=encoder,
+            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], methods, PlateInputs(),
+            metric_settings=settings, encoder=encoder,
         )  # fmt: skip
         evaluation.begin(ResultsFolder(tmp_path / "results"))
 

@@ -1,0 +1,212 @@
+"""Training and test never mix, whatever the protocol; contacts are counted and chosen with all their recordings."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import torch
+
+from avmsf.capture.impacts import Impacts
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.registry import BASELINE, METHODS, PROTOCOLS, protocol_named
+from avmsf.evaluation.splits import (
+    Choosing,
+    Closest,
+    DistinctContacts,
+    Farthest,
+    FewerViews,
+    LeaveOneOut,
+    Predefined,
+    Shots,
+    evenly_spaced,
+    split,
+)
+from avmsf.gaussians.points import farthest_points
+from factories.plate_field import plate_impacts
+from factories.raising import raises
+
+COUNT = 20
+
+
+def struck(count: int = COUNT, *, repeated: tuple[int, ...] = ()) -> Impacts:
+    """Return impacts on a plate, some contacts of which are struck once more at the end."""
+    impacts = plate_impacts(count, seconds=0.02)
+    rows = [*range(count), *repeated]
+    return replace(impacts.take(rows), names=tuple(f"{number:02d}" for number in range(len(rows))))
+
+
+def grid(*, apart: float = 0.0, times: int = 3) -> Impacts:
+    """Return impacts on a grid of 20 contacts, each struck several times, `apart` diagonals from each other.
+
+    Recordings of one contact are not next to each other in the table.
+    """
+    points = torch.cartesian_prod(torch.arange(5.0), torch.arange(4.0)).double()
+    contacts = torch.cat([points, torch.zeros(COUNT, 1, dtype=torch.float64)], dim=1).repeat(times, 1)
+    contacts[:, 2] = 5.0 * apart * torch.arange(times, dtype=torch.float64).repeat_interleave(COUNT)
+    sounds = torch.zeros(len(contacts), 4)
+    return Impacts(contacts, sounds, 8000.0, tuple(f"{row:02d}.wav" for row in range(len(contacts))))
+
+
+@pytest.mark.parametrize("repeated", [(), (0, 5, 5, 11)])
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_training_and_test_contacts_never_mix(name: str, repeated: tuple[int, ...]) -> None:
+    impacts = struck(repeated=repeated)
+    choosing = Predefined(("03", "05", "19")) if name == "predefined" else PROTOCOLS[name].choosing
+    cases = choosing.cases(impacts)
+    assert len({case.key for case in cases}) == len(cases) > 0
+    for case in cases:
+        assert case.train
+        assert case.test
+        assert len(set(case.train)) == len(case.train)
+        assert list(case.test) == sorted(set(case.test))
+        train, test = (set(map(tuple, impacts.contacts[list(rows)].tolist())) for rows in (case.train, case.test))
+        assert not train & test
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.002])
+@pytest.mark.parametrize("choosing", [Farthest(), Closest(), LeaveOneOut(), Shots(), Shots((3, 2), starts=2)], ids=repr)
+def test_recordings_of_one_contact_stay_on_one_side(choosing: Choosing, apart: float) -> None:
+    cases = choosing.cases(grid(apart=apart))
+    for case in cases:
+        assert {row % COUNT for row in case.train}.isdisjoint(row % COUNT for row in case.test)
+        contacts = len({row % COUNT for row in case.train})
+        assert len(case.train) == 3 * contacts
+        if case.label.split()[0].isdecimal():
+            assert contacts == int(case.label.split()[0])
+    # The contacts are those that are chosen where each is struck once.
+    once = [case.train for case in choosing.cases(grid(times=1))]
+    assert [tuple(row for row in case.train if row < COUNT) for case in cases] == once
+
+
+@pytest.mark.parametrize("times", [1, 2, 5])
+def test_a_fraction_is_of_contacts(times: int) -> None:
+    for fraction, count in ((0.5, 10), (0.3, 6), (0.9, 18)):
+        train, test = split(grid(times=times), fraction)
+        assert (len(train), len(test)) == (count * times, (COUNT - count) * times)
+        for choosing in (Farthest(fraction), Closest(fraction)):
+            (case,) = choosing.cases(grid(times=times))
+            assert len(case.train) == count * times
+
+
+def test_contacts_farther_apart_than_measurement_errors_are_distinct() -> None:
+    assert len(DistinctContacts.of(grid(apart=0.02)).rows) == 3 * COUNT
+    assert len(DistinctContacts.of(grid(apart=0.002)).rows) == COUNT
+
+
+def test_a_split_trains_on_farthest_points_and_tests_on_the_rest() -> None:
+    impacts = struck(30)
+    train, test = split(impacts, 0.2, start=3)
+    assert train.names == tuple(impacts.names[row] for row in farthest_points(impacts.contacts, 6, start=3).tolist())
+    assert list(test.names) == sorted(set(impacts.names) - set(train.names))
+    assert torch.equal(train.sounds[0], impacts.sounds[3])
+    assert split(impacts, 5, start=3)[0].names == train.names[:5]
+    assert len(split(struck(4), 0.2)[0]) == 2
+    # Any recording of a contact may be the first.
+    starts = [split(grid(), 5, start=row)[0].names for row in (7, 27, 47)]
+    assert starts[0] == starts[1] == starts[2]
+    assert starts[0][0] == "07.wav"
+
+
+@pytest.mark.parametrize("repeated", [(), (0, 5, 5, 11)])
+def test_farthest_is_the_split_that_all_other_commands_make(repeated: tuple[int, ...]) -> None:
+    impacts = struck(repeated=repeated)
+    (case,) = Farthest().cases(impacts)
+    assert (impacts.take(case.train).names, impacts.take(case.test).names) == tuple(
+        part.names for part in split(impacts, 0.2)
+    )
+
+
+def test_closest_takes_the_ball_around_the_first_contact() -> None:
+    impacts = struck()
+    (case,) = Closest(0.3).cases(impacts)
+    distance = (impacts.contacts - impacts.contacts[0]).norm(dim=1)
+    assert case.train[0] == 0
+    assert len(case.train) == 6
+    assert float(distance[list(case.train)].max()) < float(distance[list(case.test)].min())
+
+
+def test_leave_one_out_tests_every_impact_once() -> None:
+    cases = LeaveOneOut().cases(struck(6, repeated=(2,)))
+    assert sorted(row for case in cases for row in case.test) == list(range(7))
+    assert cases[2].test == (2, 6)
+    assert all(len(case.train) + len(case.test) == 7 for case in cases)
+    assert {case.label for case in cases} == {"leave-one-out"}
+
+
+def test_a_predefined_split_tests_the_named_recordings_and_trains_on_all_at_other_contacts() -> None:
+    impacts = struck(6, repeated=(2, 4))
+    (case,) = Predefined(("02", "05")).cases(impacts)
+    assert [impacts.names[row] for row in case.test] == ["02", "05"]
+    # 06 is at the contact of 02.
+    assert {impacts.names[row] for row in case.train} == {"00", "01", "03", "04", "07"}
+
+
+def test_shots_are_nested_and_scored_at_the_same_contacts() -> None:
+    cases = Shots().cases(struck())
+    assert [case.label for case in cases] == ["16 shots", "8 shots", "4 shots", "2 shots", "1 shot"]
+    assert [len(case.train) for case in cases] == [16, 8, 4, 2, 1]
+    for more, fewer in pairwise(cases):
+        assert more.train[: len(fewer.train)] == fewer.train
+    assert {case.test for case in cases} == {tuple(sorted(set(range(COUNT)) - set(cases[0].train)))}
+    assert [case.label for case in Shots().cases(struck(5))] == ["4 shots", "2 shots", "1 shot"]
+
+
+def test_shots_from_several_starts_have_test_contacts_of_their_own() -> None:
+    impacts = struck()
+    cases = Shots((6, 3), starts=2).cases(impacts)
+    assert len({case.key for case in cases}) == 4
+    for first, own in ((0, cases[:2]), (10, cases[2:])):
+        assert {case.fold for case in own} == {f"from {impacts.names[first]}"}
+        assert own[0].train[0] == own[1].train[0] == first
+        assert own[0].test == own[1].test == tuple(sorted(set(range(COUNT)) - set(own[0].train)))
+
+
+def test_fewer_views_change_nothing_but_the_views() -> None:
+    every, few = FewerViews().cases(struck())
+    assert (every.views, few.views) == (None, 12)
+    assert (
+        replace(few, label="farthest", views=None) == replace(every, label="farthest") == Farthest().cases(struck())[0]
+    )
+
+
+LONELY = replace(struck(3), contacts=torch.zeros(3, 3, dtype=torch.float64))
+REFUSED: dict[str, tuple[Callable[[], Any], str, Any]] = {
+    "all contacts": (lambda: split(struck(10), 10), "count", 10),
+    "no contact": (lambda: split(struck(10), 0), "count", 0),
+    "a part of two contacts": (lambda: split(struck(10).take([0, 1, 0, 1, 0, 1]), 0.2), "count", 2),
+    "more than all": (lambda: split(struck(10), 1.5), "train_size", 1.5),
+    "a start that is not there": (lambda: split(struck(10), 0.2, start=10), "start", 10),
+    "no predefined test": (lambda: Predefined().cases(struck(6)), "count", 6),
+    "an unknown test": (lambda: Predefined(("02", "99")).cases(struck(6)), "test", "99"),
+    "no shot": (lambda: Shots((0, 3)), "counts", [0, 3]),
+    "no start": (lambda: Shots(starts=0), "starts", 0),
+    "farthest of one contact": (lambda: Farthest().cases(LONELY), "count", 2),
+    "closest of one contact": (lambda: Closest().cases(LONELY), "count", 2),
+    "one contact left out": (lambda: LeaveOneOut().cases(LONELY), "count", 0),
+    "shots of one contact": (lambda: Shots().cases(LONELY), "count", 1),
+    "an unknown protocol": (lambda: protocol_named("farhest"), "protocol", "farhest"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_be_split_is_refused(what: str) -> None:
+    call, name, value = REFUSED[what]
+    with raises(EvaluationError, name=name, value=value):
+        call()
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(10, 3), (3, 3), (2, 8), (7, 1), (33, 8)])
+def test_evenly_spaced_rows_are_distinct_and_within(count: int, wanted: int) -> None:
+    rows = evenly_spaced(count, wanted)
+    assert rows == sorted(set(rows))
+    assert len(rows) == min(count, wanted)
+    assert set(rows) <= set(range(count))
+
+
+def test_all_methods_of_all_protocols_are_known_and_the_baseline_takes_part() -> None:
+    for protocol in PROTOCOLS.values():
+        assert set(protocol.methods) <= set(METHODS)
+        # A mean waveform does not locate anything.
+        assert (BASELINE in protocol.methods) != protocol.locating
