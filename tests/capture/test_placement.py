@@ -72,14 +72,6 @@ def test_a_surface_in_millimeters_is_told_even_if_all_contacts_lie_near_one_of_i
     assert 'is the surface\'s unit "mm"?' in placement.describe()
 
 
-def test_contacts_close_together_on_the_surface_are_not_in_another_frame() -> None:
-    near = CLOUD[(CLOUD - CLOUD[0]).norm(dim=1).argsort()[:3]]
-    placement = check_placement(near, CLOUD)
-    assert placement.mismatch is None
-    assert placement.fault == "rows"
-    assert "different frames" not in placement.describe()
-
-
 EYE, HERE = torch.eye(3, dtype=torch.float64), (0.0, 0.0, 0.0)
 MISTAKES = {
     "inches": (0.0254, EYE, HERE, 'is their unit "in"?', True),
@@ -141,16 +133,6 @@ def test_contacts_of_another_object_are_not_explained() -> None:
     assert explained <= 1
 
 
-def test_contacts_at_one_position_lie_on_the_surface_or_not() -> None:
-    for offset, fault in ((0.0, "none"), (0.2, "frame")):
-        assert check_placement(CONTACTS[:1].repeat(9, 1) + offset, CLOUD).fault == fault
-
-
-def test_sparse_points_widen_the_tolerance() -> None:
-    corners = torch.tensor(trimesh.creation.box((0.2, 0.2, 0.2)).vertices)
-    assert check_placement(torch.tensor([[0.1, 0.02, 0.0], [0.0, 0.1, 0.0]]), corners).fault == "none"
-
-
 def test_a_surface_is_covered_by_points_always_the_same() -> None:
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     surface = Surface(torch.tensor(box.vertices).float(), torch.tensor(box.faces))
@@ -161,13 +143,30 @@ def test_a_surface_is_covered_by_points_always_the_same() -> None:
     assert check_placement(torch.tensor([[0.1, 0.013, -0.052], [0.03, -0.1, 0.02]]), points).distances.max() < 0.01
 
 
-def test_nothing_to_judge_is_refused() -> None:
-    with raises(CaptureError, name="contacts", value=0):
-        check_placement(torch.zeros(0, 3), CLOUD)
-    with raises(CaptureError, name="contacts", value=2):
-        check_placement(torch.full((2, 3), torch.nan), CLOUD)
-    with raises(CaptureError, name="points", value=0.0):
-        check_placement(CONTACTS, torch.ones(5, 3))
+def test_few_contacts_close_together_or_on_few_points_are_judged_too() -> None:
+    near = CLOUD[(CLOUD - CLOUD[0]).norm(dim=1).argsort()[:3]]
+    corners = torch.tensor(trimesh.creation.box((0.2, 0.2, 0.2)).vertices)
+    for contacts, points, fault in (
+        (CONTACTS[:1].repeat(9, 1), CLOUD, "none"),
+        (CONTACTS[:1].repeat(9, 1) + 0.2, CLOUD, "frame"),
+        # A spot that is too small, not another frame.
+        (near, CLOUD, "rows"),
+        (torch.tensor([[0.1, 0.02, 0.0], [0.0, 0.1, 0.0]]), corners, "none"),
+    ):
+        assert check_placement(contacts, points).fault == fault
+
+
+@pytest.mark.parametrize(
+    ("contacts", "points", "name", "value"),
+    [
+        (torch.zeros(0, 3), CLOUD, "contacts", 0),
+        (torch.full((2, 3), torch.nan), CLOUD, "contacts", 2),
+        (CONTACTS, torch.ones(5, 3), "points", 0.0),
+    ],
+)
+def test_nothing_to_judge_is_refused(contacts: torch.Tensor, points: torch.Tensor, name: str, value: float) -> None:
+    with raises(CaptureError, name=name, value=value):
+        check_placement(contacts, points)
 
 
 def test_the_aircrafts_contacts_lie_on_it_and_its_mistakes_are_named(shared: Path) -> None:

@@ -12,15 +12,15 @@ from scipy.signal import fftconvolve
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.prepare import prepare
-from avmsf.capture.preprocess import start_with_impact
+from avmsf.capture.preprocess import preprocess, start_with_impact
 from avmsf.capture.table import Impact
-from avmsf.datasets.recordings import build_capture
 from factories.capture_folder import RATE, ROWS, fill, ring
 from factories.plate_capture import fill_plate
 from oracles.plate import Plate, sample_contacts, strike
 
 HAMMER = CaptureSettings(force_channel=1, response_channel=2, seconds=0.4)
 CAPTURES = Path(__file__).resolve().parents[2] / "benchmarks/captures"
+HEARD = CaptureSettings(seconds=0.3)
 MARGIN = 160
 """20 ms at 8 kHz."""
 NAMES = ("a.wav", "b.wav", "c.wav")
@@ -385,18 +385,11 @@ def test_a_force_channel_says_where_an_impulse_response_starts(tmp_path: Path) -
     assert {row.onset_seconds for row in report.recordings} == {1 / RATE}
 
 
-def test_a_dataset_s_recordings_have_margins_in_the_sounds_unit() -> None:
-    files = {name: each.astype(np.float64) for name, each in pre_triggered(40, 300, 1000).items()}
-    recordings = [
-        (Impact(name, [float(row)] * 3, gain_db=20.0), Recording(name, each[None], float(RATE), "FLOAT"))
-        for row, (name, each) in enumerate(files.items())
-    ]
-    impacts = build_capture(
-        recordings, name="cup", origin="set", settings=CaptureSettings(seconds=0.3), recorded=False
-    ).impacts
-    assert impacts.before is not None
-    assert impacts.after is not None
-    for whole, each in zip(torch.cat([impacts.before, impacts.sounds, impacts.after], 1), files.values(), strict=True):
-        held = whole[~whole.isnan()].numpy()
-        start = int(np.argmin(np.abs(each[:1001] / 10 - held[0])))
-        np.testing.assert_allclose(held, each[start : start + len(held)] / 10, rtol=2e-7)
+def test_a_dataset_s_gain_is_divided_out_of_the_margins_too() -> None:
+    files = pre_triggered(40, 300, 1000)
+    plain, divided = (
+        preprocess([(Impact(name, [0.0] * 3, gain_db=gain), recording(each)) for name, each in files.items()], HEARD)[0]
+        for gain in (0.0, 20.0)
+    )
+    for name in ("before", "sounds", "after"):
+        torch.testing.assert_close(10 * getattr(divided, name), getattr(plain, name), rtol=1e-6, atol=0, equal_nan=True)

@@ -2,7 +2,6 @@
 
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -124,33 +123,23 @@ def test_masks_that_are_named_but_not_there(tmp_path: Path) -> None:
     ],
     ids=["missing", "cut short", "text", "empty"],
 )
-def test_missing_and_corrupt_images_are_named_and_left_out(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+def test_missing_and_corrupt_images_are_left_out_and_those_without_cameras_named(tmp_path: Path, damage) -> None:
     folder = folder_of(tmp_path)
     damage(folder / "images" / "c.png")
+    write_image(folder / "images" / "late" / "x.png")
+    with warns(CaptureWarning, name="cameras", value=["late/x.png"]):
+        read_views(folder)
     with warns(CaptureWarning, file="transforms.json", name="missing images", value=["c.png"]):
         assert [view.name for view in read_views(folder)] == ["a.png", "b.png", "d.png"]
     damage(folder / "images" / "a.png")
-    with raises(CaptureError, file="transforms.json", name="views", value=2) as caught:
+    with raises(CaptureError, file="transforms.json", name="views", value=2):
         read_views(folder)
-    assert "a.png, c.png" in str(caught.value)
-
-
-def test_a_truncated_jpeg_is_corrupt(tmp_path: Path) -> None:
+    # A JPEG is decoded as far as it goes, and yet is corrupt.
     Image.fromarray(np.kron(RAMP, np.ones((8, 8, 1), dtype=np.uint8))).save(tmp_path / "a.jpg")
     content = (tmp_path / "a.jpg").read_bytes()
     (tmp_path / "a.jpg").write_bytes(content[: len(content) * 2 // 3])
     with raises(CaptureError, file="a.jpg", name="bytes", value=len(content) * 2 // 3):
         read_image(tmp_path / "a.jpg")
-
-
-def test_images_without_cameras_are_named(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path)
-    write_image(folder / "images" / "late" / "x.png")
-    write_image(folder / "images" / "y.png")
-    with warns(CaptureWarning, name="cameras", value=["late/x.png", "y.png"]):
-        assert len(read_views(folder)) == 4
-    with raises(CaptureError, file="transforms.json", name="views", value=2):
-        read_views(write_transforms(folder, frames(ring(2))))
 
 
 def test_longest_averages_areas_and_takes_the_camera_along(tmp_path: Path) -> None:

@@ -41,19 +41,16 @@ def facing_down_z(folder: Path) -> Path:
 
 
 def test_without_rotation_a_camera_looks_down_z_with_x_right_and_y_up(tmp_path: Path) -> None:
-    view = read_views(facing_down_z(tmp_path))[0]
+    folder = facing_down_z(tmp_path)
+    views = read_views(folder)
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    pixels, depth = view.camera.project(points)
+    pixels, depth = views[0].camera.project(points)
     # Focal lengths 50 and 52 over a depth of 5; rows count downwards.
     expected = torch.tensor([[19.0, 16.0], [29.0, 16.0], [19.0, 16.0 - 10.4]], dtype=torch.float64)
     assert torch.allclose(pixels, expected, atol=1e-9)
     assert torch.allclose(depth, torch.full((3,), 5.0, dtype=torch.float64))
-
-
-def test_meters_scale_positions_and_nothing_else(tmp_path: Path) -> None:
-    folder = facing_down_z(tmp_path)
-    plain, scaled = read_views(folder), read_views(folder, meters=0.01)
-    for one, other in zip(plain, scaled, strict=True):
+    # A unit scales positions and nothing else.
+    for one, other in zip(views, read_views(folder, meters=0.01), strict=True):
         assert torch.allclose(other.camera.position, one.camera.position / 100, atol=1e-15)
         assert torch.equal(other.camera.world_to_camera[:3, :3], one.camera.world_to_camera[:3, :3])
         assert other.camera.focal == one.camera.focal
@@ -317,8 +314,7 @@ def test_cameras_that_look_away_or_share_one_position_are_warned_of(tmp_path: Pa
 
 def test_cameras_side_by_side_are_right(tmp_path: Path) -> None:
     """Parallel axes meet nowhere, which says nothing against them."""
-    rows = frames(ring(4))
-    pose = opengl_pose(ring(4)[0])
+    rows, pose = frames(ring(4)), opengl_pose(ring(4)[0])
     for step, row in enumerate(rows):
         pose[:3, 3] += step * pose[:3, 0]
         row["transform_matrix"] = pose.tolist()

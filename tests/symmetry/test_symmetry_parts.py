@@ -145,13 +145,3 @@ def test_a_tube_of_twelve_sides_is_nearly_round_and_yet_has_an_order():
     group, _ = find_group(test, [turn(Z, math.pi)])
     assert group is not None
     assert [order for _, order, _ in group.axes()] == [12]
-
-
-def test_the_largest_of_groups_that_hold_is_returned_and_what_lies_outside_it_named():
-    test = divided(egg())
-    group, outside = find_group(test, [mirror(X), mirror(Y), turn(Z, 1.2), mirror(Z)])
-    assert group is not None
-    assert len(group.motions) == 7
-    assert [len(group.axes()), len(group.planes())] == [3, 3]
-    assert len(outside) == 1
-    assert outside[0] > TOLERANCE**2
