@@ -20,7 +20,6 @@ def test_a_state_comes_back(tmp_path: Path) -> None:
     assert of(path).read() is None
     of(path).save({"step": 3, "values": [torch.arange(3)]})
     state = of(str(path)).read()
-    assert state is not None
     assert state["step"] == 3
     assert state["values"][0].tolist() == [0, 1, 2]
     assert [each.name for each in path.parent.iterdir()] == ["state"]

@@ -30,7 +30,6 @@ def hold(folder: Path) -> subprocess.Popen[str]:
     """Return a process that holds the lock of a folder until its standard input is closed."""
     command = [sys.executable, "-c", HOLD, str(folder)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
     return process
 

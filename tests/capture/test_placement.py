@@ -58,7 +58,6 @@ def test_distances_are_meters_to_the_nearest_point() -> None:
 @pytest.mark.parametrize("factor", [factor for factor in FACTORS if factor < 1 or factor > 9])
 def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: float) -> None:
     placement = check_placement(CONTACTS, CLOUD * factor)
-    assert placement.mismatch is not None
     assert placement.mismatch.factor == pytest.approx(factor)
     assert placement.mismatch.unit_only
 
@@ -95,7 +94,6 @@ def test_what_befell_all_contacts_is_named_with_its_undoing(
     contacts = (CONTACTS - torch.tensor(shift, dtype=torch.float64)) @ axes / factor
     placement = check_placement(contacts, CLOUD)
     mismatch = placement.mismatch
-    assert mismatch is not None
     # Units are exact, another scale is fitted.
     assert mismatch.factor == pytest.approx(factor, rel=1e-9 if factor <= 1 else 0.02)
     assert np.array_equal(mismatch.axes, axes)

@@ -155,7 +155,6 @@ def test_a_capture_with_something_to_see_has_a_look(tmp_path: Path, sight: str) 
         (tmp_path / "cup/images").rmdir()
     (tmp_path / "cup" / sight).touch()
     source = dataset.visual_source("cup")
-    assert source is not None
     assert (source.folder, source.settings.name, dataset.facts("cup").name) == (tmp_path / "cup", "my cup", "my cup")
 
 

@@ -48,7 +48,6 @@ def test_force_gain_and_pad_are_divided_out(folder: Path) -> None:
     assert remarks == ""
     assert (impacts.sample_rate, impacts.duration) == (RATE, 3.0)
     assert impacts.names == ("0.wav", "1.wav", "2.wav", "10.wav")
-    assert impacts.forces is not None
     assert impacts.forces.tolist() == [2, 3, 4, 5]
     truth = np.stack([transfer(int(name)) for name in AUDIO_CONTACTS])
     # The force rises through a tenth of its peak on its first sample, so sample zero is the blow's; what is left is the
@@ -62,10 +61,8 @@ def test_force_gain_and_pad_are_divided_out(folder: Path) -> None:
 def test_the_mesh_is_surface_and_look(folder: Path) -> None:
     dataset = ObjectFolderRaw(folder)
     source = dataset.visual_source("2")
-    assert source is not None
     assert (source.folder / (source.settings.surface or "")).name == "model.obj"
     surface = dataset.capture("2").surface
-    assert surface is not None
     assert torch.allclose(surface.vertices.norm(dim=1), torch.tensor(0.1), atol=1e-6)
     assert dataset.visual_source("10") is None
     assert dataset.capture("10").surface is None

@@ -52,7 +52,6 @@ def test_every_blow_is_heard_by_the_closest_microphone(whole: Path) -> None:
     published = np.load(home / "deconvolved_0db.npy", mmap_mode="r")
     assert np.array_equal(capture.impacts.sounds.numpy(), published[rows])
     source = RealImpact(whole).visual_source(NAME)
-    assert source is not None
     assert (source.folder / (source.settings.surface or "")).is_file()
     assert len(capture.surface.faces) == 1280
 

@@ -18,6 +18,12 @@ def ball_color(normals: Tensor) -> Tensor:
     return 0.5 + 0.3 * torch.sin(normals * torch.tensor([4.0, 5.0, 6.0], dtype=normals.dtype) + 1.0)
 
 
+def ball_normals(count: int, *, seed: int = 1) -> Tensor:
+    """Return random directions, evenly over all; points of the ball lie at `MIDDLE + RADIUS` times these."""
+    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.normalize(normals, dim=1)
+
+
 def ball_cameras(count: int, *, size: int = 64, aim: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> list[Camera]:
     """Return cameras on a spiral around the ball, .3 m away, whose image it fills by two thirds."""
     middle, cameras = torch.tensor(MIDDLE, dtype=torch.float64), []

@@ -8,17 +8,16 @@ from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.prune import blended_weight, keep_object
 from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
-from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_views
+from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_normals, ball_views
 from factories.raising import raises
 
 COUNT = 800
 
 
 def _ball(radius: float = RADIUS, *, opacity: float = 0.9) -> GaussianCloud:
-    normals = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1))
-    normals = torch.nn.functional.normalize(normals, dim=1)
-    points = torch.tensor(MIDDLE) + radius * normals
-    return starting_cloud(StartPoints(points, ball_color(normals)), degree=0, scale=1.0, opacity=opacity)
+    normals = ball_normals(COUNT)
+    start = StartPoints(torch.tensor(MIDDLE) + radius * normals, ball_color(normals))
+    return starting_cloud(start, degree=0, scale=1.0, opacity=opacity)
 
 
 def _moved(cloud: GaussianCloud, count: int, offset: tuple[float, float, float]) -> GaussianCloud:
@@ -39,9 +38,7 @@ def test_what_is_not_the_object_goes_and_all_of_the_object_stays() -> None:
 def test_wrong_masks_of_a_few_views_take_nothing_away() -> None:
     ball, views = _ball(opacity=0.5), ball_views(24)
     for row in (3, 11):
-        mask = views[row].mask
-        assert mask is not None
-        views[row] = replace(views[row], mask=mask.roll(30, dims=0))
+        views[row] = replace(views[row], mask=views[row].mask.roll(30, dims=0))
     views[5] = replace(views[5], mask=torch.zeros(64, 64, dtype=torch.uint8))
     views[6] = replace(views[6], mask=None)
     assert len(keep_object(ball, views)) == COUNT

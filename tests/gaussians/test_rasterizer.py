@@ -169,7 +169,6 @@ def test_an_empty_cloud_shows_the_background() -> None:
     assert not bool(found.depth.any())
     assert (found.screen.shape, found.radii.shape) == ((0, 2), (0,))
     found.color.sum().backward()
-    assert cloud.centers.grad is not None
     assert cloud.centers.grad.shape == (0, 3)
 
 

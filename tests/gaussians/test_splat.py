@@ -15,7 +15,7 @@ from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
 from avmsf.gaussians.ssim import psnr
 from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
 from avmsf.photographs.cameras import View
-from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_view, ball_views
+from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_normals, ball_view, ball_views
 from factories.raising import raises, warns
 
 QUICK = SplatConfig(steps=60, start_points=400, gaussians=600, densify_every=15)
@@ -25,11 +25,6 @@ def _mean_psnr(cloud: GaussianCloud, views: list[View], *, background: float = 0
     back = torch.full((3,), background)
     images = [NumbaRasterizer()(cloud, view.camera, background=back).color for view in views]
     return sum(psnr(image, view.color) for image, view in zip(images, views, strict=True)) / len(views)
-
-
-def _ball_points(count: int) -> torch.Tensor:
-    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(1))
-    return torch.nn.functional.normalize(normals, dim=1)
 
 
 @pytest.mark.slow
@@ -82,7 +77,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
 
 def test_photographs_without_masks_start_from_points() -> None:
     views = ball_views(16, masked=False, background=0.6)
-    normals = _ball_points(500)
+    normals = ball_normals(500)
     start = StartPoints(torch.tensor(MIDDLE) + RADIUS * normals, ball_color(normals))
     cloud = splat(views, replace(QUICK, steps=100), start=start)
     assert _mean_psnr(cloud, views, background=0.6) > 26.0
@@ -93,14 +88,13 @@ def test_before_random_colors_the_object_alone_is_fitted() -> None:
     for place, view in enumerate(ball_views(16)):
         # A background that is another in every view and every pixel, as behind an object that turns.
         noise = torch.randint(256, (64, 64, 3), generator=torch.Generator().manual_seed(place), dtype=torch.uint8)
-        assert view.mask is not None
         image = torch.where(view.mask[..., None] > 127, view.image, noise)
         views.append(View(view.name, image, view.camera, view.mask))
     assert choose_background(views, QUICK) is None
     # Without the loss on the mask, the colors alone must say what is the object.
     cloud = splat(views, replace(QUICK, steps=120, mask_weight=0.0))
     assert _mean_psnr(cloud, ball_views(16)) > 24.0
-    inside = [(view.mask > 127, view) for view in views if view.mask is not None]
+    inside = [(view.mask > 127, view) for view in views]
     for mask, view in inside[:3]:
         alpha = NumbaRasterizer()(cloud, view.camera, background=torch.zeros(3)).alpha
         assert float(alpha[~mask].mean()) < 0.03
@@ -109,14 +103,11 @@ def test_before_random_colors_the_object_alone_is_fitted() -> None:
 
 def test_the_background_is_the_plain_color_around_the_object() -> None:
     found = choose_background(ball_views(4, background=0.6), SplatConfig())
-    assert found is not None
     # 0.6 is 153 of 255.
     torch.testing.assert_close(found, torch.full((3,), 0.6), rtol=0, atol=1e-6)
     unmasked = choose_background(ball_views(4, background=0.6, masked=False), SplatConfig())
-    assert unmasked is not None
     torch.testing.assert_close(unmasked, found)
     given = choose_background(ball_views(4), SplatConfig(background=(0.1, 0.2, 0.3)))
-    assert given is not None
     assert given.tolist() == pytest.approx([0.1, 0.2, 0.3])
 
 
@@ -154,7 +145,7 @@ def test_gaussians_start_as_wide_as_their_neighbors_are_far() -> None:
     torch.testing.assert_close(cloud.log_scales.exp(), torch.full((125, 3), 0.005))
     torch.testing.assert_close(cloud.opacities, torch.full((125,), 0.3))
     camera = ball_views(1)[0].camera
-    normals = torch.nn.functional.normalize(torch.randn(125, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    normals = ball_normals(125)
     normals[0] = torch.tensor([0.0, 0.0, -1.0])
     start = StartPoints(points, torch.full((125, 3), 0.25), normals)
     discs = starting_cloud(start, degree=1, scale=0.5, opacity=0.3, flatness=0.2)
@@ -169,7 +160,7 @@ def test_gaussians_start_as_wide_as_their_neighbors_are_far() -> None:
 
 
 def test_points_take_the_colors_that_photographs_show_of_their_side() -> None:
-    normals = _ball_points(2000)
+    normals = ball_normals(2000)
     points = torch.tensor(MIDDLE) + RADIUS * normals
     found = photographed_colors(points, ball_views(24), spacing=2.0 * RADIUS / 2000**0.5)
     # Depth cells and pixels of .3 / 128 m blur colors that change by 1.8 a radius at most.
