@@ -104,12 +104,12 @@ def test_a_mesh_in_millimeters_is_shown_in_meters_with_its_colors(tmp_path: Path
     path, mesh = tmp_path / f"ball.{ending}", trimesh.creation.icosphere(subdivisions=1, radius=100.0)
     mesh.visual.vertex_colors = np.r_["1", np.arange(42)[:, None] * [1, 2, 3], np.full((42, 1), 255)].astype(np.uint8)
     mesh.export(path)
-    loaded = shown_mesh(read_object(path, ball_points(), meters=1e-3).content)
+    loaded = shown_mesh(read_object(path, ball_points(), meters=1e-3)[1])
     np.testing.assert_allclose(np.linalg.norm(loaded.vertices, axis=1), 0.1, rtol=1e-5)
     if ending == "ply":
         assert np.array_equal(loaded.visual.vertex_colors, mesh.visual.vertex_colors)
     surface = ball_surface()
-    loaded = shown_mesh(read_object(surface, ball_points()).content)
+    loaded = shown_mesh(read_object(surface, ball_points())[1])
     np.testing.assert_allclose(loaded.vertices, surface.vertices.numpy(), rtol=0, atol=1e-7)
     assert np.array_equal(loaded.faces, surface.faces.numpy())
     with raises(ExportError, file=path, name="size", value=pytest.approx(1000.0, rel=0.1)):
@@ -118,11 +118,10 @@ def test_a_mesh_in_millimeters_is_shown_in_meters_with_its_colors(tmp_path: Path
 
 def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word() -> None:
     surface = ball_surface(divisions=4)
-    shown = read_object(surface, ball_points(), most=1000)
-    mesh = shown_mesh(shown.content)
+    _, content, (remark,) = read_object(surface, ball_points(), most=1000)
+    mesh = shown_mesh(content)
     assert 500 < len(mesh.faces) <= 1000
     assert float(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.1).max()) < 0.005
-    (remark,) = shown.remarks
     assert "5,120" in remark
     assert f"{len(mesh.faces):,}" in remark
 

@@ -18,7 +18,7 @@ from jaxtyping import Shaped
 from avmsf.capture.audio import wav_bytes
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
-from avmsf.export.geometry import read_object
+from avmsf.export.geometry import ObjectKind, read_object
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import MAX_POINTS, Written, no_modes, pack, write_folder
 from avmsf.field.positions import points_on_object
@@ -29,6 +29,8 @@ FORMAT = 1
 """Version of this format, increased by every change that older pages cannot read."""
 SURFACE = "surface.glb"
 """Name of the surface's file."""
+_OBJECTS: dict[ObjectKind, str | None] = {"mesh": "object.glb", "gaussians": "object.ply", "points": None}
+"""Name of the object's file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +75,14 @@ def make_bundle(
         remarks = (f"{len(sampled):,} of the field's {count:,} contacts are exported, spread evenly",)
     if len(sampled.frequency) == 0 and not mute:
         raise no_modes()
-    shown, other = read_object(object, sampled.points, meters=meters), read_object(surface, sampled.points)
+    kind, shown, notes = read_object(object, sampled.points, meters=meters)
+    other, triangles, further_notes = read_object(surface, sampled.points)
     content, places = pack(_tensors(sampled))
-    files = {"field.bin": content}
-    if shown.name is not None:
-        files[shown.name] = shown.content
-    if other.kind == "mesh":
-        files[SURFACE] = other.content
+    files, name = {"field.bin": content}, _OBJECTS[kind]
+    if name is not None:
+        files[name] = shown
+    if other == "mesh":
+        files[SURFACE] = triangles
     records, sounds = _strikes(strikes, sampled)
     manifest = {
         "format": FORMAT,
@@ -93,12 +96,12 @@ def make_bundle(
         "points": len(sampled),
         "damping": "shared" if sampled.shared_damping else "perContact",
         "tensors": {name: {"file": "field.bin", **place} for name, place in places.items()},
-        "object": {"kind": shown.kind, "file": shown.name},
+        "object": {"kind": kind, "file": name},
         "strikes": records,
         "live": None,
         "surface": {"kind": "mesh", "file": SURFACE} if SURFACE in files else None,
     }
-    return Bundle(manifest, {**files, **sounds}, remarks + shown.remarks + other.remarks)
+    return Bundle(manifest, {**files, **sounds}, remarks + notes + further_notes)
 
 
 def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:

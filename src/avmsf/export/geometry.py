@@ -1,7 +1,6 @@
 """The object that a page shows: a mesh, Gaussians, or the field's points."""
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -28,38 +27,30 @@ _MAX_SIZE_RATIO = 3.0
 """Ratio of the sizes of object and field above which their units differ."""
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectFile:
-    """The file of an object's geometry."""
-
-    kind: Literal["mesh", "gaussians", "points"]
-    name: str | None = None
-    """Name of the file; None for points, which are those of the field."""
-    content: bytes = b""
-    remarks: tuple[str, ...] = ()
-    """Notes on differences from the given file."""
+ObjectKind = Literal["mesh", "gaussians", "points"]
 
 
 def read_object(
     source: Path | Surface | None, points: Float[Tensor, "points 3"], *, meters: float = 1.0, most: int = MAX_FACES
-) -> ObjectFile:
-    """Return an object for a field at `points`: a mesh as `.glb`, Gaussians as they are, or None.
+) -> tuple[ObjectKind, bytes, tuple[str, ...]]:
+    """Return an object for a field at `points`: its kind, its file, and notes on differences from the given one.
 
-    A file's coordinates count `meters` each; Gaussians are in meters. Meshes of more than `most` triangles are reduced.
-    Raises `ExportError` for a file that is missing, not a mesh, huge, or not in the field's unit.
+    A mesh becomes a `.glb`, Gaussians stay as they are, and without either the field's points are shown. A file's
+    coordinates count `meters` each; Gaussians are in meters. Meshes of more than `most` triangles are reduced. Raises
+    `ExportError` for a file that is missing, not a mesh, huge, or not in the field's unit.
     """
     if source is None:
-        return ObjectFile("points")
+        return "points", b"", ()
     if isinstance(source, Surface):
         scene = trimesh.Scene([trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)])
     elif read_gaussians(source, points) is not None:
-        return ObjectFile("gaussians", "object.ply", source.read_bytes())
+        return "gaussians", source.read_bytes(), ()
     else:
         scene = load_mesh(source, raising=ExportError)
         scene.apply_scale(meters)  # type: ignore[no-untyped-call]
     meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not meshes:
-        return ObjectFile("points", remarks=(f"{_named(source)} has no triangles: the field's points are shown",))
+        return "points", b"", (f"{_named(source)} has no triangles: the field's points are shown",)
     _check_fits(np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes]), points, source)
     remarks: tuple[str, ...] = ()
     faces = sum(len(mesh.faces) for mesh in meshes)
@@ -71,7 +62,7 @@ def read_object(
         )
     content = scene.export(file_type="glb")  # type: ignore[no-untyped-call]
     assert isinstance(content, bytes)
-    return ObjectFile("mesh", "object.glb", content, remarks)
+    return "mesh", content, remarks
 
 
 def read_gaussians(path: Path, points: Float[Tensor, "points 3"]) -> GaussianCloud | None:

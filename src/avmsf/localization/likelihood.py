@@ -113,24 +113,48 @@ class Force:
                 raise LocationError.expected("a number above 0", value, name=f"force.{name}", advice=advice)
 
 
-@dataclass(frozen=True, eq=False)
-class LikelihoodResult:
-    """The likelihood of every point, given a sound."""
+class Likelihood:
+    """The likelihood of each point, given amplitudes and the variances of their errors."""
 
-    log_likelihood: Float64[Tensor, " points"]
-    """Up to a constant, with errors that are independent between modes."""
-    force: Float64[Tensor, " points"]
-    """The force of greatest likelihood, with its sign; 0 at points that were not preselected."""
-    shift: Float64[Tensor, " points"]
-    """The shift of the onset of greatest likelihood, seconds from the impact to the sound's first sample."""
-    noise_fraction: float
-    """Fraction of the errors' variance that is noise, 0 to 1."""
-    noise_log_likelihood: float
-    """Log likelihood, with the same constant, of noise in place of an impact; see `_Trial.noise_log_likelihood`."""
-
-    def evidence(self) -> float:
-        """Return the log Bayes factor of an impact at some point, all equally probable before, against noise."""
-        return float(self.log_likelihood.logsumexp(0)) - math.log(len(self.log_likelihood)) - self.noise_log_likelihood
+    def __init__(
+        self,
+        predicted: PredictedGains,
+        amplitudes: Complex128[Tensor, " modes"],
+        noise: Float64[Tensor, " modes"],
+        *,
+        force: Force | None = None,
+    ) -> None:
+        # In units in which the strongest is one, so that float32 holds all squares.
+        unit = float(amplitudes.abs().max())
+        self.predicted, self.values, self.noise = predicted, amplitudes / unit, (noise / unit**2).float()
+        self.prior = None if force is None else replace(force, expected=force.expected / unit)
+        mean_power, unknown = predicted.mean_power, predicted.variance.mean(0)
+        surplus = (self.values.abs().square().float() - self.noise).clamp_min(0.0)
+        level = (surplus.sum() / (mean_power + unknown).sum()).clamp_min(1e-12)
+        self.weights = 1.0 / (self.noise + level * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power))
+        """One over the errors' variance, roughly: with these the shift is found."""
+        self.force_weights = 1.0 / (self.noise + (surplus.sum() / mean_power.sum()).clamp_min(1e-12) * mean_power)
+        """By which energies are summed that give the force at which an impact's errors are taken."""
+        self.sound = self.force_weights @ surplus
+        """That sum of the sound's energy beyond the noise."""
+        self.noise_fraction = float((self.weights * self.noise).mean())
+        """Fraction of the errors' variance that is noise, 0 to 1."""
+        rows = self._preselect(_PRESELECTED)
+        found = self._evaluate(rows, RELATIVE_ERRORS)
+        near = torch.nonzero(found[0] > found[0].max() - _NEGLIGIBLE).flatten()
+        finer = self._evaluate(rows[near], MORE_RELATIVE_ERRORS)
+        better = finer[0] > found[0][near]
+        found[1][near[better]] = finer[1][better]
+        found[0][near] = torch.logaddexp(found[0][near], finer[0])
+        count, logs = len(predicted.gains), found[0].double()
+        # The others are no likelier than the least likely of those.
+        self.log_likelihood = torch.full((count,), float(logs.min()), dtype=torch.float64)
+        """[points], up to a constant, with errors that are independent between modes."""
+        self.force = torch.zeros(count, dtype=torch.float64)
+        """[points], the force of greatest likelihood, with its sign; 0 at points that were not preselected."""
+        self.shift = torch.zeros(count, dtype=torch.float64)
+        """[points], the shift of the onset of greatest likelihood, seconds from the impact to the first sample."""
+        self.log_likelihood[rows], self.force[rows], self.shift[rows] = logs, unit * found[1].double(), found[2]
 
     def tempering(self, explained: float, *, factor: float = 1.0) -> float:
         """Return the exponent of the tempered likelihood, where the likeliest point explains that part of the sound.
@@ -143,60 +167,8 @@ class LikelihoodResult:
         # of their number, a tenth of noise would make that a seventh.
         return together ** (1.0 - self.noise_fraction)
 
-
-def evaluate_likelihood(
-    predicted: PredictedGains,
-    amplitudes: Complex128[Tensor, " modes"],
-    noise: Float64[Tensor, " modes"],
-    *,
-    force: Force | None = None,
-) -> LikelihoodResult:
-    """Return the likelihood of each point, given amplitudes and the variances of their errors."""
-    # In units in which the strongest is one, so that float32 holds all squares.
-    unit = float(amplitudes.abs().max())
-    values, errors = amplitudes / unit, (noise / unit**2).float()
-    strength = None if force is None else replace(force, expected=force.expected / unit)
-    trial = _Trial(predicted, values, errors, strength)
-    rows = trial.preselect(_PRESELECTED)
-    found = trial.evaluate(rows, RELATIVE_ERRORS)
-    near = torch.nonzero(found[0] > found[0].max() - _NEGLIGIBLE).flatten()
-    finer = trial.evaluate(rows[near], MORE_RELATIVE_ERRORS)
-    better = finer[0] > found[0][near]
-    found[1][near[better]] = finer[1][better]
-    found[0][near] = torch.logaddexp(found[0][near], finer[0])
-    # The others are no likelier than the least likely of those.
-    count, logs = len(predicted.gains), found[0].double()
-    evidence = torch.full((count,), float(logs.min()), dtype=torch.float64)
-    forces, shifts = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
-    evidence[rows], forces[rows], shifts[rows] = logs, unit * found[1].double(), found[2]
-    return LikelihoodResult(evidence, forces, shifts, trial.noise_fraction, trial.noise_log_likelihood())
-
-
-class _Trial:
-    """One sound's amplitudes, in units in which the strongest is one, and the predicted gains."""
-
-    def __init__(
-        self,
-        predicted: PredictedGains,
-        values: Complex128[Tensor, " modes"],
-        noise: Float32[Tensor, " modes"],
-        force: Force | None,
-    ) -> None:
-        self.predicted, self.values, self.noise, self.force = predicted, values, noise, force
-        mean_power, unknown = predicted.mean_power, predicted.variance.mean(0)
-        surplus = (values.abs().square().float() - noise).clamp_min(0.0)
-        level = (surplus.sum() / (mean_power + unknown).sum()).clamp_min(1e-12)
-        self.weights = 1.0 / (noise + level * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power))
-        """One over the errors' variance, roughly: with these the shift is found."""
-        self.force_weights = 1.0 / (noise + (surplus.sum() / mean_power.sum()).clamp_min(1e-12) * mean_power)
-        """By which energies are summed that give the force at which an impact's errors are taken."""
-        self.sound = self.force_weights @ surplus
-        """That sum of the sound's energy beyond the noise."""
-        self.noise_fraction = float((self.weights * noise).mean())
-        """Fraction of the errors' variance that is noise."""
-
-    def noise_log_likelihood(self) -> float:
-        """Return the log likelihood of noise, of any level, with the constant of `evaluate_likelihood`.
+    def evidence(self) -> float:
+        """Return the log Bayes factor of an impact at some point, all equally probable before, against noise.
 
         Noise is one of two, equally probable: errors of the extraction that are louder than they are taken for, or
         modes of random phase that are as strong relative to each other as the field expects on average over the
@@ -208,9 +180,10 @@ class _Trial:
         logs = -(variance.log() + self.values.abs().square() / variance).sum(1)
         # The likelihood of a point is a sum over the relative errors, and leaves out a factor of the force's integral.
         constant = math.log(len(RELATIVE_ERRORS) + len(MORE_RELATIVE_ERRORS)) - 0.5 * math.log(math.pi)
-        return float(torch.logsumexp(logs, 0)) + math.log(_LEVEL_STEP / 2.0) + constant
+        noise_log_likelihood = float(torch.logsumexp(logs, 0)) + math.log(_LEVEL_STEP / 2.0) + constant
+        return float(self.log_likelihood.logsumexp(0)) - math.log(len(self.log_likelihood)) - noise_log_likelihood
 
-    def preselect(self, count: int) -> Int64[Tensor, " rows"]:
+    def _preselect(self, count: int) -> Int64[Tensor, " rows"]:
         """Return the rows, ascending, of the points whose gains match the amplitudes best, whatever the force."""
         if len(self.predicted.gains) <= count:
             return torch.arange(len(self.predicted.gains))
@@ -226,7 +199,7 @@ class _Trial:
     def _weighted(self, rotated: Complex64[Tensor, "shifts modes"]) -> Float32[Tensor, "two_modes shifts"]:
         return torch.view_as_real(rotated * self.weights).flatten(1).T.contiguous()
 
-    def evaluate(
+    def _evaluate(
         self, rows: Int64[Tensor, " rows"], relative_errors: tuple[float, ...]
     ) -> tuple[Float32[Tensor, " rows"], Float32[Tensor, " rows"], Float64[Tensor, " rows"]]:
         """Return the log likelihood, summed over relative errors, and the force and shift of the likeliest one."""
@@ -263,11 +236,11 @@ class _Trial:
         self, strength: Float32[Tensor, " rows"], squares: Float32[Tensor, " rows"]
     ) -> Float32[Tensor, " rows"]:
         """Return the logarithm of a force's prior, at the force that fits best or the square of the errors' force."""
-        if self.force is None:
+        if self.prior is None:
             return -0.5 * squares.log()
         size = strength.abs().clamp_min(_TINY)
-        spread = self.force.spread_db * math.log(10.0) / 20.0
-        return -size.log() - 0.5 * ((size / self.force.expected).log() / spread).square()
+        spread = self.prior.spread_db * math.log(10.0) / 20.0
+        return -size.log() - 0.5 * ((size / self.prior.expected).log() / spread).square()
 
 
 def delayed_back(

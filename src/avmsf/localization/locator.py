@@ -17,7 +17,7 @@ from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor
 from avmsf.localization.contact_map import ContactMap
-from avmsf.localization.likelihood import Force, LikelihoodResult, PredictedGains, cosine_distance, evaluate_likelihood
+from avmsf.localization.likelihood import Force, Likelihood, PredictedGains, cosine_distance
 from avmsf.localization.prediction import (
     calibrate_tempering,
     calibration_factor,
@@ -117,9 +117,9 @@ class Locator:
         values, noise = length.separate(amplitudes)
         _check_above_noise(values, noise)
         scaled = None if known is None else replace(known, expected=known.expected * length.unit)
-        found = evaluate_likelihood(length.predicted, values, noise, force=scaled)
+        found = Likelihood(length.predicted, values, noise, force=scaled)
         # The force does not say whether the impact was on this object.
-        free = found if scaled is None else evaluate_likelihood(length.predicted, values, noise)
+        free = found if scaled is None else Likelihood(length.predicted, values, noise)
         row = int(torch.argmax(found.log_likelihood))
         explained = length.explained(amplitudes, found, row)
         exponent = found.tempering(explained, factor=self.tempering_factor)
@@ -217,7 +217,7 @@ class _Length:
         recorded = self.extractor.mixing @ (kept * values)
         return cosine_distance(self.gains, recorded, self.extractor.bank.frequency)
 
-    def explained(self, amplitudes: Amplitudes, found: LikelihoodResult, row: int) -> float:
+    def explained(self, amplitudes: Amplitudes, found: Likelihood, row: int) -> float:
         """Return the fraction of the sound's energy that an impact at a point explains."""
         extractor = self.extractor
         rotated = torch.polar(
@@ -253,9 +253,7 @@ def _decorrelated(
     return PredictedGains(gains, variance, shares.T @ extractor.bank.frequency)
 
 
-def _force_notes(
-    force: Force, free: LikelihoodResult, exponent: float, unit: float, *, per_newton: bool
-) -> tuple[str, ...]:
+def _force_notes(force: Force, free: Likelihood, exponent: float, unit: float, *, per_newton: bool) -> tuple[str, ...]:
     """Return a note where no likely position has about that force; `free` is what the sound says without it."""
     likely = exponent * (free.log_likelihood - free.log_likelihood.max()) > _LIKELY
     forces = free.force[likely].abs()

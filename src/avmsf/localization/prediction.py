@@ -15,7 +15,7 @@ from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.posterior import fitted_mixture, has_posterior, scale_of
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
-from avmsf.localization.likelihood import PredictedGains, evaluate_likelihood
+from avmsf.localization.likelihood import Likelihood, PredictedGains
 
 _BATCH = 2048
 """Points whose gains are asked for at once."""
@@ -191,9 +191,7 @@ def calibrate_tempering(field: SoundField) -> float:
         loudest = float(measured.abs().max())
         mean, variance, _ = predict(replace(field, gain_field=left), places, factor=factor)
         known = PredictedGains(mean[:, kept], (variance + about)[:, kept], field.bank.frequency[kept].double())
-        found = evaluate_likelihood(
-            known, measured, torch.full(measured.shape, _NOISE * loudest**2, dtype=torch.float64)
-        )
+        found = Likelihood(known, measured, torch.full(measured.shape, _NOISE * loudest**2, dtype=torch.float64))
         row = int(found.log_likelihood.argmax())
         explained = _explained_energy(
             known.gains[row].to(measured), measured, 1.0 / (4.0 * field.bank.damping[kept].double())

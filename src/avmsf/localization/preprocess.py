@@ -129,7 +129,16 @@ def open_recording(
     with location_errors(recording.name):
         recording = replace(recording, sample_rate=as_rate(recording.sample_rate))
     check_sound(recording.channels, recording.sample_rate, file=recording.name)
-    chosen = _settings_for(recording, own if settings is None else settings)
+    given, count = own if settings is None else settings, len(recording.channels)
+    force, response = given.force_channel, given.response_channel
+    # A single channel is the sound, wherever the capture has its force.
+    pushed = force is not None and 1 < count >= force
+    chosen = replace(
+        given,
+        normalize=given.normalize if given.normalize == "deconvolve" and pushed else "none",
+        force_channel=force if pushed else None,
+        response_channel=response if response is not None and response <= count else None,
+    )
     with location_errors():
         response = recording.response(chosen.response_channel, force_channel=chosen.force_channel)
     clipped = find_clipping(response, name=recording.name)
@@ -177,19 +186,3 @@ def at_field_rate(
     if left_out:
         note += f"; {left_out} of the object's {counted(len(frequency), 'mode')}, above {highest:.4g} Hz, left out"
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
-
-
-def _settings_for(recording: Recording, settings: CaptureSettings) -> CaptureSettings:
-    """Return settings without those that a recording of a single impact may lack."""
-    count = len(recording.channels)
-    force, response = settings.force_channel, settings.response_channel
-    kept = replace(
-        settings,
-        normalize="none",
-        # A single channel is the sound, wherever the capture has its force.
-        force_channel=force if force is not None and count > 1 and force <= count else None,
-        response_channel=response if response is not None and response <= count else None,
-    )
-    if settings.normalize == "deconvolve" and kept.force_channel is not None:
-        return replace(kept, normalize="deconvolve")
-    return kept
