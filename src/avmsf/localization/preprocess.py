@@ -130,14 +130,14 @@ def open_recording(
         recording = replace(recording, sample_rate=as_rate(recording.sample_rate))
     check_sound(recording.channels, recording.sample_rate, file=recording.name)
     given, count = own if settings is None else settings, len(recording.channels)
-    force, response = given.force_channel, given.response_channel
+    force, channel = given.force_channel, given.response_channel
     # A single channel is the sound, wherever the capture has its force.
     pushed = force is not None and 1 < count >= force
     chosen = replace(
         given,
         normalize=given.normalize if given.normalize == "deconvolve" and pushed else "none",
         force_channel=force if pushed else None,
-        response_channel=response if response is not None and response <= count else None,
+        response_channel=channel if channel is not None and channel <= count else None,
     )
     with location_errors():
         response = recording.response(chosen.response_channel, force_channel=chosen.force_channel)
