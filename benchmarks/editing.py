@@ -6,7 +6,7 @@ the reference's, and, for prompts, the CLAP score; they are compared with those 
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -255,12 +255,13 @@ def score_edits(
     spaces: Mapping[str, MaterialSpace],
     *,
     clap: Clap | None = None,
-) -> Iterator[EditScore]:
-    """Yield every method's scores in every task. The time of fitting an object's field does not count.
+) -> tuple[EditScore, ...]:
+    """Return every method's scores in every task. The time of fitting an object's field does not count.
 
     A sound without an impact or without modes, and a method that fails, have no score, and a warning says so: a
     generative model may return anything.
     """
+    scores = []
     for task in tasks:
         _ = task.object.sound_field
         for method in methods:
@@ -276,7 +277,8 @@ def score_edits(
             if clap is not None and task.prompt is not None:
                 cosine = float(clap.score(made.sounds, [task.prompt], sample_rate=made.sample_rate).mean())
                 score = replace(score, clap=cosine, clap_curve=_clap_curve(made, task.prompt, clap))
-            yield score
+            scores.append(score)
+    return tuple(scores)
 
 
 def _score(task: EditTask, method: str, made: Edited, spaces: Mapping[str, MaterialSpace], seconds: float) -> EditScore:

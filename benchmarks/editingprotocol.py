@@ -128,7 +128,7 @@ def measure(
     else:
         methods = tuple(each for each in towards_reference(settings, paper=paper) if cast.known or each is not PHYSICS)
     found = []
-    for score in score_edits(cast.tasks, methods, spaces, clap=clap):
+    for score in (each for task in cast.tasks for each in score_edits([task], methods, spaces, clap=clap)):
         found.append(score)
         name = f"{score.object} to {score.target}"
         yield from records(_values(score), group=score.method, object=name, seed=score.seed, note=score.prompt or "")
