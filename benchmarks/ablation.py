@@ -22,16 +22,7 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.recipe import ABLATED
 from avmsf.simulate.shapes import make_shape
-from benchmarks.objects import (
-    COUNTS,
-    ROUGH,
-    SplitCase,
-    bodies_of,
-    measured,
-    simulated,
-    splits_of,
-    surface_of,
-)
+from benchmarks import objects
 from benchmarks.records import Record, Settings, records
 from tests.oracles.block import block
 from tests.oracles.known_gains import known_gains
@@ -54,18 +45,18 @@ def ablation(settings: Settings) -> Iterator[Record]:
         yield from records({"over the default": float(np.exp(np.log(ratios).mean()))}, group=variant)
 
 
-def _ablated(settings: Settings) -> Iterator[tuple[str, SplitCase]]:
+def _ablated(settings: Settings) -> Iterator[tuple[str, objects.SplitCase]]:
     for name, count, start in (("aircraft_response", 15, 18), ("ruler10", 7, 0), ("tree43", 20, 18)):
-        capture = measured(name)
-        bodies = None if capture.surface is None else bodies_of(capture.surface, settings)
-        yield f"{name} {count}", SplitCase.of(*split(capture.impacts, count, start=start), capture, bodies)
+        capture = objects.measured(name)
+        bodies = None if capture.surface is None else objects.bodies_of(capture.surface, settings)
+        yield f"{name} {count}", objects.SplitCase.of(*split(capture.impacts, count, start=start), capture, bodies)
     for name in settings.objects or settings.some(ABLATED[:3]):
-        capture, _ = simulated(name, settings)
-        bodies = bodies_of(surface_of(capture), settings)
-        yield name, SplitCase.of(*split(capture.impacts, 0.2), capture, bodies)
+        capture, _ = objects.simulated(name, settings)
+        bodies = objects.bodies_of(objects.surface_of(capture), settings)
+        yield name, objects.SplitCase.of(*split(capture.impacts, 0.2), capture, bodies)
 
 
-def _variants(case: SplitCase, settings: Settings) -> Iterator[tuple[str, float]]:
+def _variants(case: objects.SplitCase, settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield names of variants of the default model and their errors."""
     default = MixtureEstimator(bodies=case.bodies)
     field = case.fit(default)
@@ -86,7 +77,7 @@ def _variants(case: SplitCase, settings: Settings) -> Iterator[tuple[str, float]
     yield "positions alone", case.error(case.fit(MixtureEstimator((Smooth.kind, ThinPlate.kind))))
     yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries)))
     if case.surface is not None:
-        rough = bodies_of(roughened(case.surface, ROUGH, seed=0), settings)
+        rough = objects.bodies_of(roughened(case.surface, objects.ROUGH, seed=0), settings)
         yield "noisy mesh", case.error(case.fit(MixtureEstimator(bodies=rough)))
 
 
@@ -95,12 +86,13 @@ def outliers(settings: Settings) -> Iterator[Record]:
 
     In each draw three of 15 contacts get the labels of one another, in a circle.
     """
-    captures = {name: measured(name) for name in COUNTS}
+    captures = {name: objects.measured(name) for name in objects.COUNTS}
     bodies = {
-        name: None if each.surface is None else bodies_of(each.surface, settings) for name, each in captures.items()
+        name: None if each.surface is None else objects.bodies_of(each.surface, settings)
+        for name, each in captures.items()
     }
     draws = Counter[str]()
-    for case in splits_of(captures["aircraft_response"], 15, bodies["aircraft_response"], settings):
+    for case in objects.splits_of(captures["aircraft_response"], 15, bodies["aircraft_response"], settings):
         for seed in settings.some(range(9)):
             drawn = np.random.default_rng(seed).choice(len(case.train), 3, replace=False)
             order = torch.arange(len(case.train))
@@ -109,14 +101,14 @@ def outliers(settings: Settings) -> Iterator[Record]:
             train = replace(case.train, contacts=case.train.contacts[order], directions=directions)
             named, wrong = _named(replace(case, train=train)), {case.train.names[row] for row in drawn.tolist()}
             draws.update(found=len(named & wrong), false=len(named - wrong), exchanged=3)
-    for name, counts in COUNTS.items():
+    for name, counts in objects.COUNTS.items():
         for count in settings.some(counts):
-            for case in splits_of(captures[name], count, bodies[name], settings):
+            for case in objects.splits_of(captures[name], count, bodies[name], settings):
                 draws.update(clean_false=len(_named(case)), clean_fits=1)
     yield from records(draws)
 
 
-def _named(case: SplitCase) -> set[str]:
+def _named(case: objects.SplitCase) -> set[str]:
     """Return the names of the training contacts that the fit reports as outliers."""
     return set(case.fit(MixtureEstimator(bodies=case.bodies), quick=True).origin.report["outliers"])
 
@@ -127,11 +119,11 @@ def supports(settings: Settings) -> Iterator[Record]:
     free: taken for free; auto: the default; try: supports tried, and what is found; no body: by positions alone.
     """
     mug = make_shape("mug", size=0.1, wall=0.003)
-    objects = (
+    cases = (
         ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, Patch("a short side", (-1.0, 0.0, 0.0))),
         ("mug", mug.solid, CERAMIC, Patch("its base", (0.0, 0.0, -1.0))),
     )
-    for kind, solid, material, patch in settings.some(objects):
+    for kind, solid, material, patch in settings.some(cases):
         along = solid.points[solid.cells].mean(1)[:, 0] / solid.size
         uneven = 1 + 0.1 * torch.sin(2 * torch.pi * along).double()
         for support in (None, Support((patch,), 1e10)):

@@ -30,19 +30,8 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.ground_truth import read_truth
 from avmsf.simulate.recipe import EXAMPLE_FOLDER
+from benchmarks import objects
 from benchmarks.look import slab
-from benchmarks.objects import (
-    COUNTS,
-    QUICK_FIT,
-    STARTS,
-    STRUCK,
-    example_capture,
-    features_of,
-    measured,
-    shared_data,
-    solid_estimator,
-    surface_of,
-)
 from benchmarks.processes import timed
 from benchmarks.records import Measurement, Record, Settings, records
 from tests.oracles.known_modes import AIRCRAFT, LEAST_SHARE, count_modes, tree_frequencies
@@ -57,7 +46,7 @@ NOISES = (-20.0, -40.0, -60.0)
 
 def _by_threshold(name: str) -> Impacts:
     """Read a capture with each sound from its own onset on, final, whatever the others say."""
-    settings, folder = CaptureSettings(), shared_data() / name
+    settings, folder = CaptureSettings(), objects.shared_data() / name
     rows = [parse_row(row, settings) for row in read_rows(folder)[0]]
     prepared = [prepare(read_recording(folder / row.file, row.file), settings, newtons=row.newtons) for row in rows]
     rate = prepared[0].rate
@@ -75,7 +64,7 @@ def _by_threshold(name: str) -> Impacts:
 def _bowl() -> tuple[Impacts, Impacts]:
     """Return the clips of a bowl by threshold, final, and with what lies around them."""
     settings = CaptureSettings()
-    paths = sorted((shared_data() / "bowl_clips").glob("*.wav"))
+    paths = sorted((objects.shared_data() / "bowl_clips").glob("*.wav"))
     recordings = [read_recording(path) for path in paths]
     prepared, rate = [prepare(each, settings) for each in recordings], recordings[0].sample_rate
     samples, margin = round(settings.kept_seconds(rate) * rate), margin_length(rate)
@@ -99,7 +88,7 @@ def _captures(settings: Settings) -> Iterator[Record]:
     |amplitude|^2 / damping, of the modes extracted; 1 is one phase a mode. unaligned: recordings named as such.
     """
     for name in (*ALIGNED, "bowl_clips"):
-        before, after = _bowl() if name == "bowl_clips" else (_by_threshold(name), measured(name).impacts)
+        before, after = _bowl() if name == "bowl_clips" else (_by_threshold(name), objects.measured(name).impacts)
         modes = extract_modes(after)
         assert modes.alignment is not None
         delays = modes.alignment.delays
@@ -123,20 +112,20 @@ def _errors(settings: Settings) -> Iterator[Record]:
     Means of farthest-point splits from contacts 0, 18 and 37, as far as there are so many. no_body: kernels of
     positions; auto: a solid body too; network: the attention network, quick settings.
     """
-    config = QUICK_FIT if settings.quick else FitConfig()
+    config = objects.QUICK_FIT if settings.quick else FitConfig()
     for name in ALIGNED:
-        capture = measured(name)
+        capture = objects.measured(name)
         methods: dict[str, GainEstimator] = {"no_body": MixtureEstimator()}
         if capture.surface is not None:
-            methods["auto"] = solid_estimator(capture.surface, settings)
+            methods["auto"] = objects.solid_estimator(capture.surface, settings)
         methods["network"] = Attention()
         pair = {"before": _by_threshold(name), "after": capture.impacts}
-        for count in settings.some(COUNTS[name]):
+        for count in settings.some(objects.COUNTS[name]):
             for method, estimator in methods.items():
                 errors = {}
                 for when, impacts in pair.items():
-                    features = features_of(replace(capture, impacts=impacts))
-                    starts = settings.some([start for start in STARTS if start < len(impacts)])
+                    features = objects.features_of(replace(capture, impacts=impacts))
+                    starts = settings.some([start for start in objects.STARTS if start < len(impacts)])
                     splits = (split(impacts, count, start=start) for start in starts)
                     errors[when] = float(np.mean([_error(*each, features, estimator, config) for each in splits]))
                 yield from records(errors, group=f"{count}.{method}", object=name)
@@ -155,19 +144,19 @@ def _jitter(settings: Settings) -> Iterator[Record]:
     standard error, from the scatter of the draws; rms: of the delays, but for what all have in common, worst draw;
     unaligned: recordings named as not aligned, all draws.
     """
-    capture, truth = example_capture(), read_truth(EXAMPLE_FOLDER)
+    capture, truth = objects.example_capture(), read_truth(EXAMPLE_FOLDER)
     assert truth.starts is not None
-    plate = STRUCK.strikes(20 if settings.quick else 40, seconds=1.0)
+    plate = objects.STRUCK.strikes(20 if settings.quick else 40, seconds=1.0)
     # The plate's files: silence before the impact, which begins at their last sample.
     silence = torch.zeros(len(plate), 2 * margin_length(plate.sample_rate))
     body = BodyConfig(dofs=5000) if settings.quick else BodyConfig()
-    mug = MixtureEstimator(bodies=candidate_bodies(surface_of(capture), body, impacts=capture.impacts))
-    flat = solid_estimator(slab(STRUCK.plate), settings)
+    mug = MixtureEstimator(bodies=candidate_bodies(objects.surface_of(capture), body, impacts=capture.impacts))
+    flat = objects.solid_estimator(slab(objects.STRUCK.plate), settings)
     cases = {
-        "mug": (_wide(EXAMPLE_FOLDER, truth.starts), features_of(capture), mug),
-        "plate": (replace(plate, before=silence, after=silence), STRUCK.features(), flat),
+        "mug": (_wide(EXAMPLE_FOLDER, truth.starts), objects.features_of(capture), mug),
+        "plate": (replace(plate, before=silence, after=silence), objects.STRUCK.features(), flat),
     }
-    config = QUICK_FIT if settings.quick else FitConfig()
+    config = objects.QUICK_FIT if settings.quick else FitConfig()
     for name, (files, features, estimator) in cases.items():
         still: dict[str, Float64[Tensor, " draws"]] | None = None
         exact: Float64[Tensor, " contacts"] | None = None
@@ -205,9 +194,9 @@ def _modes(settings: Settings) -> Iterator[Record]:
     """Known modes of measured captures that are found, and extra ones; the aircraft's count from 1 % of the energy."""
     for name, known, share in (
         ("aircraft_response", AIRCRAFT, LEAST_SHARE),
-        ("tree43", tree_frequencies(shared_data()), 0.0),
+        ("tree43", tree_frequencies(objects.shared_data()), 0.0),
     ):
-        impacts = measured(name).impacts
+        impacts = objects.measured(name).impacts
         extraction = extract_modes(impacts)
         counted = count_modes(impacts, extraction, known, least_share=share)
         quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)

@@ -51,12 +51,7 @@ from benchmarks.mode_embedding import FEATURES, MaterialSpace
 from benchmarks.records import Record, Settings, markdown, means, records
 from benchmarks.simulatedobjects import OTHER_SHAPES, SHAPES, SolvedShape, drawn_size, simulated_objects
 
-RECORDED_TRANSITIONS: tuple[Transition, ...] = (
-    ("ceramic", "wood"),
-    ("wood", "ceramic"),
-    ("wood", "glass"),
-    ("glass", "metal"),
-)
+RECORDED_TRANSITIONS = (("ceramic", "wood"), ("wood", "ceramic"), ("wood", "glass"), ("glass", "metal"))
 """Contrasting pairs for the 26 objects. The paper shows the first two and calls the others contrastive: ours."""
 SIMULATED_TRANSITIONS: tuple[Transition, ...] = (("ceramic", "wood"), ("glass", "steel"), ("wood", "glass"))
 """Those that are evaluated with recordings as target and several seeds."""

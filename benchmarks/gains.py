@@ -26,19 +26,8 @@ from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.recipe import SET, SETS
+from benchmarks import objects
 from benchmarks.ablation import ablation, outliers, supports
-from benchmarks.objects import (
-    COUNTS,
-    ROUGH,
-    SplitCase,
-    bodies_of,
-    example_capture,
-    measured,
-    simulated,
-    splits_of,
-    surface_of,
-    views_and_gaussians,
-)
 from benchmarks.processes import timed
 from benchmarks.records import Measurement, Record, Settings, means, records
 
@@ -64,11 +53,11 @@ def _captures(settings: Settings) -> Iterator[Record]:
     coverage: part of the held-out gains, by energy, in their intervals of 90 %. worst: of the splits.
     """
     to_simple, to_best = [], []
-    for name, counts in COUNTS.items():
-        capture = measured(name)
-        bodies = None if capture.surface is None else bodies_of(capture.surface, settings)
+    for name, counts in objects.COUNTS.items():
+        capture = objects.measured(name)
+        bodies = None if capture.surface is None else objects.bodies_of(capture.surface, settings)
         for count in settings.some(counts):
-            runs = [_errors(case, settings) for case in splits_of(capture, count, bodies, settings)]
+            runs = [_errors(case, settings) for case in objects.splits_of(capture, count, bodies, settings)]
             for run in runs:
                 run["best simple"] = min(run[method] for method in SIMPLE if method in run)
                 to_simple.append(run[MIXTURE] / run["best simple"])
@@ -80,7 +69,7 @@ def _captures(settings: Settings) -> Iterator[Record]:
     yield from records({"worst_ratio_to_simple": max(to_simple), "mean_ratio_to_best": float(np.mean(to_best))})
 
 
-def _errors(case: SplitCase, settings: Settings) -> dict[str, float]:
+def _errors(case: objects.SplitCase, settings: Settings) -> dict[str, float]:
     """Return each method's error, and the part of held-out gains within the mixture's intervals of 90 %."""
     single = {
         method: evaluate(make(case.train), case.test).mean()["relative_stft"]
@@ -109,19 +98,19 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
     """
     rows = []
     for name in settings.objects or settings.some(tuple(SETS[of])):
-        capture, truth = simulated(name, settings, tidy=condition == "tidy")
-        surface: Surface | ObjectShape = surface_of(capture)
+        capture, truth = objects.simulated(name, settings, tidy=condition == "tidy")
+        surface: Surface | ObjectShape = objects.surface_of(capture)
         if condition == "noisy":
-            surface = roughened(surface_of(capture), ROUGH, seed=0)
+            surface = roughened(objects.surface_of(capture), objects.ROUGH, seed=0)
         elif condition in {"photographs", "offset"}:
-            views, cloud = views_and_gaussians(name, settings)
+            views, cloud = objects.views_and_gaussians(name, settings)
             surface = shape_of_cloud(cloud, views)
             capture = replace(capture, surface=surface.as_seen())
         if condition == "offset":
             capture = replace(capture, impacts=_moved(capture.impacts))
-        bodies = bodies_of(surface, settings)
+        bodies = objects.bodies_of(surface, settings)
         case, *fewer = (
-            SplitCase.of(*split(capture.impacts, count), capture, bodies)
+            objects.SplitCase.of(*split(capture.impacts, count), capture, bodies)
             for count in (_IMPACTS if not condition else _IMPACTS[:1])
         )
         rows.append(_scores(case, truth, settings))
@@ -138,7 +127,7 @@ def _moved(impacts: Impacts) -> Impacts:
     return replace(impacts, contacts=impacts.contacts + 0.002 * ways / ways.norm(dim=1, keepdim=True))
 
 
-def _scores(case: SplitCase, truth: Truth, settings: Settings) -> dict[str, float]:
+def _scores(case: objects.SplitCase, truth: Truth, settings: Settings) -> dict[str, float]:
     """Return the values of one simulated object."""
     field = case.fit(MixtureEstimator(bodies=case.bodies), quick=settings.quick)
     scores, averaged = evaluate(field, case.test).mean(), evaluate(MeanWaveform(case.train), case.test).mean()
@@ -178,9 +167,9 @@ def _modal_error(field: SoundField, test: Impacts, truth: Truth) -> float:
 
 def _speed(settings: Settings) -> Iterator[Record]:
     """Fit of the built-in example to 12 contacts with its elastic modes at hand."""
-    capture = example_capture()
-    bodies = bodies_of(surface_of(capture), settings)
-    case = SplitCase.of(*split(capture.impacts, 12), capture, bodies)
+    capture = objects.example_capture()
+    bodies = objects.bodies_of(objects.surface_of(capture), settings)
+    case = objects.SplitCase.of(*split(capture.impacts, 12), capture, bodies)
     _, seconds = timed(lambda: case.fit(MixtureEstimator(bodies=bodies), quick=settings.quick))
     yield from records({"example_fit_seconds": seconds})
 

@@ -19,17 +19,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.simulate.recipe import SIM20
-from benchmarks.objects import (
-    QUICK_FIT,
-    STRUCK,
-    example_capture,
-    features_of,
-    measured,
-    settings_of,
-    simulated,
-    solid_estimator,
-    surface_of,
-)
+from benchmarks import objects
 from benchmarks.records import Measurement, Record, Settings, means, records
 
 RATES = {"trained": 0.1, "measured": 0.0}
@@ -61,7 +51,7 @@ def _measure(settings: Settings, part: str) -> Iterator[Record]:
 
 def _compared(case: _Case, settings: Settings) -> Iterator[tuple[str, dict[str, float]]]:
     train, test, features, gains = case
-    config = QUICK_FIT if settings.quick else FitConfig(damping="shared")
+    config = objects.QUICK_FIT if settings.quick else FitConfig(damping="shared")
     modes = extract_modes(train)
     test = modes.aligned(test)
     for name, rate in RATES.items():
@@ -91,22 +81,26 @@ def _cases(part: str, settings: Settings) -> Iterator[tuple[str, _Case]]:
     """Yield the objects of a part: training and held-out recordings, features and gain model."""
     if part == "plate":
         count, seconds = (20, 0.25) if settings.quick else (100, 3.0)
-        yield part, (*split(STRUCK.strikes(count, seconds=seconds), 0.2), STRUCK.features(), MixtureEstimator())
-    elif part == "aircraft":
-        capture = measured("aircraft_response", settings_of("aircraft_response"))
-        solid = MixtureEstimator() if settings.quick else solid_estimator(surface_of(capture), settings)
-        yield part, (*split(capture.impacts, 15), features_of(capture), solid)
-    elif part == "mug":
-        capture = example_capture()
-        bodies = None if settings.quick else candidate_bodies(surface_of(capture))
-        yield part, (*split(capture.impacts, 12), features_of(capture), MixtureEstimator(bodies=bodies))
-    else:
-        for name in settings.objects or settings.some(tuple(SIM20)):
-            capture, _ = simulated(name, settings)
+        train, test = split(objects.STRUCK.strikes(count, seconds=seconds), 0.2)
+        yield part, (train, test, objects.STRUCK.features(), MixtureEstimator())
+        return
+    for name in settings.objects or settings.some(tuple(SIM20)) if part == "sim20" else (part,):
+        if part == "aircraft":
+            capture, count = objects.measured("aircraft_response", objects.settings_of("aircraft_response")), 15
+        elif part == "mug":
+            capture, count = objects.example_capture(), 12
+        else:
+            capture, count = objects.simulated(name, settings)[0], 8
             full_scale = capture.impacts.sounds / capture.impacts.sounds.abs().max()
-            train, test = split(replace(capture.impacts, sounds=full_scale), 8)
-            bodies = None if settings.quick else candidate_bodies(surface_of(capture), impacts=train)
-            yield name, (train, test, features_of(capture), MixtureEstimator(bodies=bodies))
+            capture = replace(capture, impacts=replace(capture.impacts, sounds=full_scale))
+        train, test = split(capture.impacts, count)
+        gains, surface = MixtureEstimator(), objects.surface_of(capture)
+        if part == "aircraft" and not settings.quick:
+            gains = objects.solid_estimator(surface, settings)
+        elif not settings.quick:
+            impacts = train if part == "sim20" else None
+            gains = MixtureEstimator(bodies=candidate_bodies(surface, impacts=impacts))
+        yield name, (train, test, objects.features_of(capture), gains)
 
 
 PARTS: dict[str, Measurement] = {part: partial(_measure, part=part) for part in ("mug", "plate", "aircraft", "sim20")}

@@ -191,15 +191,22 @@ def _mesh(surface: Surface) -> trimesh.Trimesh:
     return trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
 
 
+def _axes(order: int, *directions: tuple[float, float, float]) -> tuple[Element, ...]:
+    return tuple(Element(each, order=order) for each in directions)
+
+
+def _planes(*normals: tuple[float, float, float]) -> tuple[Element, ...]:
+    return tuple(Element(each, mirror=True) for each in normals)
+
+
 def _prism(sides: int) -> Shape:
     """A prism of height 1.5 about z whose corners lie on the unit circle, the first of them on x."""
     turn = math.pi / sides
     across = [(math.cos(step * turn), math.sin(step * turn), 0.0) for step in range(sides)]
     # Half turns about axes through corners and the middles of sides; planes contain z and such an axis.
-    elements = [Element((0, 0, 1), order=sides), Element((0, 0, 1), mirror=True)]
-    elements += [Element(axis, order=2) for axis in across]
-    elements += [Element((-axis[1], axis[0], 0.0), mirror=True) for axis in across]
-    return Shape(lambda: trimesh.creation.cylinder(1.0, 1.5, sections=sides), tuple(elements))
+    planes = _planes((0, 0, 1), *((-axis[1], axis[0], 0.0) for axis in across))
+    elements = (*_axes(sides, (0, 0, 1)), *_axes(2, *across), *planes)
+    return Shape(lambda: trimesh.creation.cylinder(1.0, 1.5, sections=sides), elements)
 
 
 def _ellipsoid() -> trimesh.Trimesh:
@@ -265,38 +272,20 @@ def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 _COORDINATES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 _DIAGONALS = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1))
 _EDGES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1), (0, 1, 1), (0, 1, -1))
-_THREE_OF_EACH = tuple(
-    element for axis in _COORDINATES for element in (Element(axis, order=2), Element(axis, mirror=True))
-)
+_BOX = (*_axes(2, *_COORDINATES), *_planes(*_COORDINATES))
+_CUBE = (*_axes(4, *_COORDINATES), *_axes(3, *_DIAGONALS), *_axes(2, *_EDGES), *_planes(*_COORDINATES, *_EDGES))
+_ROUND = Element((0, 0, 1))
 MADE = {
-    "box": Shape(lambda: trimesh.creation.box((1.0, 0.7, 0.4)), _THREE_OF_EACH),
-    "cube": Shape(
-        lambda: trimesh.creation.box((1.0, 1.0, 1.0)),
-        (
-            *(Element(axis, order=4) for axis in _COORDINATES),
-            *(Element(axis, order=3) for axis in _DIAGONALS),
-            *(Element(axis, order=2) for axis in _EDGES),
-            *(Element(axis, mirror=True) for axis in _COORDINATES + _EDGES),
-        ),
-    ),
+    "box": Shape(lambda: trimesh.creation.box((1.0, 0.7, 0.4)), _BOX),
+    "cube": Shape(lambda: trimesh.creation.box((1.0, 1.0, 1.0)), _CUBE),
     **{f"prism of {sides}": _prism(sides) for sides in (3, 4, 5, 6, 8, 12)},
-    "tetrahedron": Shape(
-        _tetrahedron,
-        (
-            *(Element(axis, order=3) for axis in _DIAGONALS),
-            *(Element(axis, order=2) for axis in _COORDINATES),
-            *(Element(axis, mirror=True) for axis in _EDGES),
-        ),
-    ),
-    "ellipsoid": Shape(_ellipsoid, _THREE_OF_EACH),
-    "cone": Shape(lambda: trimesh.creation.cone(1.0, 2.0, sections=256), (Element((0, 0, 1)),)),
-    "cylinder": Shape(
-        lambda: trimesh.creation.cylinder(1.0, 2.0, sections=256),
-        (Element((0, 0, 1)), Element((0, 0, 1), mirror=True)),
-    ),
-    "can without lid": Shape(_can, (Element((0, 0, 1)),)),
-    "can with handle": Shape(_handled_can, (Element((0, 1, 0), mirror=True),)),
-    "propeller": Shape(_propeller, (Element((0, 0, 1), order=3),)),
+    "tetrahedron": Shape(_tetrahedron, (*_axes(3, *_DIAGONALS), *_axes(2, *_COORDINATES), *_planes(*_EDGES))),
+    "ellipsoid": Shape(_ellipsoid, _BOX),
+    "cone": Shape(lambda: trimesh.creation.cone(1.0, 2.0, sections=256), (_ROUND,)),
+    "cylinder": Shape(lambda: trimesh.creation.cylinder(1.0, 2.0, sections=256), (_ROUND, *_planes((0, 0, 1)))),
+    "can without lid": Shape(_can, (_ROUND,)),
+    "can with handle": Shape(_handled_can, _planes((0, 1, 0))),
+    "propeller": Shape(_propeller, _axes(3, (0, 0, 1))),
     "bracket": Shape(_bracket),
     "blob": Shape(_blob),
 }
@@ -321,13 +310,11 @@ SCANNED = {
         Element((0.0, 1.0, 0.0), (-0.0225, 0.0, 0.01), order=2),
     ),
 }
-
-
 # Of kinds that no tolerance of the search was chosen on.
 HELD_OUT = {
-    "bottle-glass": (Element((0, 0, 1)),),
-    "lid-ceramic": (Element((0, 0, 1)),),
-    "boomerang-wood": (Element((0, 1, 0), mirror=True), Element((0, 0, 1), mirror=True), Element((1, 0, 0), order=2)),
-    "channel-steel": (Element((1, 0, 0), mirror=True), Element((0, 1, 0), mirror=True), Element((0, 0, 1), order=2)),
-    "scallop-polycarbonate": (Element((0, 1, 0), mirror=True),),
+    "bottle-glass": (_ROUND,),
+    "lid-ceramic": (_ROUND,),
+    "boomerang-wood": (*_planes((0, 1, 0), (0, 0, 1)), *_axes(2, (1, 0, 0))),
+    "channel-steel": (*_planes((1, 0, 0), (0, 1, 0)), *_axes(2, (0, 0, 1))),
+    "scallop-polycarbonate": _planes((0, 1, 0)),
 }
