@@ -1,7 +1,6 @@
 """The benchmark's protocol of editing: its objects, its scores, its record and the figures of that record."""
 
 import json
-import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +17,6 @@ from avmsf.errors import AvmsfWarning, EditError, EvaluationError
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import MATERIALS, STEEL, WOOD
 from avmsf.modal.modes import ModalBank
-from benchmarks import editingfigures
 from benchmarks import editingprotocol as protocol
 from benchmarks.editing import (
     PHYSICS,
@@ -142,9 +140,7 @@ def scored(record: Path) -> set[tuple[str, str, str]]:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
-def test_the_protocol_of_words_runs_on_simulated_objects_and_its_record_is_drawn(
-    plates_alone, tmp_path, monkeypatch, capsys
-):
+def test_the_protocol_of_words_runs_on_simulated_objects_and_its_record_is_drawn(plates_alone, tmp_path, monkeypatch):
     pytest.importorskip("diffusers", reason="needs pip install 'avmsf[text]'")
     pytest.importorskip("transformers")
     monkeypatch.setattr(protocol, "SEVEN_TRANSITIONS", SEVEN_TRANSITIONS[3:4])
@@ -158,21 +154,16 @@ def test_the_protocol_of_words_runs_on_simulated_objects_and_its_record_is_drawn
     monkeypatch.setattr(StableAudio, "generate", ringing)
     save_clap(tmp_path / "clap")
     model, record = save_audio(tmp_path / "tiny-audio"), tmp_path / "scores.json"
+    figures = tmp_path / "figures"
     words = ["--simulated", "--model", str(model), "--clap", str(tmp_path / "clap"), "--generated", "0.5"]
-    assert protocol.main([*words, "--steps", "1", "--record", str(record)]) == 0
+    assert protocol.main([*words, "--steps", "1", "--record", str(record), "--figures", str(figures)]) == 0
     methods = ("before", "generation", "audio-sds", "hierarchical")
     assert scored(record) == {(name, "steel", "plastic") for name in methods}
     scores = json.loads(record.read_text(encoding="utf-8"))["scores"]
     # Two shapes, two prompts.
     assert [sum(each["method"] == name for each in scores) for name in methods] == [4] * 4
     assert {each["prompt"] for each in scores} == {*PROMPTS["plastic"]}
-    metrics = json.loads(capsys.readouterr().out.splitlines()[-1])
-    for name in methods:
-        expected = np.mean([each["clap"] for each in scores if each["method"] == name])
-        assert metrics[f"simulated.clap_{name}"] == pytest.approx(expected)
-        assert math.isfinite(metrics[f"simulated.umap_{name}"])
-    assert editingfigures.main([str(record), str(tmp_path / "figures")]) == 0
-    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    names = {path.name for path in figures.iterdir()}
     assert {"umap-pitches-steel-to-plastic.png", "clap.png"} <= names
 
 
@@ -183,10 +174,3 @@ def test_the_simulated_protocol_without_a_model_goes_by_recordings(plates_alone,
     assert protocol.main(["--simulated", "--steps", "1", "--record", str(record)]) == 0
     methods = ("before", "unconstrained", "hierarchical", "physics")
     assert scored(record) == {(name, "iron", "polycarbonate") for name in methods}
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"scores": [{}], "spaces": {}}'])
-def test_another_file_is_no_record(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "other.json").write_text(text, encoding="utf-8")
-    assert editingfigures.main([str(tmp_path / "other.json"), str(tmp_path / "figures")]) == 2
-    assert "other.json" in capsys.readouterr().err
