@@ -173,7 +173,8 @@ def test_a_capture_is_reconstructed(capturing: Any) -> None:
     page.click("text=Save recording")
     page.wait_for_selector("text=2 impacts")
     page.click("text=Reconstruct the field")
-    page.wait_for_selector("text=avmsf studio /captures/plate/field")
+    page.wait_for_selector("text=The sound field is ready.")
+    assert page.locator("text=Field saved: /captures/plate/field").count() == 1
 
 
 def test_a_recording_that_was_not_kept_waits_when_the_next_is_made(capturing: Any) -> None:

@@ -93,13 +93,13 @@ def any_page(pages: dict[str, "Page"]) -> "Page":
     return pages["shared"]
 
 
-def heard(page: "Page", blows: Sequence[dict[str, Any]], **options: Any) -> np.ndarray:
+def heard(page: "Page", impacts: Sequence[dict[str, Any]], **options: Any) -> np.ndarray:
     sound = page.evaluate(
-        """async ([blows, seconds, options]) => {
-             const sound = await renderOffline(bundle, blows, seconds ?? undefined, options);
+        """async ([impacts, seconds, options]) => {
+             const sound = await renderOffline(bundle, impacts, seconds ?? undefined, options);
              return window.asText(sound);
            }""",
-        [list(blows), options.pop("seconds", None), options],
+        [list(impacts), options.pop("seconds", None), options],
     )
     return numbers(sound)
 
@@ -115,7 +115,7 @@ def error(found: np.ndarray, expected: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    ("blow", "pulse"),
+    ("impact", "pulse"),
     [
         ({"row": 0}, None),
         ({"row": 3, "force": 40.0}, None),
@@ -124,21 +124,21 @@ def error(found: np.ndarray, expected: torch.Tensor) -> float:
         ({"row": 2, "force": 2.0, "contactTime": 9e-3, "shape": "hertz"}, ForcePulse(9e-3, "hertz")),
     ],
 )
-def test_a_blow_is_what_python_renders(page: "Page", table: SampledField, blow: dict[str, Any], pulse: Any) -> None:
-    expected = table.render(torch.tensor([blow["row"]]), force=blow.get("force", 1.0), pulse=pulse)[0]
-    assert error(heard(page, [blow]), expected) < 1e-6
+def test_a_impact_is_what_python_renders(page: "Page", table: SampledField, impact: dict[str, Any], pulse: Any) -> None:
+    expected = table.render(torch.tensor([impact["row"]]), force=impact.get("force", 1.0), pulse=pulse)[0]
+    assert error(heard(page, [impact]), expected) < 1e-6
 
 
-def together(table: SampledField, blows: Sequence[tuple[int, float, int]], samples: int) -> torch.Tensor:
-    """Return the sum of blows on rows, of some force, from some sample on."""
+def together(table: SampledField, impacts: Sequence[tuple[int, float, int]], samples: int) -> torch.Tensor:
+    """Return the sum of impacts on rows, of some force, from some sample on."""
     sound = torch.zeros(samples, dtype=torch.float64)
-    for row, force, frame in blows:
+    for row, force, frame in impacts:
         one = table.render(torch.tensor([row]), force=force, samples=table.samples)[0].double()
         sound[frame:] += one[: samples - frame]
     return sound
 
 
-def test_blows_overlap_from_the_very_sample_on_at_which_they_begin(page: "Page", table: SampledField) -> None:
+def test_impacts_overlap_from_the_very_sample_on_at_which_they_begin(page: "Page", table: SampledField) -> None:
     """At the beginning, the end and the middle of blocks of 128 samples, two in one block, two at once."""
     places = [
         (0, 1.0, 0),
@@ -149,8 +149,8 @@ def test_blows_overlap_from_the_very_sample_on_at_which_they_begin(page: "Page",
         (5, 1.0, 9000),
         (0, 1.0, 9000),
     ]
-    blows = [{"row": row, "force": force, "when": frame / RATE} for row, force, frame in places]
-    assert error(heard(page, blows), together(table, places, table.samples)) < 1e-6
+    impacts = [{"row": row, "force": force, "when": frame / RATE} for row, force, frame in places]
+    assert error(heard(page, impacts), together(table, places, table.samples)) < 1e-6
 
 
 @pytest.mark.parametrize("rate", [11_025.0, 44_100.0])
@@ -185,7 +185,7 @@ def test_the_engine_plays_what_is_rendered_and_goes_on_with_another_field(page: 
                setTimeout(() => context.resume(), 100);
              });
              at(128 * 25 / rate, () => engine.node.port.postMessage(
-               { type: "strike", blow: engine.tuned.blow(2, { force: 0.8 }, 0, 1) }));
+               { type: "strike", impact: engine.tuned.impact(2, { force: 0.8 }, 0, 1) }));
              at(128 * 75 / rate, () => engine.replace(bundle));
              const sound = (await context.startRendering()).getChannelData(0);
              return [asText(sound), engine.level];
@@ -230,10 +230,10 @@ def test_a_click_is_heard_live(any_page: "Page") -> None:
     any_page.evaluate("engine.close()")
 
 
-BANK = """({ field, blows, seconds, voices }) => {
+BANK = """({ field, impacts, seconds, voices }) => {
   const rate = 16000, frequency = Float64Array.from(field.frequency), noise = Float32Array.from(field.noise);
   const bank = new Bank({ ...field, frequency, noise }, rate, 128, voices);
-  for (const blow of blows) bank.strike({ force: [1], strength: 1, loudest: 1, damping: null, ...blow });
+  for (const impact of impacts) bank.strike({ force: [1], strength: 1, loudest: 1, damping: null, ...impact });
   const sound = new Float64Array(128 * Math.ceil(seconds * rate / 128));
   for (let frame = 0; frame < sound.length; frame += 128) bank.render(sound.subarray(frame, frame + 128), frame);
   const banks = bank.shared === null ? bank.sounding.map((voice) => voice.resonators) : [bank.shared];
@@ -242,19 +242,19 @@ BANK = """({ field, blows, seconds, voices }) => {
 }"""
 
 
-def test_blows_that_make_room_fade(page: "Page", kind: str) -> None:
+def test_impacts_that_make_room_fade(page: "Page", kind: str) -> None:
     """Six sines of amplitude one where two may sound: a cut would be a step of up to 1, the sines' own are .04."""
     damping = [0.5]
-    blow = {"sine": [1.0], "cosine": [0.0], "damping": None if kind == "shared" else damping}
+    impact = {"sine": [1.0], "cosine": [0.0], "damping": None if kind == "shared" else damping}
     field = {"frequency": [100.0], "damping": damping if kind == "shared" else None, "noise": [1.0] * 20_000}
     field["noise"] = [0.0] if kind == "perContact" else field["noise"]
     given = {"field": field, "voices": 2, "seconds": 0.5}
-    blows = [{**blow, "frame": 1000 * number + 37} for number in range(6)]
-    found = page.evaluate(BANK, {**given, "blows": blows})
+    impacts = [{**impact, "frame": 1000 * number + 37} for number in range(6)]
+    found = page.evaluate(BANK, {**given, "impacts": impacts})
     sound = np.asarray(found["sound"])
     steps = np.abs(np.diff(sound))
-    # Each blow's own noise, all ones, sets in with it.
-    steps[[blow["frame"] - 1 for blow in blows]] = 0
+    # Each impact's own noise, all ones, sets in with it.
+    steps[[impact["frame"] - 1 for impact in impacts]] = 0
     assert steps.max() < 6 * 2 * np.pi * 100 / RATE + 0.011
     assert found["voices"] == 2
     if kind == "perContact":
@@ -265,8 +265,8 @@ def test_noise_does_not_break_off(page: "Page", kind: str) -> None:
     """A draw of ones, which would end in a step of one."""
     damping = None if kind == "perContact" else [400.0]
     field = {"frequency": [100.0], "damping": damping, "noise": [1.0] * 3000}
-    blow = {"frame": 0, "sine": [1e-3], "cosine": [0.0], "loudest": 1e-3, "damping": [400.0]}
-    found = page.evaluate(BANK, {"field": field, "voices": 8, "seconds": 0.5, "blows": [blow]})
+    impact = {"frame": 0, "sine": [1e-3], "cosine": [0.0], "loudest": 1e-3, "damping": [400.0]}
+    found = page.evaluate(BANK, {"field": field, "voices": 8, "seconds": 0.5, "impacts": [impact]})
     sound = np.asarray(found["sound"])
     assert np.abs(np.diff(sound)).max() < 0.003
     np.testing.assert_allclose(sound[1000:3000], 1.0, rtol=0, atol=1e-4)
@@ -277,12 +277,12 @@ def test_noise_does_not_break_off(page: "Page", kind: str) -> None:
 def test_what_cannot_be_heard_is_no_longer_computed(page: "Page", kind: str) -> None:
     """A second of a mode that falls to -120 dB in .35 s, beside one that rings on."""
     dampings = [40.0, 0.1]
-    blow = {"frame": 0, "sine": [1.0, 1.0], "cosine": [0.0, 0.0], "damping": dampings if kind == "perContact" else None}
+    impact = {"frame": 0, "sine": [1.0, 1.0], "cosine": [0.0, 0.0], "damping": dampings if kind == "perContact" else None}
     field = {"frequency": [300.0, 500.0], "damping": dampings if kind == "shared" else None, "noise": [0.0]}
-    given = {"field": field, "voices": 8, "blows": [blow]}
+    given = {"field": field, "voices": 8, "impacts": [impact]}
     assert page.evaluate(BANK, {**given, "seconds": 0.3})["modes"] == 2
     assert page.evaluate(BANK, {**given, "seconds": 0.4})["modes"] == 1
-    blow["damping"] = [40.0, 40.0] if kind == "perContact" else None
+    impact["damping"] = [40.0, 40.0] if kind == "perContact" else None
     field["damping"] = [40.0, 40.0] if kind == "shared" else None
     found = page.evaluate(BANK, {**given, "seconds": 1})
     assert (found["modes"], found["voices"]) == (0, 0)
@@ -351,14 +351,14 @@ def test_a_faulty_sample_is_left_out_and_what_follows_sounds(any_page: "Page", b
     assert not worked
 
 
-def test_blows_in_quick_succession_cost_no_more_than_may_sound_at_once(page: "Page", kind: str) -> None:
+def test_impacts_in_quick_succession_cost_no_more_than_may_sound_at_once(page: "Page", kind: str) -> None:
     """Sixty a second for three seconds, each to ring for far longer."""
     damping = [1.0]
     field = {"frequency": [100.0], "damping": damping if kind == "shared" else None, "noise": [1e-3] * 16_000}
     own = None if kind == "shared" else damping
     frames = [267 * number for number in range(180)]
-    blows = [{"sine": [1.0], "cosine": [0.0], "damping": own, "frame": frame} for frame in frames]
-    found = page.evaluate(BANK, {"field": field, "voices": 8, "seconds": 3, "blows": blows})
+    impacts = [{"sine": [1.0], "cosine": [0.0], "damping": own, "frame": frame} for frame in frames]
+    found = page.evaluate(BANK, {"field": field, "voices": 8, "seconds": 3, "impacts": impacts})
     # One more at most is just fading.
     assert found["voices"] <= 9
     if kind == "shared":
@@ -370,7 +370,7 @@ def test_blows_in_quick_succession_cost_no_more_than_may_sound_at_once(page: "Pa
 
 
 def test_volume_and_recordings_are_heard(any_page: "Page") -> None:
-    """A recording of ones leaves at the level of the blows, and at half of it once the volume is halved."""
+    """A recording of ones leaves at the level of the impacts, and at half of it once the volume is halved."""
     levels = any_page.evaluate(
         """async (rate) => {
              const context = new OfflineAudioContext(1, rate, rate);
@@ -454,7 +454,7 @@ def test_resampling_keeps_a_tone(any_page: "Page", tone: int, rate: int) -> None
 
 
 @pytest.mark.parametrize(
-    ("blow", "words"),
+    ("impact", "words"),
     [
         ({"row": 6}, "expected 0 to 5, got 6"),
         ({"row": 0.5}, "expected 0 to 5, got 0.5"),
@@ -462,8 +462,8 @@ def test_resampling_keeps_a_tone(any_page: "Page", tone: int, rate: int) -> None
         ({"row": 0, "shape": "box"}, "expected half-sine or hertz, got box"),
     ],
 )
-def test_blows_that_are_none_are_refused(any_page: "Page", blow: dict[str, Any], words: str) -> None:
-    said = any_page.evaluate("(blow) => renderOffline(bundle, [blow]).catch((error) => error.message)", blow)
+def test_impacts_that_are_none_are_refused(any_page: "Page", impact: dict[str, Any], words: str) -> None:
+    said = any_page.evaluate("(impact) => renderOffline(bundle, [impact]).catch((error) => error.message)", impact)
     assert words in said
 
 

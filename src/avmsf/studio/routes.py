@@ -18,7 +18,7 @@ from avmsf.export.web import MEDIA_TYPES
 from avmsf.studio.capture import read_contact
 from avmsf.studio.guard import nothing_here, policy_of, read_json_object
 from avmsf.studio.responses import FORESEEN_ERRORS, Answer, error_response, response_to
-from avmsf.studio.studio import Studio, unknown_base
+from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
 _SOUNDS = tuple(suffix for suffix, kind in MEDIA_TYPES.items() if kind.startswith("audio/"))
@@ -52,7 +52,7 @@ def make_app(studio: Studio, announce: Callable[[], None] = lambda: None) -> Sta
         _route("POST", "/lead", calls.lead),
         _route("POST", "/undo", studio.undo, read=read_json_object),
         _route("POST", "/save", studio.save, read=read_json_object, status=201),
-        _route("POST", "/capture/check", studio.check_recording, read=Request.body),
+        _route("POST", "/capture/check", calls.check_recording),
         _route("POST", "/capture/strikes", calls.add_impact, status=201),
         _route("GET", "/capture/strikes/{path:path}", calls.send_recording),
         _route("PUT", "/capture/strikes/{path:path}", calls.redo_impact),
@@ -88,9 +88,12 @@ class Calls:
     async def lead(self, request: Request) -> Any:
         """Optimize the sound towards a recording."""
         base = request.query_params.get("base", "")
-        if not (base.isascii() and base.isdigit() and len(base) < 10):
-            raise unknown_base(base)
-        return await self.studio.lead(int(base), await request.body())
+        return await self.studio.lead({"base": _as_number(base)}, await request.body())
+
+    async def check_recording(self, request: Request) -> Any:
+        """The report on a recording, which is not saved."""
+        content = await request.body()
+        return await self.studio.with_editor(lambda editor: editor.check(content))
 
     async def add_impact(self, request: Request) -> Any:
         """Add an impact to the capture."""
@@ -115,8 +118,8 @@ class Calls:
     def send_job_events(self, request: Request) -> Response:
         """The events of a job, as server-sent events; a page that reconnects gets the events that it has missed."""
         job = self.studio.jobs.named(request.path_params["job"])
-        last = request.headers.get("last-event-id", "")
-        after = int(last) + 1 if last.isdigit() and len(last) < 10 else 0
+        last = _as_number(request.headers.get("last-event-id", ""))
+        after = last + 1 if isinstance(last, int) else 0
 
         async def events() -> AsyncIterator[str]:
             async for number, event in job.listen(after=after):
@@ -129,6 +132,10 @@ class Calls:
         job = request.path_params["job"]
         stopped = await self.studio.jobs.named(job).cancel()
         return {"cancelled" if stopped else "ended": job}
+
+
+def _as_number(text: str) -> int | str:
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else text
 
 
 def _expected(request: Request) -> str | None:

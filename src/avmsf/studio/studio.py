@@ -19,7 +19,7 @@ from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Event, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
 from avmsf.studio.opening import Opened, find_object, shows_more
-from avmsf.studio.responses import NUMERIC_ERRORS, RequestError, bad_request, error_response
+from avmsf.studio.responses import NUMERIC_ERRORS, bad_request, error_response
 from avmsf.studio.session import Revision, Session
 
 
@@ -64,11 +64,6 @@ class Studio:
         self.searches.close()
         await self.jobs.close()
 
-    def manifest(self) -> dict[str, Any]:
-        """Return the manifest of the current revision, with what this server can do."""
-        shown = self.showcase.current
-        return {**shown.manifest, "live": self._live(shown.revision)}
-
     async def locate(self, content: bytes) -> dict[str, Any]:
         """Return the positions of a recording's impacts on the current revision. Raises LocationError, CaptureError."""
         recording = await self.threads.run("read", read_upload, content)
@@ -85,9 +80,9 @@ class Studio:
         sliders = Sliders.read(request, modes=len(self.session.current.require_field().bank))
         return self._changed(await self._compute(self.session.edit, base, sliders))
 
-    async def lead(self, base: int, content: bytes) -> dict[str, Any]:
+    async def lead(self, request: dict[str, Any], content: bytes) -> dict[str, Any]:
         """Start to optimize the field towards a recording. Raises CaptureError for one that cannot be used."""
-        self.session.check_current(base)
+        base = base_of(request)
         await self.threads.run("read", read_upload, content)
         return await self._lead(base, {}, recording=content)
 
@@ -112,10 +107,6 @@ class Studio:
             "object": None if visible is None else visible.name,
             "job": None if running is None else running.identifier,
         }
-
-    async def check_recording(self, content: bytes) -> dict[str, Any]:
-        """Return the report on a recording, which is not saved."""
-        return await self.with_editor(lambda editor: editor.check(content))
 
     async def with_editor(self, act: Callable[[CaptureEditor], Result]) -> Result:
         """Change the capture's impacts, one request after another. Raises RequestError (404) without a capture."""
@@ -200,20 +191,21 @@ class Studio:
         self.searches.prepare_ahead()
         return {"revision": revision.number, "remarks": list(revision.remarks)}
 
-    def _live(self, revision: Revision) -> dict[str, Any]:
-        abilities = list[str]()
-        field, running = revision.field, self.jobs.current
+    def manifest(self) -> dict[str, Any]:
+        """Return the manifest of the current revision, with what this server can do."""
+        shown, running, abilities = self.showcase.current, self.jobs.current, list[str]()
+        revision, field = shown.revision, shown.revision.field
         if field is not None:
             abilities += ["locate", "edit", "save", "like", *(["words"] if self.model is not None else [])]
         if self.editor is not None:
             abilities += ["capture", "reconstruct"]
-        return {
+        live = {
             "revision": revision.number,
             "undo": self.session.can_undo,
             "abilities": abilities,
             "mode": "capture" if field is None else "field",
             "sliders": revision.sliders.to_json(),
-            "remarks": [*self.showcase.current.remarks, *revision.remarks],
+            "remarks": [*shown.remarks, *revision.remarks],
             "rows": [] if field is None else field.audible.nonzero().flatten().tolist(),
             "materials": list(MATERIALS),
             "oldMaterial": OLD_MATERIAL,
@@ -222,16 +214,12 @@ class Studio:
             "jobKind": None if running is None else running.kind,
             "noObject": self.jobs.failure("make_object"),
         }
+        return {**shown.manifest, "live": live}
 
 
 def base_of(request: dict[str, Any]) -> int:
     """Return the revision that a change is based on. Raises RequestError (400) if the request has none."""
     base = request.get("base")
     if not isinstance(base, int) or isinstance(base, bool):
-        raise unknown_base(base)
+        raise bad_request("base", "the number of a revision", base, advice="reload the page")
     return base
-
-
-def unknown_base(base: Any) -> RequestError:
-    """Return the error of a request that does not give the revision which it changes."""
-    return bad_request("base", "the number of a revision", base, advice="reload the page")

@@ -5,8 +5,8 @@ import { Contacts } from "./contacts.js";
 const FORMAT = 1;
 const ARRAYS = { float64: Float64Array, float32: Float32Array };
 const GONE =
-  "The server does not answer. Check that it runs and try again; nothing is lost. A restarted `avmsf studio` prints a " +
-  "new address: open it.";
+  "The server does not answer. Check that it runs and try again; nothing is lost. A restarted `avmsf studio` prints " +
+  "a new address: open it.";
 /** What only the last message of a job holds. */
 const OUTCOMES = ["error", "field", "object", "revision"];
 
@@ -14,22 +14,12 @@ const OUTCOMES = ["error", "field", "object", "revision"];
 export class RequestError extends Error {
   constructor(message, { status = 0, revision = null } = {}) {
     super(message);
-    this.status = status;
-    this.revision = revision;
-  }
-
-  /** Whether another tab was faster. */
-  get stale() {
-    return this.status === 409 && this.revision !== null;
-  }
-
-  /** Whether the server has looked at what it was sent, and does not accept it. */
-  get refusal() {
-    return this.status >= 400 && this.status < 500;
-  }
-
-  get unreachable() {
-    return this.status === 0;
+    Object.assign(this, { status, revision });
+    this.unreachable = status === 0;
+    /** Whether the server has looked at what it was sent, and does not accept it. */
+    this.refusal = status >= 400 && status < 500;
+    /** Whether another tab was faster. */
+    this.stale = status === 409 && revision !== null;
   }
 }
 
@@ -48,16 +38,10 @@ async function request(method, address, { read, name = address, ...options }) {
   throw new RequestError(words, { status: response.status, revision });
 }
 
-/** The address of one of the page's files. A page that is one file carries them in `avmsfInlined`, as base64. */
-function fileUrl(name) {
+/** The address of one of the page's files, which a page that is one file carries in `avmsfInlined`. */
+export function fileUrl(name) {
   const inlined = globalThis.avmsfInlined?.[name];
-  if (inlined === undefined) return new URL(name, document.baseURI).href;
-  if (inlined.url === undefined) {
-    const bytes = Uint8Array.from(atob(inlined.base64), (letter) => letter.charCodeAt(0));
-    inlined.url = URL.createObjectURL(new Blob([bytes], { type: inlined.type }));
-    delete inlined.base64;
-  }
-  return inlined.url;
+  return inlined ? `data:${inlined.type};base64,${inlined.base64}` : new URL(name, document.baseURI).href;
 }
 
 const readFile = (name) => request("GET", fileUrl(name), { name, read: (response) => response.arrayBuffer() });
@@ -100,7 +84,7 @@ export function numbers(text) {
   return new Float32Array(bytes.buffer);
 }
 
-const ask = (method, place, options = {}) => request(method, place, { read: (response) => response.json(), ...options });
+const ask = (method, place, options) => request(method, place, { read: (response) => response.json(), ...options });
 const json = (content) => ({ body: JSON.stringify(content), headers: { "Content-Type": "application/json" } });
 const wav = (body, headers = {}) => ({ body, headers: { "Content-Type": "audio/wav", ...headers } });
 const ifMatch = (digest) => (digest ? { "If-Match": digest } : {});
@@ -109,8 +93,6 @@ const ifMatch = (digest) => (digest ? { "If-Match": digest } : {});
 export const recordingUrl = (file) => `capture/strikes/${file.split("/").map(encodeURIComponent).join("/")}`;
 
 export const server = {
-  manifest: () => ask("GET", "manifest.json"),
-
   /** Where the impacts of a recording fell. */
   locate: (recording) => ask("POST", "locate", wav(recording)),
 

@@ -1,9 +1,9 @@
-// The modal bank: blows in, sound out, on the audio thread.
+// The modal bank: impacts in, sound out, on the audio thread.
 //
-// A mode's sound after a blow is Re(a z^n) with z = exp((-d + 2 pi i f) / rate) and a = cosine - i sine, so that a blow
+// A mode's sound after an impact is Re(a z^n) with z = exp((-d + 2 pi i f) / rate) and a = cosine - i sine, so that one
 // whose force is x[n] drives the resonator s[n] = z s[n-1] + a x[n], heard as Re(s[n]). Where all contacts share their
-// dampings the bank is linear: one resonator a mode serves all blows exactly, however many they are. Where dampings
-// depend on the contact every blow brings resonators of its own.
+// dampings the bank is linear: one resonator a mode serves all impacts exactly, however many they are. Where dampings
+// depend on the contact every impact brings resonators of its own.
 //
 // Between inputs a mode is run as y[n] = 2 Re(z) y[n-1] - |z|^2 y[n-2] within a block and its complex state is carried
 // from block to block by z^block, so that rounding does not add up over seconds. All in double precision.
@@ -11,7 +11,7 @@
 // All of it is one module that imports nothing, long as it is: an audio thread loads a page's worklet as one file, and
 // from a page that is itself one file there is nothing else to be had.
 
-/** Amplitude, over that of a blow's loudest mode, below which all that is left out of a blow lies: -120 dB. */
+/** Amplitude, over that of an impact's loudest mode, below which all that is left out of an impact lies: -120 dB. */
 const INAUDIBLE = 1e-6;
 /** Loudest sample that leaves. */
 const CEILING = 0.98;
@@ -19,16 +19,17 @@ const CEILING = 0.98;
 const ABSURD = 1e9;
 /** Seconds in which the limiter lets go. */
 const RELEASE = 0.1;
-/** Seconds in which a blow that has to make room, or a field that was replaced, fades. */
+/** Seconds in which an impact that has to make room, or a field that was replaced, fades. */
 const FADE = 0.01;
 /** Seconds in which the noise fades behind the end of its draw. */
 const NOISE_FADE = 0.05;
 /** Seconds between two words to the page on whether the limiter is at work. */
 const REPORT = 0.05;
 
-/** Modes with their states. */
+/** Modes with their states, at first silent. */
 export class Resonators {
-  constructor(modes) {
+  constructor(frequency, damping, rate, block) {
+    const modes = frequency.length;
     this.modes = modes;
     // One place more than there are modes: a silent one, with which groups of four are filled up.
     for (const name of ["zRe", "zIm", "stepRe", "stepIm", "twice", "square", "re", "im"])
@@ -36,10 +37,7 @@ export class Resonators {
     this.ringing = new Int32Array(modes + 4);
     this.count = 0;
     this.rings = new Uint8Array(modes + 1);
-  }
-
-  tune(frequency, damping, rate, block) {
-    for (let mode = 0; mode < this.modes; mode++) {
+    for (let mode = 0; mode < modes; mode++) {
       const angle = (2 * Math.PI * frequency[mode]) / rate;
       const radius = Math.exp(-damping[mode] / rate);
       this.zRe[mode] = radius * Math.cos(angle);
@@ -50,14 +48,6 @@ export class Resonators {
       this.stepRe[mode] = far * Math.cos(angle * block);
       this.stepIm[mode] = far * Math.sin(angle * block);
     }
-    this.silence();
-  }
-
-  silence() {
-    this.re.fill(0);
-    this.im.fill(0);
-    this.rings.fill(0);
-    this.count = 0;
   }
 
   /** Add a block of what is ringing to `out`, and forget modes whose amplitude has fallen below `floor`. */
@@ -148,11 +138,11 @@ export class Resonators {
 }
 
 /**
- * All blows on one field.
+ * All impacts on one field.
  *
- * `field`: frequency and damping (null where every blow brings its own), Hz and 1/s; noise, a draw at this rate.
- * A blow: `frame` at which it starts, `sine` and `cosine` a mode, `damping` a mode or null, `force` a sample (its sum is
- * the blow's strength), `strength`, and `loudest`, the amplitude of its loudest mode when the force is over.
+ * `field`: frequency and damping (null where every impact brings its own), Hz and 1/s; noise, a draw at this rate.
+ * An impact: `frame` at which it starts, `sine` and `cosine` a mode, `damping` a mode or null, `force` a sample, its
+ * sum `strength`, and `loudest`, the amplitude of its loudest mode when the force is over.
  */
 export class Bank {
   constructor(field, rate, block, voices) {
@@ -162,23 +152,17 @@ export class Bank {
     this.voices = voices;
     this.modes = field.frequency.length;
     this.noisy = field.noise.some((value) => value !== 0);
-    this.shared = null;
-    if (field.damping !== null) {
-      this.shared = new Resonators(this.modes);
-      this.shared.tune(field.frequency, field.damping, rate, block);
-    }
+    this.shared = field.damping === null ? null : new Resonators(field.frequency, field.damping, rate, block);
     this.waiting = [];
     this.sounding = [];
-    this.spare = [];
     this.scratch = new Float64Array(block);
     this.begun = [];
-    // Of what rings in shared resonators: the lowest floor of the blows that have a part in it, and its end.
+    /** Of what rings in shared resonators: the lowest floor of the impacts that have a part in it. */
     this.floor = Infinity;
-    this.until = 0;
   }
 
-  strike(blow) {
-    this.waiting.push(blow);
+  strike(impact) {
+    this.waiting.push(impact);
   }
 
   /** Add the block that begins at `frame` to `out`. */
@@ -192,7 +176,7 @@ export class Bank {
       const own = voice.resonators;
       if (own !== null) own.run(target, block, voice.floor);
       if (voice.fed < voice.force.length) {
-        // Of shared resonators a blow cannot be taken back: it only stops its noise, once it is fed.
+        // Of shared resonators an impact cannot be taken back: it only stops its noise, once it is fed.
         const heard = own === null ? out : target;
         (own ?? shared).drive(voice.sine, voice.cosine, voice.force, voice.fed, begin, heard, block, voice.least);
         voice.fed += block - begin;
@@ -200,44 +184,27 @@ export class Bank {
       if (this.noisy && voice.leaving > 0) this.addNoise(voice, target, begin);
       if (voice.leaving !== Infinity) this.fade(voice, out);
     }
-    this.end(frame + block);
+    this.end();
   }
 
   begin(frame) {
     const later = [];
-    for (const blow of this.waiting) {
-      if (blow.frame >= frame + this.block) {
-        later.push(blow);
+    for (const impact of this.waiting) {
+      if (impact.frame >= frame + this.block) {
+        later.push(impact);
         continue;
       }
       if (this.sounding.filter((voice) => voice.leaving === Infinity).length >= this.voices) this.makeRoom();
-      const voice = { ...blow, frame: Math.max(blow.frame, frame), fed: 0, heard: 0, leaving: Infinity };
-      voice.floor = (INAUDIBLE * blow.loudest) / this.modes;
-      voice.least = blow.strength === 0 ? Infinity : voice.floor / Math.abs(blow.strength);
+      const voice = { ...impact, frame: Math.max(impact.frame, frame), fed: 0, heard: 0, leaving: Infinity };
+      voice.floor = (INAUDIBLE * impact.loudest) / this.modes;
+      voice.least = impact.strength === 0 ? Infinity : voice.floor / Math.abs(impact.strength);
       voice.resonators = null;
-      if (this.shared === null) {
-        voice.resonators = this.spare.pop() ?? new Resonators(this.modes);
-        voice.resonators.tune(this.field.frequency, blow.damping, this.rate, this.block);
-      }
-      if (this.shared !== null) {
-        this.floor = Math.min(this.floor, voice.floor);
-        // Long enough for the slowest mode to sink below the floor.
-        this.until = Math.max(this.until, voice.frame + blow.force.length + this.lasting(voice));
-      }
+      if (this.shared !== null) this.floor = Math.min(this.floor, voice.floor);
+      else voice.resonators = new Resonators(this.field.frequency, impact.damping, this.rate, this.block);
       this.sounding.push(voice);
-      this.begun.push({ id: blow.id, frame: voice.frame });
+      this.begun.push({ id: impact.id, frame: voice.frame });
     }
     this.waiting = later;
-  }
-
-  lasting(voice) {
-    const { damping } = this.field;
-    let longest = 0;
-    for (let mode = 0; mode < this.modes; mode++) {
-      const size = Math.hypot(voice.sine[mode], voice.cosine[mode]);
-      if (size > voice.least) longest = Math.max(longest, Math.log(size / voice.least) / damping[mode]);
-    }
-    return longest * this.rate;
   }
 
   makeRoom() {
@@ -273,22 +240,18 @@ export class Bank {
     voice.leaving = Math.max(0, voice.leaving - this.block);
   }
 
-  end(frame) {
+  end() {
     let kept = 0;
     const fade = NOISE_FADE * this.rate, length = this.field.noise.length;
     for (const voice of this.sounding) {
       const noise = this.noisy && voice.heard < length + Math.min(fade, length);
       const own = voice.resonators, feeding = voice.fed < voice.force.length;
-      // What a blow has given to shared resonators rings on without it; it is only waited for until it is fed.
+      // What an impact has given to shared resonators rings on without it; it is only waited for until it is fed.
       const stays = voice.leaving > 0 ? noise || feeding || own?.count > 0 : own === null && feeding;
       if (stays) this.sounding[kept++] = voice;
-      else if (own !== null) this.spare.push(own);
     }
     this.sounding.length = kept;
-    if (this.shared !== null && kept === 0 && (frame >= this.until || this.shared.count === 0)) {
-      this.shared.silence();
-      this.floor = Infinity;
-    }
+    if (this.shared?.count === 0 && kept === 0) this.floor = Infinity;
   }
 }
 
@@ -341,11 +304,11 @@ if (typeof AudioWorkletProcessor !== "undefined") {
   const BLOCK = 128;
 
   class ModalBankProcessor extends AudioWorkletProcessor {
-    constructor({ processorOptions: { field, level, voices, blows, ahead } }) {
+    constructor({ processorOptions: { field, level, voices, impacts, ahead } }) {
       super();
       this.voices = voices;
       this.bank = new Bank(field, sampleRate, BLOCK, voices);
-      for (const blow of blows) this.bank.strike(blow);
+      for (const impact of impacts) this.bank.strike(impact);
       this.leaving = [];
       this.limiter = new Limiter(sampleRate, ahead);
       this.ahead = ahead;
@@ -358,7 +321,7 @@ if (typeof AudioWorkletProcessor !== "undefined") {
     }
 
     heed(message) {
-      if (message.type === "strike") this.bank.strike(message.blow);
+      if (message.type === "strike") this.bank.strike(message.impact);
       else if (message.type === "level") this.wanted = message.level;
       else if (message.type === "field") this.replace(message.field);
     }
@@ -395,8 +358,9 @@ if (typeof AudioWorkletProcessor !== "undefined") {
     }
 
     report() {
-      for (const { id, frame } of this.bank.begun) this.port.postMessage({ type: "begun", id, frame: frame + this.ahead });
-      this.bank.begun.length = 0;
+      const { begun } = this.bank;
+      for (const { id, frame } of begun) this.port.postMessage({ type: "begun", id, frame: frame + this.ahead });
+      begun.length = 0;
       if (currentFrame - this.reported < REPORT * sampleRate) return;
       const { limited } = this.limiter;
       if (limited !== this.said) this.port.postMessage({ type: "limited", limited });

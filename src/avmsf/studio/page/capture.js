@@ -1,9 +1,8 @@
 /** The tab that makes a capture: click where one is about to strike, record, look at it at once, save it or redo it. */
 
 import { recordingUrl, server } from "./api.js";
-import { expectWav } from "./audio.js";
 import { ContactChoice, inward } from "./contactchoice.js";
-import { attempt, button, element, filePicker, group, line, say, section, unsay, warning } from "./dom.js";
+import { attempt, button, element, filePicker, group, line, say, section, warning } from "./dom.js";
 import { reconstructGroup } from "./jobs.js";
 import { Outbox } from "./outbox.js";
 import { RecordButton } from "./recorder.js";
@@ -13,9 +12,6 @@ import { UnsentRecordings } from "./unsent.js";
 export async function captureTab(studio) {
   const outbox = await Outbox.open(studio.live.folder);
   const reconstruction = reconstructGroup(studio);
-  /** The choice of contact for which the recording was made that is shown now. */
-  let recordedAt = null;
-
   /** Offer what the contact and the microphone allow. */
   const enable = () => {
     contact.lock(record.busy);
@@ -29,12 +25,12 @@ export async function captureTab(studio) {
 
   const card = new RecordingCard({
     keep: (entry) => {
-      contact.leave(recordedAt);
+      contact.leave(entry);
       return unsent.keep(entry);
     },
     drop: async (entry) => {
       await outbox.remove(entry.key);
-      if (!contact.locked && contact.current !== recordedAt) contact.set(entry);
+      if (!contact.locked) contact.set(entry);
       record.button.focus();
     },
     refuge: () => outbox.refuge,
@@ -52,9 +48,8 @@ export async function captureTab(studio) {
   });
 
   const take = async (file) => {
-    const chosen = contact.current;
-    if (!contact.known) say("First click the contact of this recording on the object.", { name: "take", bad: true });
-    else if (await attempt(() => expectWav(file).then(() => true), "take")) await check(file, chosen);
+    if (contact.known) await check(file, contact.current);
+    else say("First click the contact of this recording on the object.", { name: "take", bad: true });
   };
 
   /** Show what a recording is worth before it is saved. It is stored in the browser from the first moment. */
@@ -62,38 +57,27 @@ export async function captureTab(studio) {
     const entry = { key: crypto.randomUUID(), made: Date.now(), blob, ...chosen, kept: false };
     await outbox.put(entry);
     if (card.entry) say("The previous recording waits below: save or discard it.", { name: "take" });
-    recordedAt = chosen;
     const shown = card.show(entry);
     unsent.show();
     await shown;
   };
 
-  const read = async () => {
-    const capture = await server.capture();
+  const refresh = async () => {
+    const capture = await attempt(() => server.capture(), "capture");
+    if (!capture) return;
     list.show(capture);
     reconstruction.setReady(capture.strikes.length, capture.ready);
     unsent.show();
   };
-  const refresh = async () => {
-    try {
-      await read();
-      unsay("capture");
-    } catch (error) {
-      // While the server does not answer, the list of unsent recordings says so.
-      if (!error.unreachable) say(error.message, { name: "capture", bad: true });
-    }
-  };
 
   enable();
-  await attempt(read, "capture");
   // Go on with what an earlier page left: the last recording that was not saved is shown again, the others are sent.
   const left = outbox.entries.findLast(({ kept }) => !kept);
   if (left) {
     contact.set(left);
-    recordedAt = contact.current;
     card.show(left);
-    unsent.show();
   }
+  await refresh();
   if (outbox.entries.some(({ kept }) => kept)) unsent.send();
   return {
     element: section(

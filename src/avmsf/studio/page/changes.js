@@ -51,7 +51,7 @@ export class Changes {
     return true;
   }
 
-  /** Within the queue: do what changes the field; undefined where it failed, which is said, or another tab was faster. */
+  /** Within the queue: do what changes the field; undefined if it failed, which is said, or another tab was faster. */
   async ask(action, { again, refused = [] }) {
     this.onBusy(true);
     try {
@@ -69,8 +69,8 @@ export class Changes {
   }
 
   /**
-   * Within the queue: take the bundle of a revision, and with `sliders` the server's sliders; gives whether this is what
-   * is played now, and not the change of another tab.
+   * Within the queue: take the bundle of a revision, and with `sliders` the server's sliders; gives whether this is
+   * what is played now, and not the change of another tab.
    */
   async show({ revision }, { sliders = false } = {}) {
     const { studio } = this;

@@ -10,15 +10,10 @@ export class Chart {
 
   begin() {
     const { canvas, context } = this;
-    const ratio = devicePixelRatio;
-    this.width = canvas.clientWidth;
-    this.height = canvas.clientHeight;
-    if (canvas.width !== Math.round(this.width * ratio) || canvas.height !== Math.round(this.height * ratio)) {
-      canvas.width = Math.round(this.width * ratio);
-      canvas.height = Math.round(this.height * ratio);
-    }
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, this.width, this.height);
+    [this.width, this.height] = [canvas.clientWidth, canvas.clientHeight];
+    // This clears the canvas, too.
+    [canvas.width, canvas.height] = [this.width, this.height].map((size) => Math.round(size * devicePixelRatio));
+    context.scale(devicePixelRatio, devicePixelRatio);
     const style = getComputedStyle(canvas);
     this.ink = Object.fromEntries(
       ["faint", "line", "first", "second"].map((name) => [name, style.getPropertyValue(`--${name}`).trim()]),

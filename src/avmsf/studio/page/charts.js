@@ -20,7 +20,7 @@ const QUIET_SECONDS = 0.6;
 const GAP_SECONDS = 0.05;
 /** Seconds for which the word that a sound was turned down stays to be read. */
 const LIMITED_SECONDS = 2;
-const HELD = "The browser blocks the sound: click anywhere on the page, or close other programs that use the loudspeaker.";
+const HELD = "The browser blocks the sound: click anywhere on the page, or close programs that use the loudspeaker.";
 const TICKS_HZ = [100, 1000, 10000];
 
 const across = (frequency) => Math.log(frequency / LOW_HZ) / Math.log(HIGH_HZ / LOW_HZ);

@@ -1,6 +1,6 @@
 /** Where the next impact is recorded: a contact that is clicked or typed, or an impact that is recorded again. */
 
-import { button, element, group, line, millimeters, say } from "./dom.js";
+import { button, element, faint, group, line, millimeters, say } from "./dom.js";
 
 const NOWHERE = Object.freeze({ contact: null, direction: null, redo: null, digest: null });
 
@@ -17,7 +17,7 @@ export class ContactChoice {
   /** `changed()` is called when another contact was chosen. */
   constructor(studio, changed) {
     Object.assign(this, { studio, changed });
-    this.words = element("p", { className: "faint" });
+    this.words = faint("");
     this.inputs = ["x", "y", "z"].map(() =>
       element("input", { type: "number", step: "any", oninput: () => this.#typed() }),
     );
@@ -51,9 +51,9 @@ export class ContactChoice {
     return true;
   }
 
-  /** Done with a contact, unless another has been chosen meanwhile. */
-  leave(contact) {
-    if (!this.locked && this.current === contact) this.set(NOWHERE);
+  /** Done with the contact of a recording, unless another has been chosen meanwhile. */
+  leave({ contact, redo }) {
+    if (!this.locked && this.current.contact === contact && this.current.redo === redo) this.set(NOWHERE);
   }
 
   lock(locked) {
@@ -76,7 +76,8 @@ export class ContactChoice {
     const { contact, direction, redo } = this.current;
     const { view } = this.studio;
     view?.unmark("next");
-    if (contact) view?.markDot("next", element("div", { className: "dot next" }), contact, "strike here", inward(direction));
+    const dot = element("div", { className: "dot next" });
+    if (contact) view?.markDot("next", dot, contact, "strike here", inward(direction));
     this.words.textContent = redo
       ? `Strike the contact of ${redo} again.`
       : this.known

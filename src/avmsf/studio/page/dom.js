@@ -16,9 +16,11 @@ export function button(words, onclick, properties = {}) {
   return element("button", { type: "button", onclick, ...properties }, words);
 }
 
+export const smallButton = (words, onclick) => button(words, onclick, { className: "small" });
 export const section = (...children) => element("section", {}, ...children);
 export const group = (...children) => element("div", { className: "group" }, ...children);
 export const line = (...children) => element("div", { className: "row" }, ...children);
+export const faint = (words) => element("p", { className: "faint" }, words);
 export const warning = (words) => element("p", { className: "warning" }, words);
 
 /** Names and values below each other; `facts`: [name, words] each. */
@@ -100,7 +102,7 @@ export function say(words, { name = words, bad = false, answers = [], seconds = 
   const message = element(
     "div",
     { className: bad ? "word bad" : "word", "data-name": name },
-    element("div", {}, withoutFiles(words), answers.length ? element("div", { className: "answers" }, ...actions) : null),
+    element("div", {}, withoutFiles(words), element("div", { className: "answers" }, ...actions)),
     button("×", close, { className: "small", "aria-label": "Close this message" }),
   );
   unsay(name);

@@ -2,7 +2,7 @@
 
 import { server } from "./api.js";
 import { Changes } from "./changes.js";
-import { button, element, filePicker, group, line, say, section, Slider } from "./dom.js";
+import { button, element, faint, filePicker, group, line, say, section, Slider } from "./dom.js";
 import { JobProgress } from "./jobs.js";
 
 const factor = (value) => `× ${value.toPrecision(3)}`;
@@ -18,12 +18,11 @@ const OF_ALL = {
 };
 const OF_ONE = { db: ["Level", even(-40, 20)], pitch: PITCH, decay: DECAY };
 
-const isNeutral = ({ db, pitch, decay }) => db === 0 && pitch === 1 && decay === 1;
-
 /** `load()` fetches the server's current bundle and takes it. */
 export function editTab(studio, load) {
   /** By the mode's row in the bank: the values of the sliders for one mode. */
-  const changedModes = new Map();
+  const ofModes = new Map();
+  const changedModes = () => [...ofModes].filter(([, { db, pitch, decay }]) => db !== 0 || pitch !== 1 || decay !== 1);
   const makeSliders = (sliders, onInput) =>
     Object.fromEntries(
       Object.entries(sliders).map(([name, [words, options]]) => [name, new Slider(words, { ...options, onInput })]),
@@ -32,11 +31,12 @@ export function editTab(studio, load) {
   const onInput = () => changes.moved();
   const sliders = makeSliders(OF_ALL, onInput);
   const modeSliders = makeSliders(OF_ONE, () => {
-    changedModes.set(studio.bank, valuesOf(modeSliders));
+    ofModes.set(studio.bank, valuesOf(modeSliders));
     changes.moved();
   });
+  const option = (name, words = name) => element("option", { value: name }, words);
   const select = (none, onchange) =>
-    element("select", { onchange }, ...["", ...studio.live.materials].map((name) => element("option", { value: name }, name || none)));
+    element("select", { onchange }, option("", none), ...studio.live.materials.map((name) => option(name)));
   // The present material counts where the object gets another material or size, and changes nothing by itself.
   const changesMaterial = () => to.value !== "" || sliders.size.value !== sliders.size.rest;
   const from = select("inferred", () => changesMaterial() && onInput());
@@ -46,9 +46,9 @@ export function editTab(studio, load) {
   const changes = new Changes(studio, {
     load,
     request: () => ({
-      material: changesMaterial() && (from.value || to.value) ? { from: from.value || null, to: to.value || null } : null,
+      material: changesMaterial() ? { from: from.value || null, to: to.value || null } : null,
       ...valuesOf(sliders),
-      modes: [...changedModes].filter(([, values]) => !isNeutral(values)).map(([mode, values]) => ({ mode, ...values })),
+      modes: changedModes().map(([mode, values]) => ({ mode, ...values })),
     }),
     takeSliders: () => setSliders(studio.live.sliders ?? {}),
     onBusy: (yes) => {
@@ -59,28 +59,24 @@ export function editTab(studio, load) {
     for (const [name, slider] of Object.entries(sliders)) slider.set(values[name] ?? slider.rest);
     from.value = material?.from ?? "";
     to.value = material?.to ?? "";
-    changedModes.clear();
-    for (const { mode, ...changed } of modes) changedModes.set(mode, changed);
+    ofModes.clear();
+    for (const { mode, ...changed } of modes) ofModes.set(mode, changed);
     showMode();
   };
 
-  // What changes the field from under the sliders disables them until it is done; work of minutes the buttons too.
-  const running = { moments: 0, minutes: 0 };
+  // What changes the field from under the sliders disables them until it is done.
+  let running = 0;
   const enable = () => {
-    const all = [...Object.values(sliders), ...Object.values(modeSliders)].map(({ input }) => input);
-    for (const control of [...all, from, to]) control.disabled = running.moments + running.minutes > 0;
-    for (const control of [undo, reset, save]) control.disabled = running.minutes > 0;
+    const inputs = [...Object.values(sliders), ...Object.values(modeSliders)].map(({ input }) => input);
+    for (const control of [...inputs, from, to, undo, reset, save]) control.disabled = running > 0;
     undo.disabled ||= !studio.live?.undo;
   };
-  const hold = async (work, time = "moments") => {
-    running[time] += 1;
+  const hold = async (work) => {
+    running += 1;
     enable();
-    try {
-      await work();
-    } finally {
-      running[time] -= 1;
-      enable();
-    }
+    await work();
+    running -= 1;
+    enable();
   };
   /** Once the server has what the sliders ask for: do what changes the field, and then `take` its answer. */
   const change = (action, again, take) =>
@@ -101,31 +97,25 @@ export function editTab(studio, load) {
     changes.moved();
   });
   const name = element("input", { type: "text", "aria-label": "Name of the new field", placeholder: "new-name" });
-  const save = button("Save as", async () => {
-    const wanted = name.value.trim();
-    if (!wanted) {
-      say("Enter a name for the new field.", { name: "edit", bad: true });
-      name.focus();
-      return;
-    }
-    await change(() => server.save(studio.revision, wanted), () => save.click(), async (answer) => {
+  const save = button("Save as", () =>
+    change(() => server.save(studio.revision, name.value.trim()), () => save.click(), async (answer) => {
       await changes.show(answer, { sliders: true });
       say(`Saved: ${answer.file}`, { name: "saved" });
-    });
-  });
+    }),
+  );
 
-  const modeTitle = element("p", { className: "faint" });
+  const modeTitle = faint("");
   const modeBox = group(...Object.values(modeSliders).map((slider) => slider.element));
   const showMode = () => {
     const { mode } = studio;
     modeBox.hidden = mode === null;
-    const count = [...changedModes.values()].filter((values) => !isNeutral(values)).length;
+    const count = changedModes().length;
     const title =
       mode === null
         ? "Choose a mode in the tab Modes."
         : `Mode ${studio.bank}, now at ${studio.modes.frequency(mode).toFixed(1)} Hz.`;
     modeTitle.textContent = title + (count ? ` Changed modes: ${count}.` : "");
-    const values = changedModes.get(studio.bank) ?? {};
+    const values = ofModes.get(studio.bank) ?? {};
     for (const [which, slider] of Object.entries(modeSliders)) {
       // A muted mode has no level: null.
       slider.set(values[which] === null ? OF_ONE[which][1].low : (values[which] ?? slider.rest));
@@ -134,7 +124,7 @@ export function editTab(studio, load) {
   studio.on("mode", showMode);
   studio.on("bundle", () => {
     enable();
-    remarks.replaceChildren(...(studio.live?.remarks ?? []).map((words) => element("p", { className: "faint" }, words)));
+    remarks.replaceChildren(...(studio.live?.remarks ?? []).map(faint));
   });
 
   const sheet = section(
@@ -165,7 +155,7 @@ function guidedEdit(studio, changes, hold) {
       const started = await changes.queue(async () => (await changes.settle()) && changes.ask(ask, { again }));
       if (started) await follow(started.job);
       else progress.end();
-    }, "minutes");
+    });
   const follow = async (job) => {
     const steps = [];
     const last = await progress.follow(job, (message) => {
@@ -184,10 +174,11 @@ function guidedEdit(studio, changes, hold) {
   if (studio.can("words")) {
     const placeholder = "a wooden bowl is hit";
     const text = element("input", { type: "text", "aria-label": "Description of the sound", placeholder });
-    rows.push(text, button("Towards this text", () => start(() => server.edit(studio.revision, { prompt: text.value }))));
+    const byText = () => start(() => server.edit(studio.revision, { prompt: text.value }));
+    rows.push(text, button("Towards this text", byText));
   }
   // One that was running before the page was loaded goes on.
-  if (studio.live.jobKind === "lead") hold(() => follow(studio.live.job), "minutes");
+  if (studio.live.jobKind === "lead") hold(() => follow(studio.live.job));
   return group(element("h2", {}, "Guided edit"), line(...rows, progress.stop), progress.bar, progress.stage);
 }
 

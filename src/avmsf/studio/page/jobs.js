@@ -1,7 +1,7 @@
 /** Work of minutes on the server: its progress and a way to stop it; from impacts to a field. */
 
 import { server } from "./api.js";
-import { attempt, button, element, line, say } from "./dom.js";
+import { attempt, button, element, faint, line, say } from "./dom.js";
 
 const MIN_IMPACTS = 2;
 
@@ -47,7 +47,7 @@ export class JobProgress {
 
 /** The section that reconstructs a field from a capture's impacts. */
 export function reconstructGroup(studio) {
-  const words = element("p", { className: "faint" });
+  const words = faint("");
   const progress = new JobProgress();
   let ready = false;
   const enable = () => {
@@ -69,15 +69,11 @@ export function reconstructGroup(studio) {
     const last = await followed;
     enable();
     if (last.error) say(last.error, { name: "job", bad: true });
-    else if (last.field) await sayReady(last.field);
     else if (last.object) location.reload();
-  };
-  const sayReady = async (field) => {
-    progress.stage.textContent = `Field saved: ${field}`;
-    const manifest = await server.manifest().catch(() => null);
-    const opened = manifest?.live?.mode === "field";
-    const answers = opened ? [["Open it", () => location.reload()]] : [];
-    say(`The sound field is ready.${opened ? "" : ` Open it with: avmsf studio ${field}`}`, { name: "job", answers });
+    else if (last.field) {
+      progress.stage.textContent = `Field saved: ${last.field}`;
+      say("The sound field is ready.", { name: "job", answers: [["Open it", () => location.reload()]] });
+    }
   };
 
   // A job that was running before the page was loaded goes on; an edit is shown by the tab that started it.
@@ -97,8 +93,9 @@ export function reconstructGroup(studio) {
     /** Tell how many impacts there are, and whether the capture can be read. */
     setReady(count, readable) {
       const missing = Math.max(0, MIN_IMPACTS - count);
+      const impacts = missing === 1 ? "impact" : "impacts";
       words.textContent = missing
-        ? `Add at least ${missing} more ${missing === 1 ? "impact" : "impacts"}; use about a dozen, spread over the object.`
+        ? `Add at least ${missing} more ${impacts}; use about a dozen, spread over the object.`
         : readable
           ? "Fits a sound field to these recordings. Takes minutes; you can add impacts later."
           : "First correct the problems listed above.";

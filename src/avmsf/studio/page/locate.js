@@ -1,9 +1,9 @@
 /** The tab that locates impacts: from a recording to the contacts where they fell, painted and listed. */
 
 import { numbers, server } from "./api.js";
-import { expectWav } from "./audio.js";
 import { amountScale } from "./colors.js";
-import { attempt, button, element, factList, filePicker, group, line, millimeters, say, section, warning } from "./dom.js";
+import { attempt, button, element, factList, faint, filePicker, group, line } from "./dom.js";
+import { millimeters, say, section, smallButton, warning } from "./dom.js";
 import { RecordButton } from "./recorder.js";
 
 export function locateTab(studio) {
@@ -12,7 +12,7 @@ export function locateTab(studio) {
   const record = new RecordButton({ done: (blob) => locate(blob, "the recording") });
   let painted = null;
   // One search at a time: while one runs, the newest recording waits and older ones are forgotten.
-  let [running, waiting, newest] = [false, null, 0];
+  let [running, waiting] = [false, null];
 
   /** Take away the last result. */
   const clear = () => {
@@ -21,36 +21,30 @@ export function locateTab(studio) {
     if (painted && studio.view?.painted?.values === painted) studio.paint(null);
     painted = null;
   };
-  /** Another recording is to be located: nothing of those before it is shown or said; gives its number. */
-  const begin = () => {
+  const locate = async (blob, name) => {
     clear();
-    [waiting, busy.hidden] = [null, true];
-    return ++newest;
-  };
-  const locate = (blob, name) => search({ blob, name, number: begin() });
-  const search = async (recording) => {
-    [waiting, busy.hidden] = [recording, false];
+    [waiting, busy.hidden] = [{ blob, name }, false];
     if (running) return;
     running = true;
     while (waiting) {
-      const { blob, name, number } = waiting;
+      const asked = waiting;
       waiting = null;
-      const answered = server.locate(blob);
+      const answered = server.locate(asked.blob);
       await answered.catch(() => {});
-      if (number !== newest) continue;
+      if (waiting) continue;
       const answer = await attempt(() => answered, "locate");
       if (!answer) continue;
-      if (answer.revision === undefined || answer.revision === studio.revision) show(answer.impacts, name);
-      else sayStale(answer.revision, () => locate(blob, name), name);
+      if (answer.revision === undefined || answer.revision === studio.revision) show(answer.impacts, asked.name);
+      else sayStale(answer.revision, asked);
     }
     [running, busy.hidden] = [false, true];
   };
   /** Where an impact fell on another field than the one that is shown is not where it fell on this one. */
-  const sayStale = (revision, again, name) => {
+  const sayStale = (revision, { blob, name }) => {
     const words = `The field changed while ${name} was located, so the result is not shown.`;
     const load = ["Show the changed field", () => location.reload()];
-    const answers = [revision > studio.revision ? load : ["Locate again", again]];
-    say(words, { name: "locate", bad: true, answers });
+    const again = ["Locate again", () => locate(blob, name)];
+    say(words, { name: "locate", bad: true, answers: [revision > studio.revision ? load : again] });
   };
 
   const show = (impacts, name) => {
@@ -59,9 +53,7 @@ export function locateTab(studio) {
       painted = paintImpact(studio, impact);
       details.replaceChildren(...describe(studio, impact));
     };
-    const picks = impacts.map((impact, index) =>
-      button(`Impact ${index + 1}`, () => choose(impact), { className: "small" }),
-    );
+    const picks = impacts.map((impact, index) => smallButton(`Impact ${index + 1}`, () => choose(impact)));
     results.replaceChildren(
       element("h2", {}, `${name}: ${impacts.length === 1 ? "1 impact" : `${impacts.length} impacts`}`),
       line(...(picks.length > 1 ? picks : [])),
@@ -70,17 +62,13 @@ export function locateTab(studio) {
     if (impacts.length) choose(impacts[0]);
   };
 
-  const take = async (file) => {
-    const number = begin();
-    const fine = await attempt(() => expectWav(file).then(() => true), "locate");
-    if (fine && number === newest) await search({ blob: file, name: file.name, number });
-  };
+  const take = (file) => locate(file, file.name);
 
   // What is painted belongs to the recording, and to the field as it was when it was located.
   studio.addEventListener("bundle", clear);
 
   const sheet = section(
-    element("p", { className: "faint" }, "Strike the real object near the microphone, or drop a WAV file anywhere."),
+    faint("Strike the real object near the microphone, or drop a WAV file anywhere."),
     line(record.button, filePicker("Choose a WAV file …", ".wav,audio/wav", take)),
     record.level,
     busy,

@@ -157,7 +157,7 @@ async function showObject(studio, { atPress, strike }, library) {
   });
 }
 
-/** A WAV file may be dropped anywhere, where there is something to do with it; elsewhere it must not replace the page. */
+/** A WAV file may be dropped anywhere; where there is nothing to do with it, it must not replace the page. */
 function takeDrops({ take }) {
   const target = at("drop-target");
   window.addEventListener("dragover", (event) => {

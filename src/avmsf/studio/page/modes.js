@@ -31,7 +31,7 @@ export class Modes {
     return SIXTY_DB / this.damping(mode, row);
   }
 
-  /** How strong a blow of force 1 at a contact sets the mode swinging. */
+  /** How strong an impact of force 1 at a contact sets the mode swinging. */
   amplitude(mode, row) {
     const at = row * this.count + mode;
     return Math.hypot(this.tensors.sine[at], this.tensors.cosine[at]);
@@ -67,7 +67,7 @@ export class Modes {
     return greatest ? gains.map((value) => value / greatest) : gains;
   }
 
-  /** The contact at which a blow is loudest. */
+  /** The contact at which an impact is loudest. */
   get loudestRow() {
     let [best, loudest] = [0, -1];
     for (let row = 0; row < this.points; row++) {

@@ -1,7 +1,7 @@
 /** The table of the modes: pitch, decay and level at the last contact; one is chosen to paint its shape. */
 
 import { signScale } from "./colors.js";
-import { button, element, seconds, section } from "./dom.js";
+import { button, element, faint, seconds, section, smallButton } from "./dom.js";
 
 const COLUMNS = [
   ["mode", "#", "Index of the mode in the field, from 0"],
@@ -47,7 +47,8 @@ export function modesTab(studio) {
   };
   const rowOf = ({ mode, frequency, decay, level }) => {
     // The button is for keys and for who does not see; a click anywhere in its row presses it.
-    const choose = button(String(mode + 1), () => {}, { className: "small", "aria-pressed": String(mode === studio.mode) });
+    const choose = smallButton(String(mode + 1), () => {});
+    choose.ariaPressed = String(mode === studio.mode);
     choose.title = `Color the object by the gain of the mode at ${frequency.toFixed(1)} Hz`;
     choose.ariaLabel = choose.title;
     const numbers = [frequency.toFixed(1), decay.toPrecision(3), level.toFixed(1)];
@@ -56,14 +57,15 @@ export function modesTab(studio) {
       className: studio.modes.supporting.has(mode) ? "supporting" : "",
       onclick: () => studio.choose(studio.mode === mode ? null : mode),
     };
-    return element("tr", properties, ...[choose, ...numbers].map((cell) => element("td", {}, cell === "NaN" ? "–" : cell)));
+    const cells = [choose, ...numbers].map((cell) => element("td", {}, cell === "NaN" ? "–" : cell));
+    return element("tr", properties, ...cells);
   };
 
   studio.on("bundle struck", fill);
   studio.addEventListener("mode", () => {
     const { mode, modes } = studio;
     for (const row of body.children)
-      row.querySelector("button").setAttribute("aria-pressed", String(Number(row.dataset.mode) === mode));
+      row.querySelector("button").ariaPressed = String(Number(row.dataset.mode) === mode);
     // Paint of another kind, such as the position of an impact, is not this table's to take off.
     if (mode === null && painted) studio.paint(null);
     painted = mode !== null;
@@ -79,7 +81,7 @@ export function modesTab(studio) {
 
   return {
     element: section(
-      element("p", { className: "faint" }, "Choose a mode to color the object by its gain."),
+      faint("Choose a mode to color the object by its gain."),
       element("div", { className: "table-box" }, table),
       where,
     ),

@@ -48,17 +48,17 @@ export class PointLayer {
   }
 }
 
+/** A dot that is a little darker at its rim. */
 function roundDot() {
-  const size = 32;
-  const pixels = new Uint8Array(4 * size * size);
-  for (let at = 0; at < size * size; at++) {
-    const [x, y] = [(at % size) + 0.5, Math.floor(at / size) + 0.5].map((value) => (2 * value) / size - 1);
-    const light = 255 * (1 - 0.35 * (x * x + y * y));
-    pixels.set([light, light, light, x * x + y * y < 1 ? 255 : 0], 4 * at);
-  }
-  const map = new THREE.DataTexture(pixels, size, size);
+  const canvas = new OffscreenCanvas(32, 32);
+  const context = canvas.getContext("2d");
+  context.fillStyle = context.createRadialGradient(16, 16, 0, 16, 16, 16);
+  context.fillStyle.addColorStop(0, "#fff");
+  context.fillStyle.addColorStop(1, "#a6a6a6");
+  context.arc(16, 16, 16, 0, 2 * Math.PI);
+  context.fill();
+  const map = new THREE.CanvasTexture(canvas);
   map.colorSpace = THREE.SRGBColorSpace;
-  map.needsUpdate = true;
   return map;
 }
 
@@ -176,8 +176,8 @@ export class SplatLayer {
     rgba.count = colors ? brightness.length : 0;
     for (let splat = 0; splat < rgba.count; splat++) {
       const light = 1 - SHADING + SHADING * brightness[splat];
-      for (let channel = 0; channel < 3; channel++) rgba.array[4 * splat + channel] = light * mixed[3 * splat + channel];
-      rgba.array[4 * splat + 3] = this.opacities[splat];
+      const [red, green, blue] = mixed.subarray(3 * splat);
+      rgba.array.set([light * red, light * green, light * blue, this.opacities[splat]], 4 * splat);
     }
     rgba.needsUpdate = true;
     this.splats.updateVersion();

@@ -1,7 +1,8 @@
 /** The microphone: a button that records one impact, with its level while it is recorded. */
 
+import { fileUrl } from "./api.js";
 import { encodeWav } from "./audio.js";
-import { button, element, group, say, unsay } from "./dom.js";
+import { button, element, group, say, unsay, warning } from "./dom.js";
 
 const MAX_SECONDS = 12;
 const SECONDS_AFTER_IMPACT = 3;
@@ -25,7 +26,8 @@ export class RecordButton {
     this.button = button("● Record", () => this.#press(), { className: main ? "main" : "" });
     this.meter = element("meter", { min: 0, max: 1, high: 0.95, "aria-label": "Microphone level" });
     this.words = element("small");
-    this.clipped = element("p", { className: "warning", role: "alert", hidden: true }, "Clipped: strike with less force.");
+    this.clipped = warning("Clipped: strike with less force.");
+    Object.assign(this.clipped, { role: "alert", hidden: true });
     this.level = group(this.meter, this.words, this.clipped);
     prepare().catch(() => {});
   }
@@ -107,7 +109,7 @@ class Recording {
       this.begun = true;
       await listen(context, stream, (blocks) => this.#take(blocks, context.sampleRate), this.stopped);
       const samples = new Float32Array(await new Blob(this.#blocks).arrayBuffer());
-      if (!samples.length) throw new Error("The microphone recorded no samples. Check that it is on, or drop a WAV file.");
+      if (!samples.length) throw new Error("The microphone recorded nothing. Check that it is on, or drop a WAV file.");
       return encodeWav(samples, context.sampleRate);
     } finally {
       closeMicrophone(stream);
@@ -145,7 +147,6 @@ async function openMicrophone() {
 const closeMicrophone = (stream) => stream.getTracks().forEach((track) => track.stop());
 
 let prepared = null;
-let recordings = 0;
 
 /** Load what a recording needs while the server is there; the recording itself does without the server. */
 function prepare() {
@@ -159,12 +160,11 @@ function prepare() {
 async function openContext() {
   const context = new AudioContext();
   try {
-    await context.audioWorklet.addModule(new URL("./recorderprocessor.js", import.meta.url));
+    await context.audioWorklet.addModule(fileUrl("page/recorderprocessor.js"));
   } catch {
     context.close();
-    throw new Error("The recorder could not be loaded from the server. Check that `avmsf studio` runs, then record again.");
+    throw new Error("The recorder could not be loaded. Check that `avmsf studio` runs, then record again.");
   }
-  if (!recordings) context.suspend();
   return context;
 }
 
@@ -174,11 +174,8 @@ async function listen(context, stream, take, end) {
   const source = context.createMediaStreamSource(stream);
   node.port.onmessage = ({ data }) => take(data);
   source.connect(node);
-  recordings++;
   context.resume().catch(() => {});
   await end;
-  recordings--;
   source.disconnect();
   node.port.postMessage("end");
-  if (!recordings) context.suspend();
 }

@@ -2,7 +2,7 @@
 
 import { server } from "./api.js";
 import { drawWaveform, listen } from "./audio.js";
-import { attempt, button, element, factList, group, line, seconds, warning } from "./dom.js";
+import { attempt, button, element, factList, faint, group, line, seconds, smallButton, warning } from "./dom.js";
 
 export class RecordingCard {
   /** The recording that is shown, an entry of the outbox; null without one. */
@@ -17,7 +17,7 @@ export class RecordingCard {
   async show(entry) {
     this.entry = entry;
     const canvas = element("canvas", { className: "waveform", role: "img", "aria-label": "The recording" });
-    const verdict = element("div", {}, element("p", { className: "faint" }, "Measuring …"));
+    const verdict = element("div", {}, faint("Measuring …"));
     const answer = (action) => () => {
       this.hide();
       return action(entry);
@@ -42,9 +42,9 @@ export class RecordingCard {
       const barred = error.refusal && !entry.redo;
       let words = `${error.message} ${error.unreachable ? this.refuge() : ""}`;
       if (barred) words = `It cannot be saved: ${error.message}`;
-      else if (error.refusal) words = `${error.message}. This holds for a new impact; the recording may still replace ${entry.redo}.`;
+      else if (error.refusal) words = `${error.message}. As a new impact only: it may still replace ${entry.redo}.`;
       verdict.replaceChildren(warning(words));
-      if (!error.refusal) verdict.append(button("Measure again", () => this.show(entry), { className: "small" }));
+      if (!error.refusal) verdict.append(smallButton("Measure again", () => this.show(entry)));
       // What the server would not take shall not look like what is to be done next.
       keep.disabled = barred;
       keep.classList.toggle("main", !barred);
@@ -72,5 +72,5 @@ function measures(report) {
 
 /** A button that plays a recording, a blob or an address. */
 export function listenButton(sound) {
-  return button("Listen", () => attempt(() => listen(sound), "listen"), { className: "small" });
+  return smallButton("Listen", () => attempt(() => listen(sound), "listen"));
 }

@@ -1,16 +1,17 @@
-// The sound engine: blows on the field's points, heard through the modal bank on the audio thread.
+// The sound engine: impacts on the field's points, heard through the modal bank on the audio thread.
 
+import { fileUrl } from "./api.js";
 import { resample } from "./audio.js";
 import { Bank } from "./bank.js";
 
 const PROCESSOR = "avmsf-modal-bank";
-/** Blows that may sound at once; with dampings shared by all contacts this bounds their noise alone. */
+/** Impacts that may sound at once; with dampings shared by all contacts this bounds their noise alone. */
 const VOICES = 64;
-/** Peak that the loudest contact's blow of force 1 is brought to, over full scale. */
+/** Peak that the loudest contact's impact of force 1 is brought to, over full scale. */
 const COMFORTABLE = 0.5;
 /** Seconds by which the live limiter knows what is to come; all that is heard is late by as much. */
 const AHEAD = 0.0015;
-/** Seconds after a blow until it is said that the browser holds the sound back. */
+/** Seconds after an impact until it is said that the browser holds the sound back. */
 const PATIENCE = 1;
 /** Contacts, and seconds of their sound, that the loudest is sought among. */
 const LOUD_CONTACTS = 8, LOUD_SECONDS = 0.03;
@@ -18,15 +19,18 @@ const LOUD_CONTACTS = 8, LOUD_SECONDS = 0.03;
 /** Exponents of the sine that a mallet's force follows over its contact time, as avmsf.modal.modes has it. */
 const EXPONENTS = { "half-sine": 1, hertz: 1.5 };
 /** Gauss and Legendre's five points on -1..1. */
-const NODES = [0, 0.5384693101056831, -0.5384693101056831, 0.906179845938664, -0.906179845938664];
-const WEIGHTS = [0.5688888888888889, 0.47862867049936647, 0.47862867049936647, 0.23692688505618908, 0.23692688505618908];
+const [INNER, OUTER] = [0.5384693101056831, 0.906179845938664];
+const NODES = [-OUTER, -INNER, 0, INNER, OUTER];
+const [EDGE, BETWEEN] = [0.23692688505618908, 0.47862867049936647];
+const WEIGHTS = [EDGE, BETWEEN, 0.5688888888888889, BETWEEN, EDGE];
 const PANELS = 4;
 
 /** The part of the impulse that falls into each sample's time; their sum is 1. `contactTime` in seconds. */
 export function pulseSamples(contactTime, sampleRate, shape = "half-sine") {
   const exponent = EXPONENTS[shape];
   if (exponent === undefined) throw new RangeError(`pulse: expected half-sine or hertz, got ${shape}`);
-  if (!(contactTime >= 0 && contactTime < 10)) throw new RangeError(`contact time: expected 0 to 10 s, got ${contactTime}`);
+  if (!(contactTime >= 0 && contactTime < 10))
+    throw new RangeError(`contact time: expected 0 to 10 s, got ${contactTime}`);
   const length = contactTime * sampleRate;
   const count = Math.max(1, Math.ceil(length));
   if (count === 1) return Float64Array.of(1);
@@ -62,7 +66,7 @@ function impulse(from, to, exponent) {
   return sum;
 }
 
-/** What a field is at one sample rate, and the blows on it as the bank wants them. */
+/** What a field is at one sample rate, and the impacts on it as the bank wants them. */
 class Tuned {
   static async of({ manifest, tensors }, rate) {
     return new Tuned(manifest, tensors, rate, await resample(tensors.noise, manifest.sampleRate, rate));
@@ -84,7 +88,7 @@ class Tuned {
     return Float64Array.from(this.kept, (mode) => tensor[row * this.modes + mode]);
   }
 
-  blow(row, { force = 1, contactTime = 0, shape = "half-sine" }, frame, id = 0) {
+  impact(row, { force = 1, contactTime = 0, shape = "half-sine" }, frame, id = 0) {
     if (!(Number.isInteger(row) && row >= 0 && row < this.points))
       throw new RangeError(`contact: expected 0 to ${this.points - 1}, got ${row}`);
     if (!Number.isFinite(force)) throw new RangeError(`force: expected a number, got ${force}`);
@@ -99,7 +103,7 @@ class Tuned {
     return { id, frame, sine, cosine, damping, force: pulse.map((part) => part * force), strength: force, loudest };
   }
 
-  /** The largest that a sample of a blow of force 1 can be. */
+  /** The largest that a sample of an impact of force 1 can be. */
   bound(row) {
     let sum = this.noisePeak ??= this.field.noise.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
     for (const mode of this.kept) {
@@ -120,15 +124,15 @@ class Tuned {
   peak(row) {
     const samples = Math.ceil(LOUD_SECONDS * this.rate);
     const bank = new Bank({ ...this.field, noise: Float32Array.of(0) }, this.rate, samples, 1);
-    bank.strike(this.blow(row, {}, 0));
+    bank.strike(this.impact(row, {}, 0));
     const sound = new Float64Array(samples);
     bank.render(sound, 0);
     return sound.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
   }
 }
 
-function bankNode(context, tuned, { level, voices = VOICES, blows = [], ahead = 0 }) {
-  const processorOptions = { field: tuned.field, level, voices, blows, ahead };
+function bankNode(context, tuned, { level, voices = VOICES, impacts = [], ahead = 0 }) {
+  const processorOptions = { field: tuned.field, level, voices, impacts, ahead };
   return new AudioWorkletNode(context, PROCESSOR, {
     numberOfInputs: 1, numberOfOutputs: 1, outputChannelCount: [1],
     channelCount: 1, channelCountMode: "explicit", channelInterpretation: "speakers", processorOptions,
@@ -138,37 +142,36 @@ function bankNode(context, tuned, { level, voices = VOICES, blows = [], ahead = 
 async function addBank(context) {
   if (context.audioWorklet === undefined)
     throw new Error("this browser has no AudioWorklet: open the page from https or localhost in a current browser");
-  // A page that is one file carries the processor; as data, for browsers load no worklet from a file's blobs.
-  const inlined = globalThis.avmsfInlined?.["page/bank.js"];
-  const url = inlined === undefined
-    ? new URL("./bank.js", import.meta.url).href : `data:${inlined.type};base64,${inlined.base64}`;
-  await context.audioWorklet.addModule(url);
+  await context.audioWorklet.addModule(fileUrl("page/bank.js"));
 }
 
 /**
- * Return the sound of blows, [{row, force, contactTime, shape, when}] with `when` in seconds, from the bank that also
+ * Return the sound of impacts, [{row, force, contactTime, shape, when}] with `when` in seconds, from the bank that also
  * plays live. At the field's own rate, or another; as long as a training sound, or `seconds`. In the field's unit.
  */
-export async function renderOffline(bundle, blows, seconds, { sampleRate = bundle.manifest.sampleRate, voices } = {}) {
-  const samples = seconds === undefined
-    ? Math.round((bundle.manifest.samples * sampleRate) / bundle.manifest.sampleRate) : Math.round(seconds * sampleRate);
+export async function renderOffline(bundle, impacts, seconds, options = {}) {
+  const { manifest } = bundle;
+  const { sampleRate = manifest.sampleRate, voices } = options;
+  const length = seconds ?? manifest.samples / manifest.sampleRate;
+  const samples = Math.round(length * sampleRate);
   const context = new OfflineAudioContext(1, Math.max(1, samples), sampleRate);
   await addBank(context);
   const tuned = await Tuned.of(bundle, context.sampleRate);
-  const ready = blows.map((blow, id) => tuned.blow(blow.row, blow, Math.round((blow.when ?? 0) * sampleRate), id));
+  const frame = ({ when = 0 }) => Math.round(when * sampleRate);
+  const ready = impacts.map((impact, id) => tuned.impact(impact.row, impact, frame(impact), id));
   // So low that the limiter has nothing to do, whatever the unit; a power of two rounds nothing.
-  const bound = blows.reduce((sum, { row, force = 1 }) => sum + Math.abs(force) * tuned.bound(row), 0);
+  const bound = impacts.reduce((sum, { row, force = 1 }) => sum + Math.abs(force) * tuned.bound(row), 0);
   const level = bound > 0 ? 2 ** -Math.ceil(Math.log2(2 * bound)) : 1;
-  bankNode(context, tuned, { level, blows: ready, voices }).connect(context.destination);
+  bankNode(context, tuned, { level, impacts: ready, voices }).connect(context.destination);
   const sound = (await context.startRendering()).getChannelData(0);
   return sound.map((value) => value / level);
 }
 
-/** Blows heard live. */
+/** Impacts heard live. */
 export class SoundEngine {
   /**
    * Return an engine. It may be started before the reader has touched the page; browsers then hold the sound back until
-   * the first blow that follows a touch. Throws with words for the reader where there is no sound to be had.
+   * the first impact that follows a touch. Throws with words for the reader where there is no sound to be had.
    */
   static async start(bundle, { context } = {}) {
     if (typeof AudioContext === "undefined") throw new Error("this browser has no AudioContext");
@@ -188,11 +191,11 @@ export class SoundEngine {
     this.analyser = new AnalyserNode(context, { fftSize: 8192, smoothingTimeConstant: 0 });
     this.node.connect(this.analyser).connect(context.destination);
     this.next = 1;
-    /** Called with {id, time} when a blow is taken up; `time`, the context's seconds, is that of its first sample. */
+    /** Called with {id, time} when an impact begins; `time`, the context's seconds, is that of its first sample. */
     this.onbegin = null;
     /** Called with true once what sounds has to be turned down to fit, and with false when it fits again. */
     this.onlimited = null;
-    /** Called with true when the browser goes on holding the sound back after a blow, and with false when it plays. */
+    /** Called with true when the browser holds the sound back after an impact, and with false when it plays. */
     this.onheld = null;
     this.node.port.onmessage = ({ data }) => this.hear(data);
     context.addEventListener("statechange", () => {
@@ -212,16 +215,17 @@ export class SoundEngine {
 
   /**
    * Strike the contact in a row of the bundle's points, at once. `force` in newtons where the field knows them, else
-   * relative to an average recorded blow; `contactTime` in seconds, 0 for the recorded hammer. Returns the blow's number.
+   * relative to an average recorded impact; `contactTime` in seconds, 0 for the recorded hammer. Returns a number.
    */
   strike(row, { force = 1, contactTime = 0, shape = "half-sine" } = {}) {
     const id = this.next++;
-    this.node.port.postMessage({ type: "strike", blow: this.tuned.blow(row, { force, contactTime, shape }, 0, id) });
+    const impact = this.tuned.impact(row, { force, contactTime, shape }, 0, id);
+    this.node.port.postMessage({ type: "strike", impact });
     this.wake();
     return id;
   }
 
-  /** Have the sound go on: browsers hold it back before the first touch, and again after a call or in the background. */
+  /** Have the sound go on: browsers hold it back before the first touch, after a call and in the background. */
   wake() {
     const { context } = this;
     if (context.state === "running" || context.state === "closed") return;
@@ -233,22 +237,22 @@ export class SoundEngine {
     }, 1000 * PATIENCE);
   }
 
-  renderOffline(blows, seconds, options) {
-    return renderOffline(this.bundle, blows, seconds, options);
+  renderOffline(impacts, seconds, options) {
+    return renderOffline(this.bundle, impacts, seconds, options);
   }
 
-  /** Go on with another field, such as an edited one; what sounds fades. The level stays, so that edits are compared. */
+  /** Go on with another field, such as an edited one; what sounds fades. The level stays, to compare edits. */
   async replace(bundle) {
     this.tuned = await Tuned.of(bundle, this.context.sampleRate);
     this.bundle = bundle;
     this.node.port.postMessage({ type: "field", field: this.tuned.field });
   }
 
-  /** Play a recording in the field's unit, at the level of the blows; returns its source, which `stop` ends. */
-  play(audioBuffer, { when = 0 } = {}) {
-    const source = new AudioBufferSourceNode(this.context, { buffer: audioBuffer });
+  /** Play a recording in the field's unit, at the level of the impacts; returns its source, which `stop` ends. */
+  play(buffer) {
+    const source = new AudioBufferSourceNode(this.context, { buffer });
     source.connect(this.node);
-    source.start(when);
+    source.start();
     this.wake();
     return source;
   }

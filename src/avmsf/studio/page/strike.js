@@ -1,7 +1,7 @@
 /** The tab with which one plays: force, mallet, and the recorded impacts beside the model's sound. */
 
 import { decode } from "./audio.js";
-import { attempt, button, choices, element, group, line, seconds, section, Slider } from "./dom.js";
+import { attempt, button, choices, element, group, line, seconds, section, Slider, smallButton } from "./dom.js";
 
 /** Seconds of contact; null for the recorded hammer. */
 const MALLETS = [
@@ -111,8 +111,8 @@ function recordedImpacts(studio) {
           "li",
           {},
           button(name, () => play(index, "both"), { className: "grow", title: "Recording, then model" }),
-          button("Recording", () => play(index, "recording"), { className: "small" }),
-          button("Model", () => play(index, "model"), { className: "small" }),
+          smallButton("Recording", () => play(index, "recording")),
+          smallButton("Model", () => play(index, "model")),
         ),
       ),
     );
@@ -132,41 +132,45 @@ class Comparison {
     studio.on("bundle", () => this.#begin());
   }
 
+  /** Play the recording, and draw the model's modes of its contact; gives it, or null if another was chosen since. */
   async recording(impact) {
-    const isLast = this.#begin();
+    const serial = this.#begin();
     const buffer = await this.#decode(impact);
-    if (isLast()) this.#play(impact, buffer);
+    if (serial !== this.#serial) return null;
+    const { engine, spectra } = this.studio;
+    this.#source = engine.play(buffer);
+    spectra.struck(this.#row(impact), 1, this.#mallet);
+    this.#say(impact, "recording");
+    return buffer;
   }
 
-  async model(impact) {
+  model(impact) {
     this.#begin();
     // As hard as the recorded impact.
     this.studio.strike(this.#row(impact), { force: 1, contactTime: null });
   }
 
   async both(impact) {
-    const isLast = this.#begin();
+    const buffer = await this.recording(impact);
+    if (!buffer) return;
     const { engine, spectra, bundle } = this.studio;
-    const buffer = await this.#decode(impact);
-    if (!isLast()) return;
+    const serial = this.#serial;
     const length = Math.min(buffer.duration, MAX_COMPARED_SECONDS);
-    this.#play(impact, buffer);
     this.#timer = setTimeout(() => this.#strikeModel(impact), 1000 * (length + PAUSE_SECONDS));
-    const model = await engine.renderOffline([{ row: this.#row(impact), force: 1, ...this.#mallet }], length);
-    if (!isLast()) return;
+    const model = await engine.renderOffline([{ row: this.#row(impact), ...this.#mallet }], length);
+    if (serial !== this.#serial) return;
     const { sampleRate } = buffer;
     const samples = buffer.getChannelData(0).subarray(0, Math.round(length * sampleRate));
     spectra.compare({ samples, sampleRate }, { samples: model, sampleRate: bundle.manifest.sampleRate });
     this.#say(impact, "recording and model");
   }
 
-  /** End what is played or was going to be; gives whether nothing else has begun since. */
+  /** End what is played or was going to be; gives the number of what begins. */
   #begin() {
     this.#source?.stop();
     this.#source = null;
     clearTimeout(this.#timer);
-    const serial = ++this.#serial;
-    return () => serial === this.#serial;
+    return ++this.#serial;
   }
 
   #row({ contact }) {
@@ -182,17 +186,9 @@ class Comparison {
   #strikeModel(impact) {
     const { engine, spectra } = this.studio;
     const { compared } = spectra;
-    engine.strike(this.#row(impact), { force: 1, ...this.#mallet });
+    engine.strike(this.#row(impact), this.#mallet);
     spectra.struck(this.#row(impact), 1, this.#mallet);
     spectra.compared = compared;
-  }
-
-  /** Play a recording, with the model's lines of its own contact beside it from the moment at which it begins. */
-  #play(impact, buffer) {
-    const { engine, spectra } = this.studio;
-    this.#source = engine.play(buffer);
-    spectra.struck(this.#row(impact), 1, this.#mallet);
-    this.#say(impact, "recording");
   }
 
   #say({ name }, what) {

@@ -2,7 +2,7 @@
 
 import { server } from "./api.js";
 import { describeContact } from "./contactchoice.js";
-import { button, element, group, line, say, unsay } from "./dom.js";
+import { faint, group, line, say, smallButton, unsay, warning } from "./dom.js";
 import { listenButton } from "./recordingcard.js";
 
 const RETRY_MS = 3000;
@@ -23,14 +23,14 @@ export class UnsentRecordings {
     if (this.#sending) return;
     this.#sending = true;
     clearTimeout(this.#timer);
-    let entry;
-    while ((entry = this.outbox.entries.find(({ kept, refused }) => kept && !refused))) {
+    let [entry, answered] = [null, true];
+    while (answered && (entry = this.outbox.entries.find(({ kept, refused }) => kept && !refused))) {
       this.show();
-      if (!(await this.#sendOne(entry))) break;
+      answered = await this.#sendOne(entry);
     }
     this.#sending = false;
     this.show();
-    await this.sent();
+    if (answered) await this.sent();
   }
 
   /** Send a recording; gives whether the server answered at all. */
@@ -65,25 +65,19 @@ export class UnsentRecordings {
   }
 
   #item(entry) {
-    const state = !entry.kept
-      ? "is not saved yet."
-      : entry.refused
-        ? `was rejected: ${entry.refused}`
-        : "waits for the server …";
+    const { kept, refused } = entry;
+    const state = !kept ? "is not saved yet." : refused ? `was rejected: ${refused}` : "waits for the server …";
+    const words = `The recording ${describeContact(entry)} ${state}`;
     const discard = () => this.outbox.remove(entry.key).then(() => this.show());
     return group(
-      element(
-        "p",
-        { className: entry.kept && !entry.refused ? "faint" : "warning" },
-        `The recording ${describeContact(entry)} ${state}`,
-      ),
-      line(...this.#answers(entry), listenButton(entry.blob), button("Discard", discard, { className: "small" })),
+      kept && !refused ? faint(words) : warning(words),
+      line(...this.#answers(entry), listenButton(entry.blob), smallButton("Discard", discard)),
     );
   }
 
   /** What can be done with a recording; one that came too late for its impact never takes its place unasked. */
   #answers(entry) {
-    const answer = (words, changed = {}) => button(words, () => this.keep({ ...entry, ...changed }), { className: "small" });
+    const answer = (words, changed = {}) => smallButton(words, () => this.keep({ ...entry, ...changed }));
     if (!entry.kept) return [answer("Save recording")];
     if (!entry.redo || !entry.refused) return [answer("Send again")];
     const impact = this.impacts().find(({ file }) => file === entry.redo);

@@ -48,14 +48,8 @@ export class Viewpoint {
 
   /** Turn about what is looked at by angles, radians: to the right, and up. */
   turn(right, up) {
-    const offset = this.camera.position.clone().sub(this.controls.target);
-    const toUp = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
-    const sphere = new THREE.Spherical().setFromVector3(offset.applyQuaternion(toUp));
-    sphere.theta += right;
-    sphere.phi -= up;
-    offset.setFromSpherical(sphere.makeSafe()).applyQuaternion(toUp.invert());
-    this.camera.position.copy(this.controls.target).add(offset);
-    this.#settle();
+    this.controls.rotateLeft(-right);
+    this.controls.rotateUp(up);
   }
 
   /** Look from the side on which a position on the object lies, a little from above. */
