@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from avmsf.studio.opening import Opened
 from plate_page import Open, Serve, plate_site, visiting
+from served import Served, served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -80,3 +82,29 @@ def plain(browser: "Browser", site: Serve) -> Iterator["Page"]:
     """Return one page of the plate's contacts without a server, for tests that leave no more behind than a blow."""
     with visiting(browser, site) as open_page:
         yield open_page()
+
+
+@pytest.fixture
+def serving(tmp_path: Path) -> Iterator[Callable[[Opened], Served]]:
+    """Return a function that opens something in a studio of its own, which ends with the test."""
+    with contextlib.ExitStack() as servers:
+        yield lambda opened: servers.enter_context(served(opened, tmp_path / "scratch"))
+
+
+@pytest.fixture
+def visit_studio(browser: "Browser") -> Iterator[Callable[..., "Page"]]:
+    """Return a function that opens a studio's page, after `before(page)`, in a browser of its own."""
+    with contextlib.ExitStack() as opened:
+
+        def visit(server: Served, before: Callable[["Page"], Any] = lambda page: None) -> "Page":
+            # The driver waits by evaluating words in the page, which its policy forbids; another test has that.
+            context = browser.new_context(viewport={"width": 900, "height": 600}, bypass_csp=True)
+            opened.callback(context.close)
+            page = context.new_page()
+            page.set_default_timeout(15_000)
+            before(page)
+            page.goto(f"http://127.0.0.1:{server.port}/{server.token}/")
+            page.evaluate("window.avmsf.ready.then(() => null)")
+            return page
+
+        yield visit

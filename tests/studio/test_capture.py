@@ -2,7 +2,6 @@
 
 import csv
 import hashlib
-import io
 import os
 import threading
 from collections.abc import Callable
@@ -153,44 +152,26 @@ def test_only_recordings_of_the_table_can_be_touched(tmp_path: Path, file: str) 
     assert (tmp_path / "a.wav").read_bytes() == blow()
 
 
-def test_a_link_out_of_the_folder_is_neither_read_nor_written(tmp_path: Path) -> None:
-    folder = fill(tmp_path / "filled")
-    outside = tmp_path / "outside.wav"
-    outside.write_bytes(blow(5))
-    (folder / "a.wav").unlink()
-    (folder / "a.wav").symlink_to(outside)
-    editor = CaptureEditor(folder)
-    described = editor.describe()["strikes"][0]
-    assert not described["readable"]
-    assert described["warnings"][0].startswith("a.wav: ")
-    assert [each["file"] for each in editor.impacts() if each["digest"]] == ["b.wav", "c.wav"]
-    expect_links_untouched(editor, "a.wav")
-    # Nor does its rate count.
+def test_a_link_is_never_written_through_and_one_out_of_the_folder_not_read(tmp_path: Path) -> None:
+    folder, outside = fill(tmp_path / "filled"), tmp_path / "outside.wav"
+    # A recording of another rate, which does not count either.
     outside.write_bytes(wav(ring(rate=16000), rate=16000))
-    for name in ("b.wav", "c.wav"):
-        (folder / name).unlink()
+    (folder / "out.wav").symlink_to(outside)
+    (folder / "inner.wav").symlink_to("a.wav")
+    (folder / "sub").symlink_to(".")
+    rows = "".join(f"{file},0,{row},0\n" for row, file in enumerate(("a.wav", "out.wav", "inner.wav", "sub/b.wav")))
+    (folder / "impacts.csv").write_text(f"file,x,y,z\n{rows}")
+    editor = CaptureEditor(folder)
+    assert [impact["readable"] for impact in editor.describe()["strikes"]] == [True, False, True, True]
     assert editor.check(blow())["sample_rate"] == 8000
-
-
-def test_a_link_to_another_recording_is_read_and_never_written_through(tmp_path: Path) -> None:
-    editor = recorded(tmp_path, 1)
-    (tmp_path / "003.wav").symlink_to("001.wav")
-    (tmp_path / "sub").symlink_to(".")
-    rows = "001.wav,0,0,0,0,0,1\n003.wav,0.1,0,0,0,0,1\nsub/001.wav,0.2,0,0,0,0,1\n"
-    (tmp_path / "impacts.csv").write_text(f"file,x,y,z,nx,ny,nz\n{rows}")
-    assert all(impact["readable"] for impact in editor.describe()["strikes"])
-    expect_links_untouched(editor, "003.wav", "sub/001.wav")
-
-
-def expect_links_untouched(editor: CaptureEditor, *files: str) -> None:
-    before = contents(editor.folder)
-    for file in files:
+    before = contents(tmp_path)
+    for file in ("out.wav", "inner.wav", "sub/b.wav"):
         changes: list[Callable[[], object]] = [lambda: editor.redo(file, blow(9)), lambda: editor.remove(file)]  # noqa: B023
         for change in changes:
             with raises(RequestError, file=file, value="link") as refused:
                 change()
             assert refused.value.status == 409
-    after = contents(editor.folder)
+    after = contents(tmp_path)
     assert {path: after[path] for path in before} == before
 
 
@@ -222,29 +203,29 @@ def test_another_tabs_recording_is_neither_overwritten_nor_removed(tmp_path: Pat
     assert not (tmp_path / "impacts.csv").exists()
 
 
-def test_a_table_of_the_users_own_keeps_unit_columns_order_and_comments(tmp_path: Path) -> None:
-    header, rows = "Name;file;z;x;y", ("first;a.wav;0;0,1;0", '"second; 2";b.wav;0;0;20', "third;c.wav;30;0;0")
-    folder = fill(tmp_path / "filled", header=header, rows=rows, settings='unit = "cm"')
-    text = f"\ufeff# by Ann\r\n{header}\r\n" + "".join(f"{row}\r\n" for row in rows)
+WINDOWS = '\ufeff# by Ann\r\nName;file;z;x;y\r\nfirst;a.wav;0;0,1;0\r\n"second; 2";b.wav;0;0;20\r\nc;c.wav;30;0;0\r\n'
+UNIX = 'file, x,y,z,note\na.wav,0, 0,0,\n\nb.wav,0,0,20,"two\nlines"\nc.wav,30,0,0,  plain'
+
+
+@pytest.mark.parametrize(
+    ("text", "row", "without"),
+    [
+        # With decimal commas, as those before it, and in no more digits than it takes.
+        (WINDOWS, ";001.wav;30,0;11,0;2,0\r\n", '"second; 2";b.wav;0;0;20\r\n'),
+        (UNIX, "\n001.wav,11.0,2.0,30.0,\n", '\nb.wav,0,0,20,"two\nlines"\n'),
+    ],
+)
+def test_a_table_of_the_users_own_stays_to_the_last_byte_but_for_what_changes(
+    tmp_path: Path, text: str, row: str, without: str
+) -> None:
+    folder = fill(tmp_path / "filled", settings='unit = "cm"')
     (folder / "impacts.csv").write_bytes(text.encode())
     editor = CaptureEditor(folder)
     added = editor.add(blow(3), read_contact({"x": "0.11", "y": "0.02", "z": "0.3"}))
     assert added["contact"] == pytest.approx((0.11, 0.02, 0.3), abs=1e-15)
-    # With decimal commas, as those before it, and in no more digits than it takes.
-    assert (folder / "impacts.csv").read_bytes().decode() == f"{text};001.wav;30,0;11,0;2,0\r\n"
-    editor.remove("001.wav")
-    assert (folder / "impacts.csv").read_bytes().decode() == text
-
-
-def test_lines_that_are_not_changed_stay_to_the_last_byte(tmp_path: Path) -> None:
-    header, rows = "file, x,y,z,note\n", ["a.wav,0, 0,0,\n", '\nb.wav,0,0,20,"two\nlines"\n', "c.wav,30,0,0,  plain"]
-    folder = fill(tmp_path / "filled")
-    (folder / "impacts.csv").write_text(header + "".join(rows))
-    editor = CaptureEditor(folder)
-    editor.add(blow(3), read_contact({"x": "1", "y": "2", "z": "3"}))
-    assert (folder / "impacts.csv").read_text() == header + "".join(rows) + "\n001.wav,1.0,2.0,3.0,\n"
+    assert (folder / "impacts.csv").read_bytes().decode() == text + row
     editor.remove("b.wav")
-    assert (folder / "impacts.csv").read_text() == header + rows[0] + rows[2] + "\n001.wav,1.0,2.0,3.0,\n"
+    assert (folder / "impacts.csv").read_bytes().decode() == text.replace(without, "") + row
 
 
 def test_every_row_has_what_the_table_has_columns_for(tmp_path: Path) -> None:
@@ -316,28 +297,24 @@ def test_another_rate_is_refused_at_once(tmp_path: Path) -> None:
     assert editor.redo("001.wav", wav(ring(rate=16000), rate=16000))["sample_rate"] == 16000
 
 
-def test_another_format_becomes_a_wav_of_the_same_samples(tmp_path: Path) -> None:
+def test_a_recording_of_another_format_becomes_a_wav_of_the_same_samples(tmp_path: Path) -> None:
     sound = np.round(ring(before=0.1) * 32768) / 32768
-    recorded(tmp_path, 0).add(wav(sound, subtype="PCM_16", kind="FLAC"), contact(0.1))
-    content = (tmp_path / "001.wav").read_bytes()
-    assert content[:4] == b"RIFF"
-    samples, rate = soundfile.read(io.BytesIO(content))
-    assert rate == 8000
-    assert np.array_equal(samples, sound)
-
-
-def test_a_recording_of_another_format_is_redone_as_a_wav_of_its_own_name(tmp_path: Path) -> None:
-    before = wav(ring(before=0.1), subtype="PCM_16", kind="FLAC")
-    for name, content in (("hit.flac", before), ("hit2.flac", before), ("hit2.wav", blow(4))):
+    flac = wav(sound, subtype="PCM_16", kind="FLAC")
+    for name, content in (("hit.flac", flac), ("hit2.flac", flac), ("hit2.wav", blow(4))):
         (tmp_path / name).write_bytes(content)
     (tmp_path / "impacts.csv").write_text("file,x,y,z,note\nhit.flac,0,0,0,a  b\nhit2.flac,0.1,0,0,\n")
     editor = CaptureEditor(tmp_path)
+    added = editor.add(flac, contact(0.3))["file"]
+    samples, rate = soundfile.read(tmp_path / added)
+    assert (added, rate, (tmp_path / added).read_bytes()[:4]) == ("001.wav", 8000, b"RIFF")
+    assert np.array_equal(samples, sound)
+    # Redone, it is a wav of its own name, unless there is another one.
     redone = editor.redo("hit.flac", blow(6))
     assert (redone["file"], redone["row"], redone["readable"]) == ("hit.wav", 0, True)
     assert (tmp_path / "hit.wav").read_bytes() == blow(6)
     assert not (tmp_path / "hit.flac").exists()
-    assert removed(tmp_path) == [before]
-    assert editor.redo("hit2.flac", blow(7))["file"] == "001.wav"
+    assert removed(tmp_path) == [flac]
+    assert editor.redo("hit2.flac", blow(7))["file"] == "002.wav"
     assert (tmp_path / "hit2.wav").read_bytes() == blow(4)
     assert (tmp_path / "impacts.csv").read_text().splitlines()[1] == "hit.wav,0,0,0,a  b"
 

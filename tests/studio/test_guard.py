@@ -34,55 +34,44 @@ def test_the_page_and_its_data_are_there_under_the_token(server: Served) -> None
 
 
 def test_without_the_token_nothing_is_told(server: Served) -> None:
-    paths = [
+    assert len({new_token() for _ in range(100)}) == 100
+    # 24 bytes of chance are 32 characters of base64.
+    assert len(server.token) == 32
+    for path in (
         "/",
         "/manifest.json",
-        "/edit",
         f"/{new_token()}/",
         f"/{server.token[:-1]}/manifest.json",
         f"//{server.token}/",
-    ]
-    answers = [server.ask("GET", path, whole=True) for path in paths]
-    assert {answer.status for answer in answers} == {404}
-    assert [answer.words for answer in answers] == [{"error": NOTHING_HERE, "moved": True}] * len(paths)
+    ):
+        answer = server.ask("GET", path, whole=True)
+        assert (answer.status, answer.words) == (404, {"error": NOTHING_HERE, "moved": True})
+        assert server.token not in str(answer.headers)
     assert server.ask("POST", "/edit", {"base": 1}, whole=True).status == 404
-    assert all(server.token not in str(answer.headers) for answer in answers)
-
-
-def test_the_address_without_its_last_slash_leads_to_the_page(server: Served) -> None:
     answer = server.ask("GET", f"/{server.token}", whole=True)
     assert (answer.status, answer.headers["location"]) == (308, f"/{server.token}/")
 
 
-def test_tokens_are_long_and_never_the_same() -> None:
-    tokens = {new_token() for _ in range(100)}
-    assert len(tokens) == 100
-    # 24 bytes of chance are 32 characters of base64.
-    assert min(map(len, tokens)) == 32
+HOSTS = ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "0.0.0.0:{port}", ""]
+ORIGINS = ["https://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1:{port}"]
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "0.0.0.0:{port}", ""]
+    ("header", "value"), [*(("Host", host) for host in HOSTS), *(("Origin", origin) for origin in ORIGINS)]
 )
-def test_a_name_that_was_bent_to_this_machine_is_refused(server: Served, host: str) -> None:
-    answer = server.ask("GET", "manifest.json", headers={"Host": host.format(port=server.port)})
-    assert answer.status == 403
-    assert answer.words["error"].startswith("host: ")
+def test_another_name_of_this_machine_and_another_sites_page_are_refused(
+    server: Served, header: str, value: str
+) -> None:
+    for method, place, body in (("GET", "manifest.json", None), ("POST", "undo", {"base": 1})):
+        answer = server.ask(method, place, body, headers={header: value.format(port=server.port)})
+        assert answer.status == 403
+        assert answer.words["error"].startswith(f"{header.lower()}: ")
 
 
-@pytest.mark.parametrize("name", LOOPBACK)
-def test_loopback_names_are_let_in(server: Served, name: str) -> None:
-    assert server.ask("GET", "manifest.json", headers={"Host": f"{name.upper()}:{server.port}"}).status == 200
-
-
-@pytest.mark.parametrize("origin", ["https://evil.example", "null", "http://127.0.0.1:1", "https://127.0.0.1:{port}"])
-@pytest.mark.parametrize("method", ["GET", "POST"])
-def test_another_sites_page_is_refused(server: Served, origin: str, method: str) -> None:
-    headers = {"Origin": origin.format(port=server.port)}
-    answer = server.ask(method, "manifest.json" if method == "GET" else "undo", {"base": 1}, headers=headers)
-    assert answer.status == 403
-    assert answer.words["error"].startswith("origin: ")
-    assert server.ask("GET", "manifest.json", headers={"Origin": f"http://127.0.0.1:{server.port}"}).status == 200
+def test_loopback_names_and_the_pages_own_origin_are_let_in(server: Served) -> None:
+    own = [{"Host": f"{name.upper()}:{server.port}"} for name in LOOPBACK]
+    for headers in (*own, {"Origin": f"http://127.0.0.1:{server.port}"}):
+        assert server.ask("GET", "manifest.json", headers=headers).status == 200
 
 
 @pytest.mark.parametrize(

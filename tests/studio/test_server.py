@@ -237,20 +237,6 @@ def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
             assert torch.allclose(one.point.double(), other.point.double(), atol=1e-3)
 
 
-def test_the_capture_is_guarded_by_the_recordings_digest(capture: Served) -> None:
-    added = capture.ask("POST", "capture/strikes?x=0&y=0&z=0.002", blow()).words
-    file = "capture/strikes/001.wav"
-    quoted = {"If-Match": f'"{added["digest"]}"'}
-    assert capture.ask("PUT", file, blow(1), headers=quoted).status == 200
-    for method, content in (("PUT", blow(2)), ("DELETE", None)):
-        late = capture.ask(method, file, content, headers=quoted)
-        assert late.status == 409
-        assert late.words["error"].startswith("001.wav: ")
-    assert capture.get(file).content == blow(1)
-    [strike] = capture.get("capture").words["strikes"]
-    assert capture.ask("DELETE", file, headers={"If-Match": strike["digest"]}).status == 200
-
-
 def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:
     manifest = capture.manifest()
     assert manifest["live"]["mode"] == "capture"
@@ -275,7 +261,9 @@ def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:
     assert told["ready"]
     assert told["object"] == "surface.obj"
     assert capture.get("capture/strikes/002.wav").content == blow(1)
-    assert capture.ask("PUT", "capture/strikes/002.wav", blow(9)).words["row"] == 1
+    quoted = {"If-Match": f'"{told["strikes"][1]["digest"]}"'}
+    assert capture.ask("PUT", "capture/strikes/002.wav", blow(9), headers=quoted).words["row"] == 1
+    assert capture.ask("PUT", "capture/strikes/002.wav", blow(8), headers=quoted).status == 409
     assert capture.ask("DELETE", "capture/strikes/003.wav").status == 200
     assert len(capture.get("capture").words["strikes"]) == 2
     assert (tmp_path / "lid" / "impacts.csv").is_file()
@@ -365,30 +353,27 @@ def test_a_port_in_use_is_named_with_a_way_out(tmp_path: Path) -> None:
         assert {each.getsockname()[0] for each in (one, two)} == {"127.0.0.1"}
 
 
-def test_the_browsers_command_line_holds_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    addresses: list[str] = []
-    opened: list[tuple[str, int]] = []
-
-    def open_browser(address: str) -> None:
-        path = Path(urllib.request.url2pathname(address.removeprefix("file:")))
-        opened.append((path.read_text(), path.stat().st_mode & 0o777))
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr("webbrowser.open", open_browser)
-    assert not serve(open_plate(tmp_path), port=0, log=addresses.append)
-    [(text, mode)] = opened
-    assert f'content="0; url={addresses[0]}"' in text
-    assert mode == 0o600
+BROWSER = "import os, sys; from pathlib import Path; path = Path(sys.argv[2].removeprefix('file://'))\n"
+BROWSER += "Path(sys.argv[1]).write_text(f'{path.stat().st_mode & 0o777:o} {path.read_text()}')"
 
 
 @pytest.mark.slow
-def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
-    opened = open_plate(tmp_path / "opened")
+def test_the_command_serves_until_it_is_told_to_end_and_tells_no_browsers_command_line_its_secret(
+    tmp_path: Path,
+) -> None:
+    opened, seen, script = open_plate(tmp_path / "opened"), tmp_path / "seen", tmp_path / "browser.py"
+    script.write_text(BROWSER)
     command = [sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())", "studio"]
-    words = [*command, str(opened.field), "--no-browser", "--port", "0", "--json"]
     environment = {**os.environ, "TMPDIR": str(tmp_path / "temporary")}
+    environment["BROWSER"] = f"{sys.executable} {script} {seen} %s"
     (tmp_path / "temporary").mkdir()
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    process = subprocess.Popen(
+        [*command, str(opened.field), "--port", "0", "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
     assert process.stderr is not None
     try:
         line = next(line for line in process.stderr if "http://" in line)
@@ -396,12 +381,13 @@ def test_the_command_serves_until_it_is_told_to_end(tmp_path: Path) -> None:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}/", address)
         with urllib.request.urlopen(f"{address}manifest.json", timeout=20) as answer:
             assert json.load(answer)["modes"] == 5
-        assert list((tmp_path / "temporary").glob("avmsf-studio-*"))
+        wait_until(seen.exists)
         process.send_signal(signal.SIGINT)
         out, rest = process.communicate(timeout=20)
     finally:
         process.kill()
-    assert process.returncode == 0
-    assert rest == "closed\n"
-    assert json.loads(out) == {"address": address}
+    assert (process.returncode, rest, json.loads(out)) == (0, "closed\n", {"address": address})
     assert list((tmp_path / "temporary").iterdir()) == []
+    mode, _, text = seen.read_text().partition(" ")
+    assert mode == "600"
+    assert f'content="0; url={address}"' in text

@@ -185,7 +185,7 @@ def test_the_engine_plays_what_is_rendered_and_goes_on_with_another_field(page: 
                setTimeout(() => context.resume(), 100);
              });
              at(128 * 25 / rate, () => engine.node.port.postMessage(
-               { type: "strike", impact: engine.tuned.impact(2, { force: 0.8 }, 0, 1) }));
+               { type: "strike", impact: engine.tuned.impact(2, { force: 0.8 }) }));
              at(128 * 75 / rate, () => engine.replace(bundle));
              const sound = (await context.startRendering()).getChannelData(0);
              return [asText(sound), engine.level];
@@ -277,7 +277,12 @@ def test_noise_does_not_break_off(page: "Page", kind: str) -> None:
 def test_what_cannot_be_heard_is_no_longer_computed(page: "Page", kind: str) -> None:
     """A second of a mode that falls to -120 dB in .35 s, beside one that rings on."""
     dampings = [40.0, 0.1]
-    impact = {"frame": 0, "sine": [1.0, 1.0], "cosine": [0.0, 0.0], "damping": dampings if kind == "perContact" else None}
+    impact = {
+        "frame": 0,
+        "sine": [1.0, 1.0],
+        "cosine": [0.0, 0.0],
+        "damping": dampings if kind == "perContact" else None,
+    }
     field = {"frequency": [300.0, 500.0], "damping": dampings if kind == "shared" else None, "noise": [0.0]}
     given = {"field": field, "voices": 8, "impacts": [impact]}
     assert page.evaluate(BANK, {**given, "seconds": 0.3})["modes"] == 2

@@ -106,9 +106,8 @@ export const server = {
 
   /** Add an impact; the same recording and contact twice add it once. */
   addImpact: (recording, { contact, direction }) => {
-    const query = new URLSearchParams();
-    ["x", "y", "z"].forEach((axis, at) => query.set(axis, contact[at]));
-    if (direction) ["nx", "ny", "nz"].forEach((axis, at) => query.set(axis, direction[at]));
+    const [[x, y, z], [nx, ny, nz]] = [contact, direction ?? []];
+    const query = new URLSearchParams({ x, y, z, ...(direction && { nx, ny, nz }) });
     return ask("POST", `capture/strikes?${query}`, wav(recording));
   },
   // With the recording's digest, as `capture` gives it, it is changed only if no other tab was faster.

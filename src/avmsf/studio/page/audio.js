@@ -47,28 +47,15 @@ export async function drawWaveform(canvas, blob, onset) {
   context.fillRect((onset * width) / buffer.duration, 0, 2 * devicePixelRatio, height);
 }
 
-let playing = null;
+const player = new Audio();
+player.addEventListener("ended", () => URL.revokeObjectURL(player.src));
 
 /** Play a recording, a blob or an address, by the browser's own player; one recording at a time. */
 export async function listen(sound) {
-  playing?.end();
-  const address = sound instanceof Blob ? URL.createObjectURL(sound) : sound;
-  const player = new Audio(address);
-  const mine = {
-    end() {
-      player.pause();
-      if (address !== sound) URL.revokeObjectURL(address);
-      if (playing === mine) playing = null;
-    },
-  };
-  playing = mine;
-  player.addEventListener("ended", mine.end);
-  try {
-    await player.play();
-  } catch (error) {
+  URL.revokeObjectURL(player.src);
+  player.src = sound instanceof Blob ? URL.createObjectURL(sound) : sound;
+  await player.play().catch((error) => {
     // Another was begun before this one was read.
-    if (playing !== mine) return;
-    mine.end();
-    throw new Error(`The recording cannot be played (${error.message}).`);
-  }
+    if (error.name !== "AbortError") throw new Error(`The recording cannot be played (${error.message}).`);
+  });
 }

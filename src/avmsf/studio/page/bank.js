@@ -202,7 +202,7 @@ export class Bank {
       if (this.shared !== null) this.floor = Math.min(this.floor, voice.floor);
       else voice.resonators = new Resonators(this.field.frequency, impact.damping, this.rate, this.block);
       this.sounding.push(voice);
-      this.begun.push({ id: impact.id, frame: voice.frame });
+      this.begun.push(voice.frame);
     }
     this.waiting = later;
   }
@@ -306,7 +306,6 @@ if (typeof AudioWorkletProcessor !== "undefined") {
   class ModalBankProcessor extends AudioWorkletProcessor {
     constructor({ processorOptions: { field, level, voices, impacts, ahead } }) {
       super();
-      this.voices = voices;
       this.bank = new Bank(field, sampleRate, BLOCK, voices);
       for (const impact of impacts) this.bank.strike(impact);
       this.leaving = [];
@@ -317,18 +316,14 @@ if (typeof AudioWorkletProcessor !== "undefined") {
       this.old = new Float64Array(BLOCK);
       this.reported = 0;
       this.said = false;
-      this.port.onmessage = ({ data }) => this.heed(data);
-    }
-
-    heed(message) {
-      if (message.type === "strike") this.bank.strike(message.impact);
-      else if (message.type === "level") this.wanted = message.level;
-      else if (message.type === "field") this.replace(message.field);
-    }
-
-    replace(field) {
-      this.leaving.push({ bank: this.bank, left: Math.round(FADE * sampleRate) });
-      this.bank = new Bank(field, sampleRate, BLOCK, this.voices);
+      this.port.onmessage = ({ data: { type, impact, level, field } }) => {
+        if (type === "strike") this.bank.strike(impact);
+        if (type === "level") this.wanted = level;
+        if (type === "field") {
+          this.leaving.push({ bank: this.bank, left: Math.round(FADE * sampleRate) });
+          this.bank = new Bank(field, sampleRate, BLOCK, voices);
+        }
+      };
     }
 
     process(inputs, outputs) {
@@ -359,7 +354,7 @@ if (typeof AudioWorkletProcessor !== "undefined") {
 
     report() {
       const { begun } = this.bank;
-      for (const { id, frame } of begun) this.port.postMessage({ type: "begun", id, frame: frame + this.ahead });
+      for (const frame of begun) this.port.postMessage({ type: "begun", frame: frame + this.ahead });
       begun.length = 0;
       if (currentFrame - this.reported < REPORT * sampleRate) return;
       const { limited } = this.limiter;

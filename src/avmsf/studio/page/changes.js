@@ -17,10 +17,10 @@ export class Changes {
 
   /**
    * `load()` fetches the server's current bundle and takes it; `request()` is what the sliders ask for; `takeSliders()`
-   * puts them where the server has them; `onBusy(busy)` is called when the server begins and ends to work.
+   * puts them where the server has them; `busy` is an element that is shown while the server works.
    */
-  constructor(studio, { load, request, takeSliders, onBusy }) {
-    Object.assign(this, { studio, load, request, takeSliders, onBusy });
+  constructor(studio, { load, request, takeSliders, busy }) {
+    Object.assign(this, { studio, load, request, takeSliders, busy });
   }
 
   /** A slider has moved; what the sliders ask for together is sent when they rest. */
@@ -53,7 +53,7 @@ export class Changes {
 
   /** Within the queue: do what changes the field; undefined if it failed, which is said, or another tab was faster. */
   async ask(action, { again, refused = [] }) {
-    this.onBusy(true);
+    this.busy.hidden = false;
     try {
       const answer = await action();
       unsay("edit");
@@ -64,7 +64,7 @@ export class Changes {
       else if (await this.show(error, { sliders: true })) say(CHANGED_ELSEWHERE, { name: "edit" });
       return undefined;
     } finally {
-      this.onBusy(false);
+      this.busy.hidden = true;
     }
   }
 

@@ -30,6 +30,7 @@ const levelTicks = (top) =>
 
 export class SpectrumView {
   #strike = null;
+  /** Pieces of [seconds, level] each, between which no level was taken for too long. */
   #trace = [];
   #quietSince = null;
   #running = false;
@@ -123,7 +124,8 @@ export class SpectrumView {
     analyser.getFloatFrequencyData(this.lines);
     const power = this.wave.subarray(-LEVEL_SAMPLES).reduce((sum, value) => sum + value * value, 0) / LEVEL_SAMPLES;
     const level = decibels(Math.sqrt(power)) - this.#volume;
-    this.#trace.push([seconds, level]);
+    if (!(seconds - this.#trace.at(-1)?.at(-1)[0] <= GAP_SECONDS)) this.#trace.push([]);
+    this.#trace.at(-1).push([seconds, level]);
     if (level > this.#top - RANGE_DB - 10) this.#quietSince = null;
     else this.#quietSince ??= seconds;
     return this.#quietSince === null || seconds - this.#quietSince < QUIET_SECONDS || seconds < Math.min(span, 1);
@@ -183,7 +185,7 @@ export class SpectrumView {
     const shares = chart.width < 240 ? [0.5, 1] : [0.25, 0.5, 0.75, 1];
     const ticks = shares.map((share) => ({ share, words: `${Number((share * seconds).toPrecision(2))} s` }));
     chart.axes(ticks, levelTicks(this.#top));
-    for (const piece of unbroken(this.#trace)) {
+    for (const piece of this.#trace) {
       const points = piece.map(([at, level]) => [at / seconds, down(level)]);
       chart.curve(points, chart.ink.second, { fill: true });
     }
@@ -194,16 +196,6 @@ export class SpectrumView {
     const model = steps.map((share) => [share, down(10 * Math.log10(power(share * seconds)))]);
     chart.curve(model, chart.ink.first, { dash: [5, 4] });
   }
-}
-
-/** The pieces of a list of [seconds, level] between which no level was taken for too long; none for a single level. */
-function unbroken(trace) {
-  const pieces = [];
-  trace.forEach((point, at) => {
-    if (at === 0 || point[0] - trace[at - 1][0] > GAP_SECONDS) pieces.push([]);
-    pieces.at(-1).push(point);
-  });
-  return trace.length > 1 ? pieces : [];
 }
 
 let forgetting;

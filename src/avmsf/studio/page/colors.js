@@ -25,12 +25,6 @@ const SIGN = [
   [103, 0, 31],
 ];
 
-function between(stops, share) {
-  const place = Math.min(Math.max(share, 0), 1) * (stops.length - 1);
-  const low = Math.min(Math.floor(place), stops.length - 2);
-  return stops[low].map((value, channel) => value + (place - low) * (stops[low + 1][channel] - value));
-}
-
 /** A scale takes one value to [red, green, blue] of 0..255 and tells the style sheet what it looks like. */
 class Scale {
   constructor(stops, toShare) {
@@ -39,7 +33,10 @@ class Scale {
   }
 
   color(value) {
-    return between(this.stops, this.toShare(value));
+    const { stops } = this;
+    const at = Math.min(Math.max(this.toShare(value), 0), 1) * (stops.length - 1);
+    const low = Math.min(Math.floor(at), stops.length - 2);
+    return stops[low].map((channel, index) => channel + (at - low) * (stops[low + 1][index] - channel));
   }
 
   /** Red, green, blue of every value, 0..255, three bytes each. */

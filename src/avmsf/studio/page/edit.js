@@ -51,9 +51,7 @@ export function editTab(studio, load) {
       modes: changedModes().map(([mode, values]) => ({ mode, ...values })),
     }),
     takeSliders: () => setSliders(studio.live.sliders ?? {}),
-    onBusy: (yes) => {
-      busy.hidden = !yes;
-    },
+    busy,
   });
   const setSliders = ({ material, modes = [], ...values }) => {
     for (const [name, slider] of Object.entries(sliders)) slider.set(values[name] ?? slider.rest);

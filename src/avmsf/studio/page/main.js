@@ -8,7 +8,7 @@ import { editTab } from "./edit.js";
 import { locateTab } from "./locate.js";
 import { modesTab } from "./modetable.js";
 import { StrikePointer } from "./pointer.js";
-import { SoundEngine } from "./sound.js";
+import { renderOffline, SoundEngine } from "./sound.js";
 import { strikeTab } from "./strike.js";
 import { Studio } from "./studio.js";
 
@@ -190,7 +190,7 @@ window.avmsf = {
     return row;
   },
   /** The sound of strikes [{row, force, contactTime, when}], from the bank that plays. */
-  renderOffline: (strikes, seconds, options) => window.avmsf.studio.engine.renderOffline(strikes, seconds, options),
+  renderOffline: (strikes, ...more) => renderOffline(window.avmsf.studio.bundle, strikes, ...more),
   pick: (clientX, clientY) => window.avmsf.studio.view.pick(clientX, clientY),
   project: (position) => window.avmsf.studio.view.project(position),
   /** Values and colors that the contacts are painted by; null without paint. */

@@ -10,7 +10,6 @@ export class Modes {
     this.count = manifest.modes ?? 0;
     /** Rows that are no modes of the object, but describe what its modes do not explain. */
     this.supporting = new Set(manifest.supporting ?? []);
-    this.points = manifest.points ?? 0;
     this.sampleRate = manifest.sampleRate;
     this.shared = manifest.damping !== "perContact";
     this.tensors = tensors;
@@ -51,15 +50,15 @@ export class Modes {
   shape(mode) {
     const { sine, cosine } = this.tensors;
     let [difference, product] = [0, 0];
-    for (let row = 0; row < this.points; row++) {
+    for (let row = 0; row < this.contacts.count; row++) {
       const at = row * this.count + mode;
       difference += sine[at] ** 2 - cosine[at] ** 2;
       product += 2 * sine[at] * cosine[at];
     }
     const phase = Math.atan2(product, difference) / 2;
-    const gains = new Float32Array(this.points);
+    const gains = new Float32Array(this.contacts.count);
     let greatest = 0;
-    for (let row = 0; row < this.points; row++) {
+    for (let row = 0; row < this.contacts.count; row++) {
       const at = row * this.count + mode;
       gains[row] = sine[at] * Math.cos(phase) + cosine[at] * Math.sin(phase);
       greatest = Math.max(greatest, Math.abs(gains[row]));
@@ -70,7 +69,7 @@ export class Modes {
   /** The contact at which an impact is loudest. */
   get loudestRow() {
     let [best, loudest] = [0, -1];
-    for (let row = 0; row < this.points; row++) {
+    for (let row = 0; row < this.contacts.count; row++) {
       let power = 0;
       for (let mode = 0; mode < this.count; mode++) power += this.amplitude(mode, row) ** 2;
       if (power > loudest) [best, loudest] = [row, power];

@@ -33,10 +33,6 @@ export class PointLayer {
     this.paint(null);
   }
 
-  hit() {
-    return null;
-  }
-
   paint(colors) {
     if (colors) this.colors.array.set(colors);
     else this.colors.array.fill(150);

@@ -13,10 +13,7 @@ export class ObjectView {
     try {
       renderer = new THREE.WebGLRenderer({ antialias: bundle.manifest.object.kind !== "gaussians", alpha: true });
     } catch {
-      throw new Error(
-        "This browser shows no 3D (WebGL is missing or off), so the object is not shown." +
-          (bundle.tensors.points?.length ? " Sound still works: use the buttons in the panel." : ""),
-      );
+      throw new Error("This browser shows no 3D (WebGL is missing or off), so the object is not shown: use the panel.");
     }
     const view = new ObjectView(host, overlay, renderer);
     await view.replace(bundle);
@@ -103,7 +100,7 @@ export class ObjectView {
     this.camera.updateMatrixWorld();
     raycaster.setFromCamera(onScreen, this.camera);
     const { ray } = raycaster;
-    const place = (this.layer.hit(raycaster) ?? this.#hitContacts(ray))?.toArray();
+    const place = (this.layer.hit?.(raycaster) ?? this.#hitContacts(ray))?.toArray();
     if (!place) return null;
     const { row } = this.contacts.nearestFacing(place, ray.direction.clone().negate().toArray());
     return { row, place, normal: this.contacts.normal(row) };

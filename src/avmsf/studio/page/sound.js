@@ -88,7 +88,7 @@ class Tuned {
     return Float64Array.from(this.kept, (mode) => tensor[row * this.modes + mode]);
   }
 
-  impact(row, { force = 1, contactTime = 0, shape = "half-sine" }, frame, id = 0) {
+  impact(row, { force = 1, contactTime = 0, shape = "half-sine" }, frame = 0) {
     if (!(Number.isInteger(row) && row >= 0 && row < this.points))
       throw new RangeError(`contact: expected 0 to ${this.points - 1}, got ${row}`);
     if (!Number.isFinite(force)) throw new RangeError(`force: expected a number, got ${force}`);
@@ -100,7 +100,7 @@ class Tuned {
       loudest = Math.max(loudest, Math.hypot(sine[mode], cosine[mode]) * passed * Math.abs(force));
     }
     const damping = this.shared ? null : this.pick(this.tensors.damping, row);
-    return { id, frame, sine, cosine, damping, force: pulse.map((part) => part * force), strength: force, loudest };
+    return { frame, sine, cosine, damping, force: pulse.map((part) => part * force), strength: force, loudest };
   }
 
   /** The largest that a sample of an impact of force 1 can be. */
@@ -124,7 +124,7 @@ class Tuned {
   peak(row) {
     const samples = Math.ceil(LOUD_SECONDS * this.rate);
     const bank = new Bank({ ...this.field, noise: Float32Array.of(0) }, this.rate, samples, 1);
-    bank.strike(this.impact(row, {}, 0));
+    bank.strike(this.impact(row, {}));
     const sound = new Float64Array(samples);
     bank.render(sound, 0);
     return sound.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
@@ -146,8 +146,8 @@ async function addBank(context) {
 }
 
 /**
- * Return the sound of impacts, [{row, force, contactTime, shape, when}] with `when` in seconds, from the bank that also
- * plays live. At the field's own rate, or another; as long as a training sound, or `seconds`. In the field's unit.
+ * The sound of impacts, [{row, force, contactTime, shape, when}] with `when` in seconds, from the bank that also plays
+ * live: at the field's own rate or another, as long as a training sound or `seconds`, in the field's unit.
  */
 export async function renderOffline(bundle, impacts, seconds, options = {}) {
   const { manifest } = bundle;
@@ -158,7 +158,7 @@ export async function renderOffline(bundle, impacts, seconds, options = {}) {
   await addBank(context);
   const tuned = await Tuned.of(bundle, context.sampleRate);
   const frame = ({ when = 0 }) => Math.round(when * sampleRate);
-  const ready = impacts.map((impact, id) => tuned.impact(impact.row, impact, frame(impact), id));
+  const ready = impacts.map((impact) => tuned.impact(impact.row, impact, frame(impact)));
   // So low that the limiter has nothing to do, whatever the unit; a power of two rounds nothing.
   const bound = impacts.reduce((sum, { row, force = 1 }) => sum + Math.abs(force) * tuned.bound(row), 0);
   const level = bound > 0 ? 2 ** -Math.ceil(Math.log2(2 * bound)) : 1;
@@ -169,10 +169,7 @@ export async function renderOffline(bundle, impacts, seconds, options = {}) {
 
 /** Impacts heard live. */
 export class SoundEngine {
-  /**
-   * Return an engine. It may be started before the reader has touched the page; browsers then hold the sound back until
-   * the first impact that follows a touch. Throws with words for the reader where there is no sound to be had.
-   */
+  /** An engine; before the first touch of the page, browsers hold its sound back. Throws where there is no sound. */
   static async start(bundle, { context } = {}) {
     if (typeof AudioContext === "undefined") throw new Error("this browser has no AudioContext");
     const used = context ?? new AudioContext({ latencyHint: "interactive" });
@@ -190,14 +187,16 @@ export class SoundEngine {
     this.node = bankNode(context, this.tuned, { level: this.comfortable, ahead });
     this.analyser = new AnalyserNode(context, { fftSize: 8192, smoothingTimeConstant: 0 });
     this.node.connect(this.analyser).connect(context.destination);
-    this.next = 1;
-    /** Called with {id, time} when an impact begins; `time`, the context's seconds, is that of its first sample. */
+    /** Called with {time}, the context's seconds, of an impact's first sample when it begins. */
     this.onbegin = null;
     /** Called with true once what sounds has to be turned down to fit, and with false when it fits again. */
     this.onlimited = null;
     /** Called with true when the browser holds the sound back after an impact, and with false when it plays. */
     this.onheld = null;
-    this.node.port.onmessage = ({ data }) => this.hear(data);
+    this.node.port.onmessage = ({ data: { type, frame, limited } }) => {
+      if (type === "begun") this.onbegin?.({ time: frame / context.sampleRate });
+      if (type === "limited") this.onlimited?.(limited);
+    };
     context.addEventListener("statechange", () => {
       if (context.state === "running") this.onheld?.(false);
     });
@@ -213,16 +212,10 @@ export class SoundEngine {
     this.node.port.postMessage({ type: "level", level: this.level });
   }
 
-  /**
-   * Strike the contact in a row of the bundle's points, at once. `force` in newtons where the field knows them, else
-   * relative to an average recorded impact; `contactTime` in seconds, 0 for the recorded hammer. Returns a number.
-   */
+  /** Strike a contact by its row; `force` as the field has it, `contactTime` in seconds, 0 for the recorded hammer. */
   strike(row, { force = 1, contactTime = 0, shape = "half-sine" } = {}) {
-    const id = this.next++;
-    const impact = this.tuned.impact(row, { force, contactTime, shape }, 0, id);
-    this.node.port.postMessage({ type: "strike", impact });
+    this.node.port.postMessage({ type: "strike", impact: this.tuned.impact(row, { force, contactTime, shape }) });
     this.wake();
-    return id;
   }
 
   /** Have the sound go on: browsers hold it back before the first touch, after a call and in the background. */
@@ -235,10 +228,6 @@ export class SoundEngine {
     this.waking = setTimeout(() => {
       if (context.state !== "running" && context.state !== "closed") this.onheld?.(true);
     }, 1000 * PATIENCE);
-  }
-
-  renderOffline(impacts, seconds, options) {
-    return renderOffline(this.bundle, impacts, seconds, options);
   }
 
   /** Go on with another field, such as an edited one; what sounds fades. The level stays, to compare edits. */
@@ -261,10 +250,5 @@ export class SoundEngine {
     clearTimeout(this.waking);
     this.node.disconnect();
     await this.context.close();
-  }
-
-  hear({ type, ...data }) {
-    if (type === "begun") this.onbegin?.({ id: data.id, time: data.frame / this.context.sampleRate });
-    if (type === "limited") this.onlimited?.(data.limited);
   }
 }

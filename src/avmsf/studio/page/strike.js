@@ -2,6 +2,7 @@
 
 import { decode } from "./audio.js";
 import { attempt, button, choices, element, group, line, seconds, section, Slider, smallButton } from "./dom.js";
+import { renderOffline } from "./sound.js";
 
 /** Seconds of contact; null for the recorded hammer. */
 const MALLETS = [
@@ -153,11 +154,11 @@ class Comparison {
   async both(impact) {
     const buffer = await this.recording(impact);
     if (!buffer) return;
-    const { engine, spectra, bundle } = this.studio;
+    const { spectra, bundle } = this.studio;
     const serial = this.#serial;
     const length = Math.min(buffer.duration, MAX_COMPARED_SECONDS);
     this.#timer = setTimeout(() => this.#strikeModel(impact), 1000 * (length + PAUSE_SECONDS));
-    const model = await engine.renderOffline([{ row: this.#row(impact), ...this.#mallet }], length);
+    const model = await renderOffline(bundle, [{ row: this.#row(impact), ...this.#mallet }], length);
     if (serial !== this.#serial) return;
     const { sampleRate } = buffer;
     const samples = buffer.getChannelData(0).subarray(0, Math.round(length * sampleRate));
