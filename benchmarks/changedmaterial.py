@@ -48,7 +48,7 @@ def change(settings: Settings) -> Iterator[Record]:
         start, _ = _solved(solid, old, 1.0, count)
         found, seconds = timed(partial(change_material, start, old, kept, size=size))
         fresh, solve_seconds = _solved(solid, kept, size, count)
-        ours, truth = (_by_pitch(_gains(each), fresh.bank.frequency) for each in (found, fresh))
+        ours, truth = (_by_pitch(each, fresh.bank.frequency) for each in (found, fresh))
         rows.append(
             {
                 "frequency_error": float((found.bank.frequency / fresh.bank.frequency - 1).abs().max()),
@@ -82,16 +82,9 @@ def _solved(solid: Solid, material: Material, size: float, count: int) -> tuple[
     contacts = size * _contacts(solid)
     damping = rayleigh(body.frequency, material) / 2
     frequency = torch.sqrt(body.frequency.square() - (damping / (2 * math.pi)).square())
-    field = SoundField(
-        ModalBank(frequency, damping),
-        _gain_model(contacts, _response(body, material, contacts)),
-        torch.zeros_like(frequency),
-        Residual(torch.zeros(9)),
-        192e3,
-        1000,
-        Origin("bowl"),
-    )
-    return field, seconds
+    gains, silence = _gain_model(contacts, _response(body, material, contacts)), Residual(torch.zeros(9))
+    bank, phase = ModalBank(frequency, damping), torch.zeros_like(frequency)
+    return SoundField(bank, gains, phase, silence, 192e3, 1000, Origin("bowl")), seconds
 
 
 def _gain_model(contacts: Tensor, values: Tensor) -> MixtureGains:
@@ -118,12 +111,9 @@ def _contacts(solid: Solid) -> Tensor:
     return solid.points[corners[:: math.ceil(len(corners) / 24)]]
 
 
-def _gains(field: SoundField) -> Tensor:
-    return field.gains(field.gain_field.points).double()
-
-
-def _by_pitch(gains: Tensor, frequency: Tensor) -> Tensor:
+def _by_pitch(field: SoundField, frequency: Tensor) -> Tensor:
     """Return gains with modes of one frequency summed, which does not depend on the shapes that stand for them."""
+    gains = field.gains(field.gain_field.points).double()
     apart = torch.diff(frequency) > 1e-5 * frequency[:-1]
     group = torch.cat([torch.zeros(1, dtype=torch.long), torch.cumsum(apart.long(), 0)])
     return torch.zeros(len(gains), int(group[-1]) + 1, dtype=gains.dtype).index_add(1, group, gains)

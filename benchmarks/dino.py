@@ -23,8 +23,6 @@ EVERY = 8
 """Of the views in order of their names, every eighth is held out, the first of them too."""
 CONFIG = SplatConfig()
 QUICK = replace(CONFIG, steps=60, start_points=2000, gaussians=3000)
-_POINTS = 10
-"""Points on the curve of PSNR over time."""
 
 
 def dino(settings: Settings) -> Iterator[Record]:
@@ -57,7 +55,7 @@ def fit_dino(quick: bool) -> tuple[dict[str, float], dict[int, dict[str, float]]
 
     def evaluate(progress: SplatProgress) -> None:
         nonlocal paused
-        if progress.step % max(10, config.steps // _POINTS // 10 * 10) == 0:
+        if progress.step % max(10, config.steps // 100 * 10) == 0:
             seconds = time.perf_counter() - begun - paused
             scores, taken = timed(lambda: _scores(progress.cloud, held))
             curve[progress.step] = {"seconds": seconds, "gaussians": len(progress.cloud), **scores}

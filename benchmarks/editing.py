@@ -19,7 +19,7 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.editing.clips import level, with_length
-from avmsf.editing.config import DistillationConfig, GuidedEditConfig
+from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.distillation import DecoderDistillation
 from avmsf.editing.guided import (
     HIERARCHICAL,
@@ -147,15 +147,12 @@ PHYSICS = EditMethod("physics", _in_new_material)
 
 
 def guided(
-    name: str,
-    guide: Callable[[EditTask], Guide],
-    parameters: Parameterization,
-    settings: Mapping[str, Any] | None = None,
+    name: str, guide: Callable[[EditTask], Guide], parameters: Parameterization, settings: Mapping[str, Any]
 ) -> EditMethod:
     """Return guided editing; `settings` are those of `GuidedEditConfig` other than the seed, which is the task's."""
 
     def edit(task: EditTask) -> Edited:
-        config = GuidedEditConfig(**{"preview_every": 0, **(settings or {}), "seed": task.seed})
+        config = GuidedEditConfig(**{"preview_every": 0, **settings, "seed": task.seed})
         field, previews = task.object.sound_field, list[tuple[int, Tensor]]()
 
         def keep(progress: GuidedEditProgress) -> None:
@@ -174,7 +171,7 @@ GENERATED = 3.0
 """Seconds of a sound that is generated from a prompt only."""
 
 
-def generation(model: StableAudio, seconds: float = GENERATED, *, paper: bool = False) -> EditMethod:
+def generation(model: StableAudio, seconds: float, *, paper: bool) -> EditMethod:
     """Return direct generation (the paper's baseline): no object at all, and the modes found from the onset on."""
 
     def edit(task: EditTask) -> Edited:
@@ -188,41 +185,27 @@ def generation(model: StableAudio, seconds: float = GENERATED, *, paper: bool = 
     return EditMethod("generation", edit)
 
 
-def towards_reference(settings: Mapping[str, Any] | None = None, *, paper: bool = False) -> tuple[EditMethod, ...]:
-    """Return the methods without words: before, every mode by itself, ours or the `paper`'s parameters, and physics."""
-
-    def guide(task: EditTask) -> Guide:
-        return _expect(task.reference, "reference")
-
-    parameters = PUBLISHED if paper else HIERARCHICAL
-    single, ours = (
-        guided("unconstrained", guide, INDEPENDENT, settings),
-        guided(parameters.name, guide, parameters, settings),
-    )
-    return UNTOUCHED, single, ours, PHYSICS
-
-
-def towards_words(
-    model: StableAudio,
-    settings: Mapping[str, Any] | None = None,
-    *,
-    distillation: DistillationConfig | None = None,
-    generated: float = GENERATED,
-    paper: bool = False,
+def edit_methods(
+    settings: Mapping[str, Any], *, model: StableAudio | None = None, generated: float = GENERATED, paper: bool = False
 ) -> tuple[EditMethod, ...]:
-    """Return the methods of the paper's table: before, generation, Audio-SDS, and ours.
+    """Return the methods towards recordings, or by a `model` towards words: those of the paper's table.
 
-    `generated` is how many seconds direct generation makes. The `paper`'s form has its parameters of an edit, and its
-    extraction from generated sounds.
+    Before; every mode by itself, which with words is Audio-SDS; ours, or the `paper`'s parameters; and physics, or
+    direct generation of so many seconds. `settings` are those of `GuidedEditConfig`.
     """
+    parameters = PUBLISHED if paper else HIERARCHICAL
 
     def guide(task: EditTask) -> Guide:
+        if model is None:
+            return _expect(task.reference, "reference")
         rate = task.object.sound_field.sample_rate
-        return DecoderDistillation(model, _expect(task.prompt, "prompt"), sample_rate=rate, config=distillation)
+        return DecoderDistillation(model, _expect(task.prompt, "prompt"), sample_rate=rate)
 
-    parameters = PUBLISHED if paper else HIERARCHICAL
-    direct, single = generation(model, generated, paper=paper), guided("audio-sds", guide, INDEPENDENT, settings)
-    return UNTOUCHED, direct, single, guided(parameters.name, guide, parameters, settings)
+    single = guided("unconstrained" if model is None else "audio-sds", guide, INDEPENDENT, settings)
+    ours = guided(parameters.name, guide, parameters, settings)
+    if model is None:
+        return UNTOUCHED, single, ours, PHYSICS
+    return UNTOUCHED, generation(model, generated, paper=paper), single, ours
 
 
 @dataclass(frozen=True)
@@ -270,8 +253,7 @@ def score_edits(
                 made = method.edit(task)
             except AvmsfError as error:
                 name = f"{task.object.name} to {task.target}, {method.name}"
-                attributes = {**error.attributes, "name": name}
-                warnings.warn(AvmsfWarning(f"{name}: no score, since {error}", **attributes), stacklevel=2)
+                warnings.warn(AvmsfWarning(f"{name}: no score, since {error}", name=name), stacklevel=2)
                 continue
             score = _score(task, method.name, made, spaces, time.perf_counter() - begun)
             if clap is not None and task.prompt is not None:
@@ -312,11 +294,7 @@ def spectral_distance(made: Edited, reference: Reference) -> float:
     Free of level; 0 for a sound that is one of the clips, 1 for silence. Raises EvaluationError for another rate.
     """
     if made.sample_rate != reference.sample_rate:
-        raise EvaluationError(
-            f"expected a reference at {made.sample_rate:g} Hz, got {reference.sample_rate:g} Hz; resample one of them",
-            name="reference",
-            value=reference.sample_rate,
-        )
+        raise EvaluationError.expected(f"{made.sample_rate:g} Hz", reference.sample_rate, name="reference")
     clips = with_length(reference.clips, made.sounds.shape[1])
     sounds, wanted = (
         each.double() / level(each.double(), sample_rate=made.sample_rate)[:, None] for each in (made.sounds, clips)

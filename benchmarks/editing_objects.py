@@ -3,24 +3,21 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.fit import fit
-from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
 from avmsf.field.trainer import GainEstimator
-from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_sounds
-from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 
 _CERAMIC = ("3_CeramicKoiBowl", "4_CeramicBowlFish", "9_BowlCeramic", "61_PlanterCeramic", "63_SmallPlanterCeramic",
@@ -38,7 +35,7 @@ REALIMPACT_26: Mapping[str, str] = {name: material for material, names in _LISTE
 Those whose name contains the material, the first seven of each by number, iron and metal as one, without
 self-intersecting meshes. There is one of glass."""
 
-_FAINTEST_DB = -60.0
+_AUDIBLE_DB = -60.0
 """Energy relative to the strongest mode's, decibels, below which a mode is inaudible."""
 DIRECT = FitConfig(steps=0, damping="shared", residual=False)
 """Settings of a field without training end to end and without residual noise, which no edit changes."""
@@ -73,17 +70,10 @@ class KnownObject:
     def sound_field(self) -> SoundField:
         """Its field."""
         features = FeatureField.from_points(self.impacts.contacts) if self.features is None else self.features()
-        if self.checkpoint is not None:
-            self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        return fit(
-            self.impacts,
-            features,
-            self.modes,
-            self.config,
-            gains=self.recipe,
-            capture=self.name,
-            checkpoint=self.checkpoint,
-        )
+        file, modes = self.checkpoint, self.modes
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        return fit(self.impacts, features, modes, self.config, gains=self.recipe, capture=self.name, checkpoint=file)
 
 
 def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = math.inf) -> ModalBank:
@@ -95,47 +85,6 @@ def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = m
     energy = amplitudes.abs().double().square().mean(dim=0) / (4.0 * bank.damping)
     energy = torch.where(bank.frequency < 0.5 * sample_rate, energy, 0.0)
     if not bool(energy.max() > 0.0):
-        raise EvaluationError.expected(
-            "a mode with energy below half the sample rate",
-            len(bank),
-            got=f"none among {len(bank)}",
-            name="bank",
-            advice="check the frequencies and amplitudes",
-        )
-    kept = energy >= energy.max() * 10.0 ** (_FAINTEST_DB / 10.0)
+        raise EvaluationError.expected("a mode with energy below half the sample rate", len(bank), name="bank")
+    kept = energy >= energy.max() * 10.0 ** (_AUDIBLE_DB / 10.0)
     return bank.take(kept)
-
-
-def plain_object(name: str, material: str, impacts: Impacts) -> KnownObject:
-    """Return an object with the default's modes and a field without training. Raises as `extract_modes`."""
-    return KnownObject(name, material, impacts, extract_modes(impacts))
-
-
-def paper_object(
-    name: str,
-    material: str,
-    impacts: Impacts,
-    *,
-    features: Callable[[str], FeatureField],
-    config: FitConfig = PUBLISHED,
-    checkpoints: Path | None = None,
-) -> KnownObject:
-    """Return an object as the paper reconstructs it: modes of section 3.4, the attention network and residual noise.
-
-    `features` makes the visual features of an object by its name; `checkpoints` is a folder for states of training,
-    which a repeated call goes on from. Raises ExtractionError where no mode is found.
-    """
-    modes = extract_sounds(impacts.sounds, sample_rate=impacts.sample_rate, method=ShortTime())
-    kept = None if checkpoints is None else checkpoints / name
-    return KnownObject(name, material, impacts, modes, Attention(), partial(features, name), config, kept)
-
-
-def recorded_objects(
-    dataset: Dataset, *, make: Callable[[str, str, Impacts], KnownObject] = plain_object
-) -> tuple[KnownObject, ...]:
-    """Read the 26 objects of RealImpact, and `make` them of all of their recordings.
-
-    Objects that the dataset does not hold are left out, so that a part of it will do. Raises as reading and making do.
-    """
-    held = [name for name in dataset.objects() if name in REALIMPACT_26]
-    return tuple(make(name, REALIMPACT_26[name], dataset.capture(name).impacts) for name in held)

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from avmsf.capture.impacts import Impacts
 from avmsf.datasets import open_dataset
 from avmsf.datasets.dataset import Dataset
 from avmsf.editing.config import GuidedEditConfig
@@ -25,6 +26,9 @@ from avmsf.evaluation.clap import Clap
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.results import write_json
 from avmsf.fem.material import MATERIALS
+from avmsf.field.gains.attention import Attention
+from avmsf.modal.extraction.extract import extract_modes, extract_sounds
+from avmsf.modal.extraction.finders import ShortTime
 from avmsf.pipeline.config import DINO, PRESETS
 from avmsf.pipeline.features import choose_encoder
 from benchmarks.editing import (
@@ -33,19 +37,11 @@ from benchmarks.editing import (
     EditScore,
     EditTask,
     Transition,
+    edit_methods,
     prompted_tasks,
     score_edits,
-    towards_reference,
-    towards_words,
 )
-from benchmarks.editing_objects import (
-    PUBLISHED,
-    REALIMPACT_26,
-    KnownObject,
-    paper_object,
-    plain_object,
-    recorded_objects,
-)
+from benchmarks.editing_objects import PUBLISHED, REALIMPACT_26, KnownObject
 from benchmarks.editingfigures import write_figures
 from benchmarks.mode_embedding import FEATURES, MaterialSpace
 from benchmarks.records import Record, Settings, markdown, means, records
@@ -118,10 +114,8 @@ def measure(
     settings: dict[str, Any] = {} if steps is None else {"steps": steps}
     if clap is not None:
         settings["preview_every"] = max(1, (steps or GuidedEditConfig().steps) // PREVIEWS)
-    if model is not None:
-        methods = towards_words(model, settings, generated=generated, paper=paper)
-    else:
-        methods = tuple(each for each in towards_reference(settings, paper=paper) if cast.known or each is not PHYSICS)
+    methods = edit_methods(settings, model=model, generated=generated, paper=paper)
+    methods = tuple(each for each in methods if cast.known or each is not PHYSICS)
     found = []
     for score in (each for task in cast.tasks for each in score_edits([task], methods, spaces, clap=clap)):
         found.append(score)
@@ -210,37 +204,43 @@ def recorded_cast(folder: Path, *, words: bool, seed: int = 0, paper: tuple[str,
     dataset = open_dataset(folder, time_zero=None if paper is None else PRESETS["paper"].time_zero)
     missing = sorted(set(REALIMPACT_26) - set(dataset.objects()))
     if len(REALIMPACT_26) - len(missing) < MIN_OBJECTS:
-        raise EvaluationError(
-            f"{folder}: expected {MIN_OBJECTS} objects of known materials or more, got "
-            f"{len(REALIMPACT_26) - len(missing)}; download more, such as {', '.join(missing[:3])}",
-            file=folder,
-            name=dataset.name,
-            value=len(REALIMPACT_26) - len(missing),
-        )
-    make = plain_object if paper is None else _paper_maker(dataset, *paper, seed=seed)
-    objects = recorded_objects(dataset, make=make)
+        found, advice = len(REALIMPACT_26) - len(missing), f"download more, such as {', '.join(missing[:3])}"
+        what = f"{MIN_OBJECTS} objects of known materials or more"
+        raise EvaluationError.expected(what, found, file=folder, name=dataset.name, advice=advice)
+    make = _plain_object if paper is None else _paper_maker(dataset, *paper, seed=seed)
+    names = [name for name in dataset.objects() if name in REALIMPACT_26]
+    objects = tuple(make(name, REALIMPACT_26[name], dataset.capture(name).impacts) for name in names)
     present = {each.material for each in objects}
     transitions = [each for each in RECORDED_TRANSITIONS if {*each} <= present]
     if not transitions:
-        pairs = ", ".join(map(" to ".join, RECORDED_TRANSITIONS))
-        raise EvaluationError(
-            f"{folder}: expected objects of a material to edit, {pairs}, found {', '.join(sorted(present))}",
-            file=folder,
-            value=tuple(sorted(present)),
-        )
+        what = f"objects of two materials, {', '.join(map(' to '.join, RECORDED_TRANSITIONS))}"
+        raise EvaluationError.expected(what, tuple(sorted(present)), file=folder)
     tasks = prompted_tasks(objects, transitions, seed=seed) if words else _referred_tasks(objects, transitions, seed)
     return Cast("realimpact", objects, tasks, known=False, missing=tuple(missing))
 
 
-def _paper_maker(dataset: Dataset, encoder: str, cache: Path, *, seed: int) -> Callable[..., KnownObject]:
+def _plain_object(name: str, material: str, impacts: Impacts) -> KnownObject:
+    """Return an object with the default's modes and a field without training."""
+    return KnownObject(name, material, impacts, extract_modes(impacts))
+
+
+def _paper_maker(
+    dataset: Dataset, encoder: str, cache: Path, *, seed: int
+) -> Callable[[str, str, Impacts], KnownObject]:
+    """Return what reconstructs an object as the paper does: short-time modes, attention network, residual noise."""
     scene = PRESETS["paper"].scene
     lift = replace(scene.lift, encoder=encoder, seed=seed)
     # Before the modes of all objects: without the encoder nothing else is worth its time.
     choose_encoder(lift, log=partial(print, file=sys.stderr))
     scene = replace(scene, splat=replace(scene.splat, seed=seed), lift=lift)
     inputs, config = ObjectInputs(dataset, cache, scene, lift), replace(PUBLISHED, seed=seed)
-    features = partial(inputs.features, visual_input="paper")
-    return partial(paper_object, features=features, config=config, checkpoints=cache / "training")
+
+    def make(name: str, material: str, impacts: Impacts) -> KnownObject:
+        modes = extract_sounds(impacts.sounds, sample_rate=impacts.sample_rate, method=ShortTime())
+        features = partial(inputs.features, name, "paper")
+        return KnownObject(name, material, impacts, modes, Attention(), features, config, cache / "training" / name)
+
+    return make
 
 
 def simulated_cast(

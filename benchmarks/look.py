@@ -8,14 +8,10 @@ import trimesh
 from jaxtyping import UInt8
 from torch import Tensor
 
-from avmsf.features.descriptors import ImageDescriptors
-from avmsf.features.lift import Lifted
 from avmsf.mesh import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
-from avmsf.pipeline.config import LiftConfig
-from avmsf.pipeline.features import lift_features
 from tests.oracles.plate import Plate
 
 AMBIENT = 0.3
@@ -47,11 +43,6 @@ def pictures(mesh: TexturedMesh, *, count: int, size: int) -> tuple[View, ...]:
     return render_views(mesh, cameras, ambient=AMBIENT, background=(0.0, 0.0, 0.0))
 
 
-def lift_pictures(surface: Surface, views: tuple[View, ...], *, points: int = 8192) -> Lifted:
-    """Lift the built-in descriptors onto points of the surface."""
-    return lift_features(surface, views, ImageDescriptors(), LiftConfig(points=points))
-
-
 def _bowl() -> trimesh.Trimesh:
     angle = np.linspace(0.0, 0.45 * np.pi, 40)
     outer = np.c_[np.sin(angle), 1 - np.cos(angle)]
@@ -68,7 +59,7 @@ SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
 
 
 def shape(name: str) -> Surface:
-    """Return one of `SHAPES`."""
+    """Return one of `SHAPES`, a surface."""
     return _surface(SHAPES[name]())
 
 

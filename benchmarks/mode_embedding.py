@@ -15,7 +15,6 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float64
 
 from avmsf.errors import EvaluationError
@@ -33,23 +32,21 @@ _PACKAGES = ("umap-learn", "numba", "numpy", "scipy", "scikit-learn", "avmsf")
 
 
 def pitches(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
-    """Return the frequencies alone, as in the paper: 32 evenly spaced quantiles of their logarithms.
+    """Return the frequencies alone, as in the paper: 32 evenly spaced quantiles of log2 f, by Hazen's rule.
 
-    Component k of n is the quantile (k + 1/2) / n of log2 f by Hazen's rule, over sqrt(n), so that the distance of two
-    sets is the root mean square of their quantiles' differences in octaves. Raises EvaluationError for a set that is
-    empty or not of numbers.
+    Over the square root of their number, so that the distance of two sets is the root mean square of their quantiles'
+    differences in octaves. Raises EvaluationError for a set that is empty or not of numbers.
     """
     levels = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
     return np.quantile(_logarithms(bank)[0], levels, method="hazen") / math.sqrt(_QUANTILES)
 
 
 def rings(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
-    """Return the frequencies as `pitches` does, and how fast each pitch decays.
+    """Return the frequencies as `pitches` does, and how fast each pitch decays, which tells materials apart.
 
-    Frequencies alone hardly tell materials apart: sound runs equally fast, to 6 %, in ceramic, glass, iron and steel,
-    and an object of twice the size is an octave lower. How fast they decay does. After the quantiles follows, at
-    evenly spaced pitches, log2 of the damping there, the mean over all modes weighted by
-    exp(-(distance in octaves / width)^2 / 2), over the square root of their number.
+    Frequencies alone hardly do: sound runs equally fast, to 6 %, in ceramic, glass, iron and steel. At evenly spaced
+    pitches follows log2 of the damping there, the mean over all modes weighted by exp(-(distance in octaves /
+    width)^2 / 2), over the square root of their number.
     """
     frequency, damping = _logarithms(bank)
     exponent = np.linspace(math.log2(125.0), math.log2(16000.0), _PITCHES)[:, None] - frequency
@@ -68,15 +65,11 @@ def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64
     """Return log2 of frequencies and dampings."""
     if not len(bank):
         raise EvaluationError("expected a bank of one mode or more, got none", name="bank", value=0)
-    both = torch.stack([bank.frequency, bank.damping])
-    wrong = torch.nonzero(~(torch.isfinite(both) & (both > 0)))
-    if len(wrong):
-        which, row = wrong[0].tolist()
-        name = ("frequency", "damping")[which]
-        value = float(both[which, row])
-        raise EvaluationError(f"mode {row}: expected a {name} above 0, got {value:g}", row=row, name=name, value=value)
-    frequency, damping = torch.log2(both).numpy()
-    return frequency, damping
+    for name in ("frequency", "damping"):
+        for row, value in enumerate(getattr(bank, name).tolist()):
+            if not 0.0 < value < math.inf:
+                raise EvaluationError.expected(f"a {name} above 0", value, row=row, name=name)
+    return bank.frequency.log2().numpy(), bank.damping.log2().numpy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +144,7 @@ class MaterialSpace:
         return float(np.linalg.norm(place - self.center(material)))
 
     def nearest_neighbor_accuracy(self) -> float:
-        """Return the part of objects whose nearest other object, by the plain vectors, is of their own material.
-
-        What a distance to a material can mean at all: objects drawn at random would have the materials' shares.
-        """
+        """Return the part of objects whose nearest other object, by the plain vectors, is of their own material."""
         apart = np.linalg.norm(self.vectors[:, None] - self.vectors[None], axis=2)
         np.fill_diagonal(apart, np.inf)
         materials = np.array(self.materials)

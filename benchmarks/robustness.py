@@ -32,12 +32,11 @@ REQUESTS = 3000
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one input."""
+    """What became of one input: read, refused, or one of `FAULTS`."""
 
     family: str
     name: str
     result: str
-    """read, refused, or one of `FAULTS`."""
     seconds: float
     """Processor time."""
     megabytes: float
@@ -52,7 +51,8 @@ def _files(settings: Settings) -> Iterator[Record]:
     more than 60 s of processor time or 4096 MB above an idle process.
     """
     with tempfile.TemporaryDirectory(prefix="avmsf-robustness-") as name:
-        seeds, folder = _seeds(Path(name))
+        seeds, folder = Path(name) / "seeds", Path(name) / "input"
+        write_seeds(seeds)
         for family, each in FAMILIES.items():
             # What a verb imports is not what an input costs.
             _copied(seeds, folder)
@@ -66,7 +66,8 @@ def _files(settings: Settings) -> Iterator[Record]:
 def _bombs(settings: Settings) -> Iterator[Record]:
     """Small files that claim or unfold to be large, likewise."""
     with tempfile.TemporaryDirectory(prefix="avmsf-robustness-") as name:
-        seeds, folder = _seeds(Path(name))
+        seeds, folder = Path(name) / "seeds", Path(name) / "input"
+        write_seeds(seeds)
         outcomes = []
         for title, bomb in BOMBS.items():
             _copied(seeds, folder)
@@ -75,11 +76,6 @@ def _bombs(settings: Settings) -> Iterator[Record]:
             values = {"seconds": outcomes[-1].seconds, "megabytes": outcomes[-1].megabytes}
             yield from records(values, object=title, note=outcomes[-1].result)
         yield from _counted(outcomes)
-
-
-def _seeds(folder: Path) -> tuple[Path, Path]:
-    write_seeds(folder / "seeds")
-    return folder / "seeds", folder / "input"
 
 
 def _copied(seeds: Path, folder: Path) -> None:

@@ -9,6 +9,7 @@ import torch
 from avmsf.capture import Capture, read_capture, write_capture
 from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.splits import split
+from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
@@ -16,12 +17,12 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
-from avmsf.pipeline.features import finish_features
+from avmsf.pipeline.features import finish_features, lift_features
 from avmsf.pipeline.fit import fit_in_stages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.dino import dino
-from benchmarks.look import SHAPES, lift_pictures, pictures, shape, slab, speckled
+from benchmarks.look import SHAPES, pictures, shape, slab, speckled
 from benchmarks.objects import STRUCK
 from benchmarks.processes import timed
 from benchmarks.rasterizer import rasterizer
@@ -39,7 +40,7 @@ def _consistency(settings: Settings) -> Iterator[Record]:
     for name in SHAPES:
         surface = shape(name)
         views = pictures(TexturedMesh.plain(surface), count=count, size=size)
-        lifted = lift_pictures(surface, views, points=points)
+        lifted = lift_features(surface, views, ImageDescriptors(), LiftConfig(points=points))
         _, made = finish_features(lifted, LiftConfig(positions=False))
         symmetries = Symmetries.from_dict(made["symmetries"])
         before = after = float("nan")

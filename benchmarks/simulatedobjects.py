@@ -80,30 +80,22 @@ class SolvedShape:
     def struck(
         self, material: Material, *, size: float = 1.0, sample_rate: float = 44100.0, seconds: float = 0.5
     ) -> KnownObject:
-        """Return the object in a material and size, struck at places far apart, straight into its surface."""
+        """Return the object in a material and size, struck at contacts far apart, straight into its surface."""
         elastic = self.remade(material, size=size)
-        vibration = damped(
-            elastic.frequency,
-            torch.diag(rayleigh(elastic.frequency, material)),
-            highest=MAX_FREQUENCY_RATIO * sample_rate,
-        )
+        damping = torch.diag(rayleigh(elastic.frequency, material))
+        vibration = damped(elastic.frequency, damping, highest=MAX_FREQUENCY_RATIO * sample_rate)
         middle = 0.5 * (elastic.nodes.amax(0) + elastic.nodes.amin(0))
         sound = radiated(elastic, vibration, middle + torch.tensor(_MICROPHONE, dtype=torch.float64))
         body = SoundingBody(elastic, vibration, sound, Hammer())
-        places = elastic.nodes[self._spread[:_CONTACTS]]
-        directions = -elastic.normals(places)
-        amplitudes = body.gains(places, directions)
-        starts, samples = torch.zeros(len(places), dtype=torch.float64), round(seconds * sample_rate)
+        contacts = elastic.nodes[self._spread[:_CONTACTS]]
+        directions = -elastic.normals(contacts)
+        amplitudes = body.gains(contacts, directions)
+        starts, samples = torch.zeros(len(contacts), dtype=torch.float64), round(seconds * sample_rate)
         sounds = recorded(vibration.poles, amplitudes, starts, sample_rate=sample_rate, samples=samples)
-        impacts = Impacts(
-            contacts=places,
-            sounds=sounds.float(),
-            sample_rate=sample_rate,
-            names=tuple(f"{row + 1:03d}.wav" for row in range(len(places))),
-            directions=directions.float(),
-        )
+        names = tuple(f"{row + 1:03d}.wav" for row in range(len(contacts)))
+        impacts = Impacts(contacts, sounds.float(), sample_rate, names, directions=directions.float())
         bank = ModalBank(vibration.frequency, vibration.damping)
-        # Regression over shapes needs some doubt: as much as noise 60 dB below the sounds would give.
+        # Regression over shapes needs some variance: as much as noise 60 dB below the sounds would give.
         level = torch.full((17,), 1e-3 * float(sounds.square().mean().sqrt()))
         modes = Extraction(bank, (1j * amplitudes).to(torch.complex64), Residual(level))
         recipe = MixtureEstimator(bodies=CandidateBodies([CandidateBody(None, elastic)]))

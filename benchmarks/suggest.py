@@ -22,10 +22,8 @@ from avmsf.simulate.simulation import simulate_object
 from benchmarks.objects import features_of, measured, settings_of, surface_of
 from benchmarks.records import Measurement, Record, Settings, means, records
 
-FIRST = 6
-"""Impacts to begin with."""
-ROUNDS = (8, 11, 15, 20)
-"""Impacts after each round, when all ways are compared."""
+FIRST, ROUNDS = 6, (8, 11, 15, 20)
+"""Impacts to begin with, and after each round, when all ways are compared."""
 HELD_OUT = 3
 """One recording of so many is held out, drawn at random."""
 STARTS = 3

@@ -25,6 +25,7 @@ from avmsf.simulate.recipe import SET, SETS
 from benchmarks.objects import views_and_gaussians
 from benchmarks.records import Measurement, Record, Settings, means, records
 
+Points = Float64[np.ndarray, "points 3"]
 SAMPLES, RAYS = 8000, 48
 OPEN = 0.5
 """Part of the directions, weighted by the cosine, in which a point of the outer side sees no other part."""
@@ -132,17 +133,13 @@ def _mesh(surface: Surface) -> trimesh.Trimesh:
     return trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
 
 
-def _sampled(
-    mesh: trimesh.Trimesh,
-) -> tuple[Float64[np.ndarray, "points 3"], Float64[np.ndarray, "points 3"]]:
+def _sampled(mesh: trimesh.Trimesh) -> tuple[Points, Points]:
     points, rows = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
     return np.asarray(points, dtype=np.float64), np.asarray(mesh.face_normals[rows], dtype=np.float64)
 
 
-def _openness(
-    mesh: trimesh.Trimesh, points: Float64[np.ndarray, "points 3"], normals: Float64[np.ndarray, "points 3"]
-) -> Float64[np.ndarray, " points"]:
-    """Return the part of the directions from each place in which nothing of the mesh lies, weighted by the cosine."""
+def _openness(mesh: trimesh.Trimesh, points: Points, normals: Points) -> Float64[np.ndarray, " points"]:
+    """Return the part of the directions from each point in which nothing of the mesh lies, weighted by the cosine."""
     generator, free = np.random.default_rng(1), np.zeros(len(points))
     for _ in range(RAYS):
         aside = generator.standard_normal(points.shape)
@@ -152,10 +149,7 @@ def _openness(
 
 
 def _rays(
-    mesh: trimesh.Trimesh,
-    points: Float64[np.ndarray, "points 3"],
-    directions: Float64[np.ndarray, "points 3"],
-    normals: Float64[np.ndarray, "points 3"] | None = None,
+    mesh: trimesh.Trimesh, points: Points, directions: Points, normals: Points | None = None
 ) -> Float64[np.ndarray, " points"]:
     """Return the distance to what lies in a direction, meters; rays start a little along the normals."""
     offset = 1e-4 * float(np.linalg.norm(mesh.extents))
