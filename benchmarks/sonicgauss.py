@@ -8,13 +8,15 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from avmsf.baselines.sonicgauss.patches import PatchCodec, log_magnitudes, spectra
 from avmsf.baselines.sonicgauss.small import (
+    PatchCodec,
     SmallConfig,
     SmallSonicGauss,
     SmallWeights,
     clip_loss,
+    log_magnitudes,
     object_tokens,
+    spectra,
     visible,
 )
 from avmsf.baselines.sonicgauss.training import TrainingConfig, train

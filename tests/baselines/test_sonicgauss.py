@@ -8,20 +8,23 @@ from itertools import pairwise
 import pytest
 import torch
 
-from avmsf.baselines.sonicgauss import patches
+from avmsf.baselines.sonicgauss import small
 from avmsf.baselines.sonicgauss.conditioning import ContactEncoding, Fusion, degree_one, first_nine, normalized
-from avmsf.baselines.sonicgauss.patches import (
-    CHANNELS,
+from avmsf.baselines.sonicgauss.small import (
     FFT,
     HOP,
+    LATENTS,
     PATCHES,
     RATE,
     PatchCodec,
+    SmallConfig,
+    SmallSonicGauss,
+    SmallWeights,
+    fit_small,
     log_magnitudes,
     sounds_of,
     spectra,
 )
-from avmsf.baselines.sonicgauss.small import SmallConfig, SmallSonicGauss, SmallWeights, fit_small
 from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, draw_times, flow_loss, integrate, train
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
@@ -168,7 +171,7 @@ def test_patches_with_all_components_lose_nothing():
     few = torch.cat([few[:, :400], few[:, :1].expand(-1, 624, -1)], dim=1)
     codec = PatchCodec.of([few], seed=0)
     latents = codec.encode(few)
-    assert latents.shape == (1, PATCHES, CHANNELS)
+    assert latents.shape == (1, PATCHES, LATENTS)
     torch.testing.assert_close(codec.decode(latents), few, rtol=0, atol=1e-3)
 
 
@@ -214,7 +217,7 @@ def test_weights_come_back_from_their_file(tmp_path):
     weights().write(path)
     again = SmallWeights.read(path)
     assert again.report == weights().report
-    latents, times, tokens = torch.randn(2, PATCHES, CHANNELS), torch.rand(2), torch.randn(2, 8, 16)
+    latents, times, tokens = torch.randn(2, PATCHES, LATENTS), torch.rand(2), torch.randn(2, 8, 16)
     assert torch.equal(again.network(latents, times, tokens), weights().network(latents, times, tokens))
     assert torch.equal(again.codec.decode(latents), weights().codec.decode(latents))
 
@@ -240,7 +243,7 @@ def lively_network() -> SmallSonicGauss:
 
 def test_the_contact_and_the_object_change_the_velocity():
     network = lively_network()
-    latents, times = torch.randn(1, PATCHES, CHANNELS), torch.tensor([0.5])
+    latents, times = torch.randn(1, PATCHES, LATENTS), torch.tensor([0.5])
     features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
     base = network(latents, times, network.condition(features, place))
     for other in (network.condition(features, place + 0.2), network.condition(features + 0.5, place)):
@@ -250,7 +253,7 @@ def test_the_contact_and_the_object_change_the_velocity():
 
 def test_the_order_of_gaussian_tokens_changes_nothing():
     network = lively_network()
-    latents, times = torch.randn(1, PATCHES, CHANNELS), torch.tensor([0.5])
+    latents, times = torch.randn(1, PATCHES, LATENTS), torch.tensor([0.5])
     features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
     one, other = (
         network(latents, times, network.condition(each, place)) for each in (features, features[:, [2, 0, 3, 1]])
@@ -260,7 +263,7 @@ def test_the_order_of_gaussian_tokens_changes_nothing():
 
 @pytest.fixture
 def _few_iterations(monkeypatch):
-    monkeypatch.setattr(patches, "_ITERATIONS", 1)
+    monkeypatch.setattr(small, "_ITERATIONS", 1)
 
 
 @pytest.mark.usefixtures("_few_iterations")

@@ -15,7 +15,7 @@ from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError, SceneError
-from avmsf.evaluation.field_methods import PAPER_GRID, FieldMethod, Grid, random_modes
+from avmsf.evaluation.field_methods import NETWORK, PAPER_GRID, FieldMethod, Grid, random_modes
 from avmsf.evaluation.methods import RecordedMethod, diffsound, method_named
 from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.splits import split
@@ -29,8 +29,7 @@ from avmsf.fem.walls import shell
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
-from avmsf.field.sound_field import SoundField
-from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.synthesis import synthesize
 from factories.made_sheet import sheet_over
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
@@ -108,7 +107,6 @@ def made(name: str, seed: int = 0) -> Renderer:
 
 
 NAMES = [name for name, entry in METHODS.items() if not entry.path]
-every_method = pytest.mark.parametrize("name", NAMES)
 # To choose takes a fit of every kind for every contact left out.
 fitted_quickly = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name == "field-auto" else name for name in NAMES]
@@ -116,8 +114,8 @@ fitted_quickly = pytest.mark.parametrize(
 
 
 @fitted_quickly
-def test_a_sound_depends_on_its_contact_alone(name):
-    _, test = parts()
+def test_a_sound_depends_on_its_contact_and_the_seed_alone(name):
+    train, test = parts()
     renderer = made(name)
     assert isinstance(method_named(name), Method)
     assert isinstance(renderer, Renderer)
@@ -132,21 +130,14 @@ def test_a_sound_depends_on_its_contact_alone(name):
         alone = renderer.render(test.contacts[row : row + 1])[0]
         assert torch.allclose(alone, together[row], rtol=0, atol=1e-5 * float(together.abs().max()))
     assert renderer.render(test.contacts[:0]).shape == (0, SAMPLES)
+    assert torch.equal(tiny(method_named(name)).fit(plate_task(train)).render(test.contacts), together)
 
 
-@fitted_quickly
-def test_a_seed_decides_all_chance(name):
-    train, test = parts()
-    again = tiny(method_named(name)).fit(plate_task(train)).render(test.contacts)
-    assert torch.equal(again, made(name).render(test.contacts))
-
-
-@every_method
+@pytest.mark.parametrize("name", NAMES)
 def test_one_or_two_shots_are_enough(name):
     impacts = struck()
     for count in (1, 2):
-        train = impacts.take(range(count))
-        renderer = tiny(method_named(name)).fit(plate_task(train))
+        renderer = tiny(method_named(name)).fit(plate_task(impacts.take(range(count))))
         sounds = renderer.render(impacts.contacts)
         assert sounds.shape == (COUNT, SAMPLES)
         assert bool(torch.isfinite(sounds).all())
@@ -154,88 +145,52 @@ def test_one_or_two_shots_are_enough(name):
             assert report_of(renderer) == {"neighbors": count}
 
 
-@pytest.mark.parametrize("name", ["nearest", "knn3", "knn3-directions", "knn-gains", "spline-gains"])
-def test_the_order_of_training_rows_changes_nothing(name):
-    train, test = parts()
-    rows = torch.randperm(TRAIN, generator=torch.Generator().manual_seed(1)).tolist()
-    shuffled = method_named(name).fit(plate_task(train.take(rows))).render(test.contacts)
-    straight = made(name).render(test.contacts)
-    assert torch.allclose(shuffled, straight, rtol=0, atol=1e-5 * float(straight.abs().max()))
-
-
-@pytest.mark.parametrize("name", ["nearest", "spline-gains"])
-def test_training_contacts_sound_as_recorded(name):
-    train, _ = parts()
-    difference = made(name).render(train.contacts) - train.sounds
-    # The recordings' noise is 40 dB down, and the spline's own noise comes to as much once more. The plate's true modes
-    # are a little off in its extraction, 20 dB at the end of the sound.
-    limit = 0.0 if name == "nearest" else 0.35
-    assert float(difference.square().mean().sqrt() / train.sounds.square().mean().sqrt()) <= limit
-
-
-@pytest.mark.parametrize("name", ["knn-gains", "spline-gains", "field", "field-no-initialization"])
-def test_methods_with_modes_give_their_bank_and_gains(name):
-    train, test = parts()
-    renderer = made(name)
-    gains = -renderer.complex_gains(test.contacts).imag
-    assert gains.shape == (len(test), len(renderer.bank))
-    if name != "field-no-initialization":
-        assert len(renderer.bank) == len(plate_extraction(train).bank)
-    if name.endswith("gains"):
-        sounds = replace(renderer, noise=False).render(test.contacts)
-        made_of = synthesize(gains, renderer.bank.frequency, renderer.bank.damping, samples=SAMPLES, sample_rate=RATE)
-        # The plate's sounds are sines alone, and so are these.
-        assert torch.allclose(sounds, made_of, rtol=0, atol=1e-6 * float(sounds.abs().max()))
-
-
 @pytest.mark.parametrize("name", ["knn-gains", "spline-gains"])
-def test_noise_beside_modes_is_the_residual(name):
-    _, test = parts()
-    noise = made(name).render(test.contacts) - replace(made(name), noise=False).render(test.contacts)
+def test_methods_with_modes_render_them_and_the_residual(name):
+    train, test = parts()
+    renderer, bank = made(name), plate_extraction(train).bank
+    assert torch.equal(renderer.bank.frequency, bank.frequency)
+    modes = replace(renderer, noise=False).render(test.contacts)
+    # The plate's sounds are sines alone, and so are these.
+    gains = -renderer.complex_gains(test.contacts).imag
+    made_of = synthesize(gains, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
+    assert torch.allclose(modes, made_of, rtol=0, atol=1e-6 * float(modes.abs().max()))
+    noise = renderer.render(test.contacts) - modes
     assert torch.allclose(noise[0], noise[3], rtol=0, atol=1e-4 * float(noise.abs().max()))
-    magnitude = float(plate_extraction(parts()[0]).residual.magnitude[0])
+    magnitude = float(plate_extraction(train).residual.magnitude[0])
     # Flat noise of 800 samples: its root mean square scatters by 2.5 %.
     assert float(noise[0].square().mean().sqrt()) == pytest.approx(magnitude, rel=0.1)
     other = made(name, seed=1).render(test.contacts)
-    assert not torch.allclose(other, made(name).render(test.contacts), rtol=0, atol=0.1 * magnitude)
+    assert not torch.allclose(other, modes + noise, rtol=0, atol=0.1 * magnitude)
 
 
-def test_a_random_impact_is_the_strangers_everywhere():
-    train, test = parts()
+def test_a_random_impact_is_the_other_objects_recording_everywhere():
+    _, test = parts()
     sounds = made("random-impact").render(test.contacts)
     assert torch.equal(sounds, torch.linspace(-1, 1, SAMPLES).expand(len(test), -1))
-    with raises(EvaluationError, name="stranger"):
-        method_named("random-impact").fit(replace(plate_task(train), other_recording=no_stranger))
-
-
-def no_stranger():
-    raise EvaluationError("no other object", name="stranger")
 
 
 def test_fields_read_what_their_names_say():
-    train, _ = parts()
     asked = []
 
     def features(look):
         asked.append(look)
         return plate_features(200)
 
-    task = replace(plate_task(train), features=features)
-    for name in ("field", "field-positions", "field-unaligned", "field-no-residual", "field-no-initialization"):
-        tiny(method_named(name)).fit(task)
-    assert asked == ["visual", "positions", "unaligned", "visual", "visual"]
-
     def blind(look):
         raise SceneError("no visual input", name=look)
 
+    task = replace(plate_task(parts()[0]), features=features)
+    for name in ("field", "field-positions", "field-unaligned", "field-no-residual", "field-no-initialization"):
+        tiny(method_named(name)).fit(task)
+    assert asked == ["visual", "positions", "unaligned", "visual", "visual"]
     with raises(SceneError, name="visual"):
         tiny(method_named("field")).fit(replace(task, features=blind))
 
 
 def test_ablations_leave_out_what_their_names_say():
-    train, _ = parts()
+    bank = plate_extraction(parts()[0]).bank
     assert float(made("field-no-residual").residual.magnitude.abs().max()) == 0.0
-    bank = plate_extraction(train).bank
     assert torch.equal(made("field-warmup").bank.frequency, bank.frequency)
     assert not torch.equal(made("field").bank.frequency, bank.frequency)
     assert made("field-warmup").origin.config.steps == 0
@@ -247,16 +202,27 @@ def test_ablations_leave_out_what_their_names_say():
     assert made("field", seed=7).origin.config.seed == 7
 
 
+def test_the_papers_method_finds_modes_in_its_own_way():
+    def shared():
+        raise AssertionError("the shared modes were asked for")
+
+    train = plate_impacts()
+    task = replace(plate_task(train, impacts=train), modes=shared)
+    pipeline = replace(NETWORK, extraction="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
+    field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
+    assert torch.allclose(field.bank.frequency, ShortTime().find(train.sounds, train.sample_rate).frequency)
+
+
 def test_without_initialization_no_mode_of_the_recordings_leaks_in():
     """Other recordings of the same energy give the same start; and the fit begins as silent as that start says."""
     train, _ = parts()
-    chance = torch.Generator().manual_seed(3)
-    start = random_modes(train, modes=12, bins=17, generator=chance)
-    other = replace(train, sounds=train.sounds.flip(1))
-    again = random_modes(other, modes=12, bins=17, generator=torch.Generator().manual_seed(3))
-    for one, two in zip((*bank_of(start), start.gains), (*bank_of(again), again.gains), strict=True):
+    start, again = (
+        random_modes(each, modes=12, bins=17, generator=torch.Generator().manual_seed(3))
+        for each in (train, replace(train, sounds=train.sounds.flip(1)))
+    )
+    frequency, damping = start.bank.frequency, start.bank.damping
+    for one, two in ((frequency, again.bank.frequency), (damping, again.bank.damping), (start.gains, again.gains)):
         assert torch.allclose(one, two, rtol=1e-6)
-    frequency, damping = bank_of(start)
     assert bool((frequency.diff() > 0).all())
     # Fifty periods in .1 s, and nine tenths of 4 kHz; from one neper over the sound to a quality of ten.
     assert float(frequency.min()) > 50 / SECONDS
@@ -266,56 +232,22 @@ def test_without_initialization_no_mode_of_the_recordings_leaks_in():
     sounds = synthesize(start.gains, frequency, damping, samples=SAMPLES, sample_rate=RATE)
     # Half of a damped sine's square is lost or won to its phase and its neighbors.
     assert float(sounds.square().mean() / train.sounds.square().mean()) == pytest.approx(1.0, abs=0.5)
-    untrained = fit(
-        train, plate_features(200), start, replace(TINY, warmup_steps=0, steps=1, learning_rate=1e-9), gains=Attention()
-    )
+    config = replace(TINY, warmup_steps=0, steps=1, learning_rate=1e-9)
+    untrained = fit(train, plate_features(200), start, config, gains=Attention())
     assert torch.allclose(untrained.gain_field.gain_scale, start.gains[0].real)
-
-
-def bank_of(extraction: Extraction) -> tuple[torch.Tensor, torch.Tensor]:
-    return extraction.bank.frequency, extraction.bank.damping
-
-
-def test_nothing_can_be_started_from_nothing():
-    train, _ = parts()
-    short = replace(train, sounds=train.sounds[:, :100])
     with raises(FitError, name="train", value=100):
+        short = replace(train, sounds=train.sounds[:, :100])
         random_modes(short, modes=3, bins=17, generator=torch.Generator())
 
 
 def test_the_papers_grid_has_all_its_combinations():
     candidates = list(PAPER_GRID.candidates(TINY))
-    assert len(candidates) == 162
-    found = {(each.clusters, each.learning_rate, each.steps, each.early_weight, each.damping) for each in candidates}
-    assert len(found) == 162
+    names = ("clusters", "learning_rate", "steps", "early_weight", "damping")
+    assert len(candidates) == len({tuple(getattr(each, name) for name in names) for each in candidates}) == 162
     assert {each.warmup_steps for each in candidates} == {TINY.warmup_steps}
 
 
-def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training():
-    train, _ = parts()
-    # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
-    grid = Grid((8,), (1e-7, 2e-2), (30,), (1.0,), ("shared",))
-    method = with_fit(FieldMethod("grid", grid=grid), replace(TINY, warmup_steps=1, warmup_rate=1e-7))
-    field = method.fit(plate_task(train))
-    report = report_of(field)["grid"]
-    assert report["chosen"] == {
-        "clusters": 8,
-        "learning_rate": 2e-2,
-        "steps": 30,
-        "early_weight": 1.0,
-        "damping": "shared",
-    }
-    assert report["validation_envelope"][1] < report["validation_envelope"][0]
-    assert field.origin.config.learning_rate == 2e-2
-    # A quarter of nine, and all nine learn in the end.
-    assert len(report["validation_contacts"]) == 2
-    assert set(report["validation_contacts"]) < set(train.names)
-    assert field.origin.trained_on == train.names
-    few = with_fit(FieldMethod("grid", grid=grid), TINY).fit(plate_task(train.take(range(5))))
-    assert report_of(few)["grid"] == {"validated": False}
-
-
-def test_a_grids_trials_do_not_learn_from_what_they_are_judged_by(monkeypatch):
+def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training(monkeypatch):
     train, _ = parts()
     seen = []
 
@@ -325,47 +257,37 @@ def test_a_grids_trials_do_not_learn_from_what_they_are_judged_by(monkeypatch):
         return fit(impacts, features, modes, config, **rest)
 
     monkeypatch.setattr("avmsf.evaluation.field_methods.fit", watched)
-    grid = Grid((8,), (1e-2,), (2,), (0.5, 1.0), ("shared",))
-    field = with_fit(FieldMethod("grid", grid=grid), TINY).fit(plate_task(train))
-    held = set(report_of(field)["grid"]["validation_contacts"])
-    assert len(seen) == 3
-    for names in seen[:2]:
-        assert set(names) == set(train.names) - held
-    assert seen[2] == train.names
+    # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
+    grid = Grid((8,), (1e-7, 2e-2), (30,), (1.0,), ("shared",))
+    method = with_fit(FieldMethod("grid", grid=grid), replace(TINY, warmup_steps=1, warmup_rate=1e-7))
+    field = method.fit(plate_task(train))
+    report = report_of(field)["grid"]
+    chosen = {"clusters": 8, "learning_rate": 2e-2, "steps": 30, "early_weight": 1.0, "damping": "shared"}
+    assert report["chosen"] == chosen
+    assert report["validation_envelope"][1] < report["validation_envelope"][0]
+    assert field.origin.config.learning_rate == 2e-2
+    # A quarter of nine is held out of the trials, and all nine learn in the end.
+    held = set(report["validation_contacts"])
+    assert len(held) == 2
+    assert [set(names) for names in seen] == [set(train.names) - held] * 2 + [set(train.names)]
+    few = with_fit(FieldMethod("grid", grid=grid), TINY).fit(plate_task(train.take(range(5))))
+    assert report_of(few)["grid"] == {"validated": False}
 
 
 def test_a_field_of_few_points_has_no_more_regions():
-    train, _ = parts()
     points = FeatureField.from_contacts(struck().contacts, count=6)
-    field = tiny(method_named("field")).fit(replace(plate_task(train), features=lambda look: points))
-    assert isinstance(field, SoundField)
+    field = tiny(method_named("field")).fit(replace(plate_task(parts()[0]), features=lambda look: points))
     assert field.gain_field.shape.clusters == len(points.points) < 8
 
 
-def test_reports_say_what_was_used():
-    assert report_of(made("white-noise")) == {}
-    assert report_of(made("knn3")) == {"neighbors": 3}
-    assert report_of(made("spline-gains")) == {
-        "kernel": "thin plate",
-        "directions": 2,
-        "sites": TRAIN,
-    }
-    assert report_of(made("field-positions"))["damping"] in ("shared", "per-contact")
-
-
 def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
-    with raises(EvaluationError, name="method", value="spline-gain") as caught:
-        method_named("spline-gain")
-    assert str(caught.value).endswith("spline-gains?")
-    with raises(EvaluationError, name="method", value="audio") as caught:
-        method_named("audio")
-    assert all(name in str(caught.value) for name in METHODS)
-    for name, folder in (("recorded:", None), (f"recorded:{tmp_path}/none", tmp_path / "none")):
-        with raises(EvaluationError, file=folder, name="method", value=name):
+    refused = {"spline-gain": None, "audio": None, "recorded:": None, f"recorded:{tmp_path}/none": tmp_path / "none"}
+    for name, file in refused.items():
+        with raises(EvaluationError, file=file, name="method", value=name) as caught:
             method_named(name)
-    method = method_named(f"recorded:{tmp_path}")
-    assert method == RecordedMethod(f"recorded:{tmp_path}", tmp_path)
-    assert method.name == f"recorded:{tmp_path}"
+        if file is None and ":" not in name:
+            assert all(known in str(caught.value) for known in METHODS)
+    assert method_named(f"recorded:{tmp_path}") == RecordedMethod(f"recorded:{tmp_path}", tmp_path)
 
 
 def test_methods_are_told_apart_by_their_words():
@@ -375,51 +297,46 @@ def test_methods_are_told_apart_by_their_words():
     assert not [word for word in words if " at 0x" in word]
 
 
-def write_sounds(folder, impacts: Impacts, *, rate: int = int(RATE), ending: str = ".wav") -> None:
+def write_sounds(folder: Path, impacts: Impacts) -> None:
+    (folder / "plate").mkdir()
     for name, sound in zip(impacts.names, impacts.sounds, strict=True):
-        path = folder / "plate" / f"{name}{ending}"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        soundfile.write(path, sound.numpy(), rate, subtype="FLOAT")
+        soundfile.write(folder / "plate" / f"{name}.wav", sound.numpy(), int(RATE), subtype="FLOAT")
 
 
 def test_others_sounds_come_back_as_they_were_written(tmp_path):
     train, test = parts()
     write_sounds(tmp_path, test)
-    task = plate_task(train)
-    renderer = method_named(f"recorded:{tmp_path}").fit(task)
+    task, method = plate_task(train), method_named(f"recorded:{tmp_path}")
+    renderer = method.fit(task)
     assert isinstance(renderer, Renderer)
-    rows = [5, 0, 7]
-    assert torch.equal(renderer.render(test.contacts[rows]), test.sounds[rows])
+    assert torch.equal(renderer.render(test.contacts[[5, 0, 7]]), test.sounds[[5, 0, 7]])
     assert torch.equal(renderer.render(test.contacts.float()), test.sounds)
     assert renderer.render(test.contacts[:0]).shape == (0, SAMPLES)
     # Recordings that are called by their files are looked up by them.
     called = replace(task, names=tuple(f"{name}.wav" for name in task.names))
-    assert torch.equal(method_named(f"recorded:{tmp_path}").fit(called).render(test.contacts), test.sounds)
-    # Two blows in one place: the one that has a sound stands for both.
+    # Of two impacts in one place the one that has a sound stands for both.
     doubled = replace(task, contacts=torch.cat([test.contacts[:1], task.contacts]), names=("elsewhere", *task.names))
-    assert torch.equal(method_named(f"recorded:{tmp_path}").fit(doubled).render(test.contacts), test.sounds)
+    for other in (called, doubled):
+        assert torch.equal(method.fit(other).render(test.contacts), test.sounds)
 
 
 def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
     train, test = parts()
-    task = plate_task(train)
+    task, method = plate_task(train), RecordedMethod("recorded", tmp_path)
     with raises(EvaluationError, file=tmp_path / "plate", name=None):
-        RecordedMethod("recorded", tmp_path).fit(task)
+        method.fit(task)
     write_sounds(tmp_path, test)
-    renderer = RecordedMethod("recorded", tmp_path).fit(task)
+    renderer = method.fit(task)
     with raises(EvaluationError, file=f"plate/{train.names[0]}.wav", name=train.names[0]):
         renderer.render(train.contacts[:1])
     with raises(EvaluationError, name="contacts", value=[1.0, 2.0, 3.0]):
         renderer.render(torch.tensor([[1.0, 2.0, 3.0]]))
     path = tmp_path / "plate" / f"{test.names[0]}.wav"
     sound = test.sounds[0].numpy()
-    for data, rate in ((sound[:700], 8000), (sound, 16000)):
+    for data, rate, channels in ((sound[:700], 8000, 1), (sound, 16000, 1), (np.stack([sound, sound / 2], 1), 8000, 2)):
         soundfile.write(path, data, rate, subtype="FLOAT")
-        with raises(EvaluationError, file=path, name="samples", value=(len(data), rate, 1)):
+        with raises(EvaluationError, file=path, name="samples", value=(len(data), rate, channels)):
             renderer.render(test.contacts[:1])
-    soundfile.write(path, np.stack([sound, 0.5 * sound], axis=1), 8000, subtype="FLOAT")
-    with raises(EvaluationError, file=path, name="samples", value=(SAMPLES, RATE, 2)):
-        renderer.render(test.contacts[:1])
     soundfile.write(path, np.stack([sound, sound], axis=1), 8000, subtype="FLOAT")
     assert torch.equal(renderer.render(test.contacts[:1]), test.sounds[:1])
     path.write_bytes(b"no sound")
@@ -433,9 +350,8 @@ def test_a_digest_is_of_the_wavs_of_one_object(tmp_path: Path) -> None:
     for path in paths:
         path.parent.mkdir()
         path.write_bytes(b"one")
-    before, identity = method.digest("bowl"), repr(method)
+    before = method.digest("bowl")
     paths[1].write_bytes(b"two")
     assert method.digest("bowl") == before
     paths[0].write_bytes(b"two")
     assert method.digest("bowl") != before
-    assert repr(method) == identity

@@ -65,19 +65,15 @@ QUICK_GRID = Grid((8, 16, 32), (3e-3, 1e-3), (150,), (1.0,))
 
 @dataclass(frozen=True)
 class FieldMethod:
-    """A field fitted as a configuration of the pipeline says.
+    """A field fitted as a configuration of the pipeline says, with the evaluation's seed and device.
 
-    Seed and device are the evaluation's, and the sounds start as in the task's recordings.
+    Unless `informed` it has no modal initialization (the paper's row "w/o init"): it starts from `random_modes`, as
+    many as the extraction has, and is trained end to end for as many steps as the configuration takes in all.
 
-    Unless `informed` it has no modal initialization (the paper's row "w/o init"), neither extracted modes nor a
-    warm-up. It starts from `random_modes`, with as many modes and bands of noise as the extraction has, and is trained
-    end to end for as many steps as the configuration takes in all.
-
-    With a `grid`, its settings are chosen on validation contacts, a part of the training contacts alone: the quarter of
-    the positions that farthest-point sampling takes last is held out; every candidate is fitted to the others and
-    scored there by ENV (paper, supplement), the mean over contacts of the root mean square difference of envelopes. The
-    best is fitted to all training contacts; of equals the first. With fewer than six positions nothing is held out, and
-    the configuration's own settings are taken. Modes are those of all training contacts.
+    With a `grid`, its settings are chosen on the quarter of the training positions that farthest-point sampling takes
+    last: every candidate is fitted to the others and scored there by ENV (paper, supplement), and the best, of equals
+    the first, is fitted to all training contacts. With fewer than six positions the configuration's own settings are
+    taken. Modes are those of all training contacts.
     """
 
     name: str
@@ -177,8 +173,8 @@ def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Gene
 
     Frequencies are spread evenly over their logarithm, from the lowest that the sounds' length allows (17 Hz in 3 s) to
     nine tenths of half the sample rate; dampings likewise, from a fall by one neper over the whole sound to a quality
-    factor of 10. All gains are equal, and so large that the modes have the energy of the mean sound. Nothing but this
-    energy, the rate and the length are taken from `train`. Raises FitError for too short recordings.
+    factor of 10. All gains are equal, and the modes have the energy of the mean sound, which with the rate and the
+    length is all that is taken from `train`. Raises FitError for too short recordings.
     """
     rate, samples = train.sample_rate, train.sounds.shape[1]
     lowest, highest = lowest_frequency(samples, rate), _MAX_FREQUENCY_RATIO * rate / 2

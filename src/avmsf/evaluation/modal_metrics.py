@@ -130,14 +130,12 @@ class ModalRenderer(Protocol):
     @property
     def bank(self) -> ModalBank:
         """The modes, the same at all contacts."""
-        ...
 
     def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
 
         In the unit of the training sounds; `directions` are the unit vectors of the impacts, for methods that use them.
         """
-        ...
 
 
 def compare_modes(

@@ -147,9 +147,8 @@ class NearestRecording(_Trained):
 class MeanWaveform(_Neighbors, _Trained):
     """The mean of the nearest training sounds, sample by sample: the paper's KNN. Phases cancel in it.
 
-    With `by_direction`, where the directions of both sides are known, an impact's direction is part of where it is, by
-    `Sites.nearest`. The size there is the diagonal of the box around the training contacts, as the object itself is not
-    known here. Recordings are neighbors, each one, also those of one contact.
+    With `by_direction`, where the directions of both sides are known, an impact's direction is part of where it is
+    (`Sites.nearest`; the size is the diagonal of the box around the training contacts).
     """
 
     count: int = 3
@@ -165,8 +164,7 @@ class MeanWaveform(_Neighbors, _Trained):
         asked = Sites(contacts.double(), normalize(directions.double()))
         size = float((known.points.amax(0) - known.points.amin(0)).norm())
         rows, signs = asked.nearest(known, size=size, count=self.count)
-        signs = signs.to(self.train.sounds.dtype)
-        return (signs[:, :, None] * self.train.sounds[rows]).mean(dim=1)
+        return (signs[:, :, None].to(self.train.sounds) * self.train.sounds[rows]).mean(dim=1)
 
 
 @dataclass(frozen=True, eq=False)

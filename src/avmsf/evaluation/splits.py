@@ -48,7 +48,6 @@ class Choosing(Protocol):
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the cases of an object. Raises EvaluationError for too few contacts."""
-        ...
 
 
 @dataclass(frozen=True)

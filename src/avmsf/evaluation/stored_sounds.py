@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import soundfile
@@ -107,16 +108,14 @@ def _address(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
-@dataclass(frozen=True, eq=False)
-class StoredContact:
-    """One test contact with stored sounds, and the predictions of all methods."""
+class StoredContact(NamedTuple):
+    """One test contact of an object with stored sounds: its recording, and the predictions of all methods."""
 
     record: ObjectRecord
     name: str
-    """The recording's."""
     recorded: str
-    """Its file."""
-    made: tuple[tuple[CaseRecord, Outcome], ...]
+    """The recording's file."""
+    made: list[tuple[CaseRecord, Outcome]]
 
 
 def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
@@ -124,4 +123,4 @@ def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
     files = {name: file for case in reversed(record.cases) for name, file in case.sounds.items()}
     pairs = [(case, each) for case in record.cases for each in record.outcomes if each.case == case.key]
     for name, file in files.items():
-        yield StoredContact(record, name, file, tuple(pair for pair in pairs if name in pair[1].sounds))
+        yield StoredContact(record, name, file, [pair for pair in pairs if name in pair[1].sounds])

@@ -33,14 +33,12 @@ class Renderer(Protocol):
     @property
     def sample_rate(self) -> float:
         """Samples per second of the rendered sounds, Hz."""
-        ...
 
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the sound of an impact at each contact (object frame, meters), in the unit of the training sounds.
 
         `directions`, unit vectors along which the hammer moves, are for renderers that use them.
         """
-        ...
 
 
 def expect_renderer(given: Any) -> Renderer:
@@ -127,8 +125,6 @@ class Method(Protocol):
     @property
     def name(self) -> str:
         """Name in tables and on the command line, joined by hyphens."""
-        ...
 
     def fit(self, task: Task) -> Renderer:
         """Fit a renderer to the task's training recordings. Raises AvmsfError where it cannot."""
-        ...

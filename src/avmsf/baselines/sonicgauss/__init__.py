@@ -3,5 +3,5 @@
 - `conditioning`: 23 channels of Gaussians, the encoding of a contact, and their fusion; shared by both sizes.
 - `training`: the objective of rectified flow, its Euler integration, training by it, and the renderer of both sizes.
 - `published`, `point_transformer`: the published architecture, which reads a user's copy of the published weights.
-- `small`, `patches`: a small generator of log spectrograms, and its latents.
+- `small`: a small generator of log spectrograms.
 """

@@ -69,15 +69,13 @@ Loss = Callable[[Int[Tensor, " batch"], torch.Generator], Float[Tensor, ""]]
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """One training. The defaults of the optimizer are the published ones."""
+    """One training. The defaults, and the optimizer's other settings, are the published ones."""
 
     steps: int
     batch: int
     rate: float = 1e-4
     warmup: int = 200
     """Steps; at most half of all."""
-    betas: tuple[float, float] = (0.9, 0.95)
-    decay: float = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +145,7 @@ def train(
     `log` is called with the step and its loss. All chance starts at `seed`, that of dropout too.
     """
     generator = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.AdamW(parameters, lr=config.rate, betas=config.betas, weight_decay=config.decay)
+    optimizer = torch.optim.AdamW(parameters, lr=config.rate, betas=(0.9, 0.95), weight_decay=1e-2)
     warmup = max(1, min(config.warmup, config.steps // 2))
 
     def factor(step: int) -> float:
