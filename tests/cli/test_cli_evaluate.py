@@ -8,7 +8,7 @@ import pytest
 
 from avmsf.cli import main, options_of
 from avmsf.errors import AvmsfError, EvaluationError, FitError
-from avmsf.evaluation.field_methods import FieldMethod
+from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.task import Task
@@ -125,7 +125,7 @@ def test_methods_train_on_the_device_that_is_asked_for(
         asked.append(device)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("avmsf.evaluation.field_methods.fit", stop)
+    monkeypatch.setattr("avmsf.evaluation.methods.fit", stop)
     words = ["farthest", str(plates), "--methods", "field-auto", "--no-cdpam", "--device", "cpu"]
     assert main(["evaluate", *words, "--output", str(tmp_path / "results")]) == 130
     assert asked == ["cpu"]

@@ -68,8 +68,6 @@ def test_the_score_is_the_models_own_cosine(clap):
 def test_one_prompt_goes_with_all_sounds(clap):
     one = clap.score(strikes(), PROMPTS[:1], sample_rate=RATE)
     assert torch.equal(one, clap.score(strikes(), PROMPTS[:1] * 3, sample_rate=RATE))
-    with raises(EvaluationError, name="prompts", value=2):
-        clap.score(strikes(), PROMPTS[:2], sample_rate=RATE)
 
 
 def test_level_does_not_matter_and_the_sample_rate_hardly(clap):
@@ -88,24 +86,14 @@ def test_a_batch_is_its_sounds_one_by_one(clap):
     assert torch.allclose(clap.embed(sounds, sample_rate=RATE), expected, rtol=0.0, atol=1e-6)
 
 
-def test_longer_sounds_are_cut_at_the_same_place_every_time(clap):
-    sounds = strikes(2, samples=3 * CLIP)
-    np.random.seed(1)
-    first = clap.embed(sounds, sample_rate=RATE)
-    np.random.seed(2)
-    again = clap.embed(sounds, sample_rate=RATE)
-    assert torch.equal(first, again)
-    assert torch.equal(first, clap.embed(sounds[:, :CLIP], sample_rate=RATE))
-
-
-def test_a_fused_network_draws_nothing_by_chance(tmp_path):
-    save_clap(tmp_path, fused=True)
-    found = []
-    for seed in range(3):
-        np.random.seed(seed)
-        found.append(Clap.load(tmp_path).embed(strikes(samples=2 * CLIP), sample_rate=RATE))
-    assert torch.equal(found[0], found[1])
-    assert torch.equal(found[0], found[2])
+@pytest.mark.parametrize("fused", [False, True])
+def test_longer_sounds_are_cut_at_the_same_place_every_time(tmp_path, fused):
+    save_clap(tmp_path, fused=fused)
+    network, sounds, found = Clap.load(tmp_path), strikes(2, samples=3 * CLIP), []
+    for given in (sounds, sounds, sounds, sounds[:, :CLIP]):
+        np.random.seed(len(found))
+        found.append(network.embed(given, sample_rate=RATE))
+    assert all(torch.equal(each, found[0]) for each in found)
 
 
 def test_other_weights_have_another_digest(clap, tmp_path):
@@ -118,11 +106,9 @@ def test_other_weights_have_another_digest(clap, tmp_path):
 
 
 def test_sounds_and_prompts_that_cannot_be_scored_are_refused(clap):
-    for prompts in ([""], ["  "]):
-        with raises(EvaluationError, name="prompt", value=prompts[0]):
-            clap.score(strikes(), prompts, sample_rate=RATE)
-    for prompts in ("wood", []):
-        with raises(EvaluationError, name="prompts", value=prompts):
+    refused = ([""], "prompt", ""), (["  "], "prompt", "  "), ("wood", "prompts", "wood"), ([], "prompts", [])
+    for prompts, name, value in (*refused, (PROMPTS[:2], "prompts", 2)):
+        with raises(EvaluationError, name=name, value=value):
             clap.score(strikes(), prompts, sample_rate=RATE)
     silent = strikes()
     silent[1] = 0.0

@@ -16,8 +16,8 @@ from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation import report
-from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import MAX_VERTICES, located, nearest_spectrum, published_distance, random_distance
+from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise

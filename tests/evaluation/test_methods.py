@@ -15,8 +15,16 @@ from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, FitError, SceneError
-from avmsf.evaluation.field_methods import NETWORK, PAPER_GRID, FieldMethod, Grid, random_modes
-from avmsf.evaluation.methods import RecordedMethod, diffsound, method_named
+from avmsf.evaluation.methods import (
+    NETWORK,
+    PAPER_GRID,
+    FieldMethod,
+    Grid,
+    RecordedMethod,
+    diffsound,
+    method_named,
+    random_modes,
+)
 from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Renderer, Task, report_of
@@ -256,7 +264,7 @@ def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training(monkeypatch):
         assert len(modes.gains) == len(impacts)
         return fit(impacts, features, modes, config, **rest)
 
-    monkeypatch.setattr("avmsf.evaluation.field_methods.fit", watched)
+    monkeypatch.setattr("avmsf.evaluation.methods.fit", watched)
     # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
     grid = Grid((8,), (1e-7, 2e-2), (30,), (1.0,), ("shared",))
     method = with_fit(FieldMethod("grid", grid=grid), replace(TINY, warmup_steps=1, warmup_rate=1e-7))
@@ -298,9 +306,10 @@ def test_methods_are_told_apart_by_their_words():
 
 
 def write_sounds(folder: Path, impacts: Impacts) -> None:
-    (folder / "plate").mkdir()
     for name, sound in zip(impacts.names, impacts.sounds, strict=True):
-        soundfile.write(folder / "plate" / f"{name}.wav", sound.numpy(), int(RATE), subtype="FLOAT")
+        path = folder / "plate" / f"{name}.wav"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        soundfile.write(path, sound.numpy(), int(RATE), subtype="FLOAT")
 
 
 def test_others_sounds_come_back_as_they_were_written(tmp_path):

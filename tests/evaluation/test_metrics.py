@@ -46,21 +46,11 @@ def clips(rows: int = 3, *, seed: int = 0) -> torch.Tensor:
 
 
 @every_metric
-def test_equal_sounds_are_at_no_distance(metric):
+def test_equal_sounds_are_at_no_distance_and_more_noise_is_farther(metric):
     assert metric(clips(), clips()).tolist() == [0.0, 0.0, 0.0]
-
-
-@every_metric
-def test_more_noise_is_farther(metric):
     noise = torch.randn(3, 4800, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     distances = torch.stack([metric(clips() + level * noise, clips()) for level in (1e-4, 1e-3, 1e-2, 1e-1)])
     assert bool((distances.diff(dim=0) > 0).all())
-
-
-@pytest.mark.parametrize("name", ["l1", "l1_log", "envelope"])
-def test_distances_are_the_same_from_both_sides(name):
-    a, b = clips(seed=1), clips(seed=2).flip(0)
-    assert torch.allclose(METRICS[name](a, b), METRICS[name](b, a), rtol=1e-12)
 
 
 @every_metric
@@ -81,8 +71,10 @@ def test_rows_are_judged_for_themselves(metric):
     assert torch.allclose(metric(a[order], b[order]), metric(a, b)[order], rtol=1e-12)
 
 
-def test_levels_scale_as_they_should():
+def test_levels_scale_as_they_should_and_distances_are_symmetric():
     a, b = clips(seed=1), clips(seed=2).flip(0)
+    for name in ("l1", "l1_log", "envelope"):
+        assert torch.allclose(METRICS[name](a, b), METRICS[name](b, a), rtol=1e-12)
     for name in ("l1", "envelope"):
         assert torch.allclose(METRICS[name](3 * a, 3 * b), 3 * METRICS[name](a, b), rtol=1e-12)
     assert torch.allclose(METRICS["relative"](3 * a, 3 * b), METRICS["relative"](a, b), rtol=1e-12)
@@ -98,22 +90,21 @@ def test_relative_error_of_silence_is_one_and_of_twice_the_sound_too():
     assert float(METRICS["relative"](1.1 * truth, truth).mean()) == pytest.approx(0.1, rel=1e-12)
 
 
-def test_relative_error_is_the_ratio_of_sums_at_a_quarter_hop():
+def test_relative_error_is_the_ratio_of_sums_at_a_quarter_hop_by_loudness():
     a, b = clips(seed=1), clips(seed=2).flip(0)
     ratios = []
     for size in (512, 128):
         spectra = [magnitude_stft(sounds, fft_size=size, hop=size // 4) for sounds in (a, b)]
         ratios.append(float((spectra[0] - spectra[1]).abs().sum() / spectra[1].sum()))
     assert float(METRICS["relative"](a, b).mean()) == pytest.approx(sum(ratios) / 2, rel=1e-12)
-
-
-def test_relative_error_weighs_contacts_by_their_loudness():
     one = clips(1)
     truth = torch.cat([one, 9 * one])
     # The loud one missed altogether, the faint one right: nine tenths of all magnitudes are wrong.
     errors = relative_stft_error(torch.cat([one, 0 * one]), truth, sample_rate=RATE, fft_sizes=(256,))
     assert float(errors.mean()) == pytest.approx(0.9, rel=1e-12)
     assert errors.tolist() == pytest.approx([0.0, 1.8], rel=1e-12)
+    with raises(EvaluationError, name="truth", value=0.0):
+        METRICS["relative"](a, 0 * a)
 
 
 def test_a_steady_sine_too_many_is_what_its_spectrum_holds():
@@ -144,20 +135,10 @@ def test_the_papers_white_noise_is_where_the_paper_has_it():
 
 
 @pytest.mark.parametrize(
-    ("sample_rate", "sizes"),
-    [
-        (100.0, (512, 256, 128, 64)),
-        (400.0, (512, 256, 128, 64)),
-        (16000.0, (1024, 512, 256, 128)),
-        (22050.0, (1024, 512, 256, 128)),
-        (44100.0, (2048, 1024, 512, 256)),
-        (48000.0, (2048, 1024, 512, 256)),
-        (96000.0, (4096, 2048, 1024, 512)),
-        (192000.0, (8192, 4096, 2048, 1024)),
-    ],
+    ("sample_rate", "largest"), [(100.0, 512), (400.0, 512), (22050.0, 1024), (48000.0, 2048), (192000.0, 8192)]
 )
-def test_fft_sizes_go_with_the_sample_rate(sample_rate, sizes):
-    assert default_fft_sizes(sample_rate) == sizes
+def test_fft_sizes_go_with_the_sample_rate(sample_rate, largest):
+    assert default_fft_sizes(sample_rate) == tuple(largest // part for part in (1, 2, 4, 8))
 
 
 @pytest.mark.parametrize("sample_rate", [100.0, 400.0, 5512.5, 16000.0, 31000.0, 44100.0, 62000.0, 63000.0, 192000.0])
@@ -181,19 +162,12 @@ def test_what_cannot_be_compared_is_refused(metric):
     with raises(EvaluationError, name="truth", value=[3, 0]):
         metric(good, good[:, :0])
     broken = good.clone()
-    broken[1, 7] = math.nan
-    with raises(EvaluationError, name="predicted", row=1) as caught:
-        metric(broken, good)
-    assert math.isnan(caught.value.value)
-    with raises(EvaluationError, name="truth", row=1):
-        metric(good, broken)
-
-
-def test_a_bad_row_is_called_by_its_name():
-    broken = clips()
     broken[2, 0] = math.inf
+    for given, name in (((broken, good), "predicted"), ((good, broken), "truth")):
+        with raises(EvaluationError, name=name, row=2, value=math.inf):
+            metric(*given)
     with raises(EvaluationError, name="predicted", row=2, value=math.inf) as caught:
-        validate(broken, clips(), names=("a", "b", "taps/c.wav"))
+        validate(broken, good, names=("a", "b", "taps/c.wav"))
     assert "taps/c.wav" in str(caught.value)
 
 
@@ -203,12 +177,10 @@ def test_resampling_keeps_a_tone_and_its_length():
         return (torch.sin(math.pi * times / 0.5) ** 2 * torch.sin(2 * math.pi * 1000 * times))[None]
 
     # 44100 / 0.9999: the rate of a capture that was played a little slower.
-    for rate in (8000.0, 44100.0, 44100.0 / 0.9999, 48000.0, 96000.0, 192000.0):
+    for rate in (8000.0, 44100.0 / 0.9999, 48000.0, 192000.0):
         heard = resampled(tone(rate), sample_rate=rate, wanted=22050.0)
         assert abs(heard.shape[1] - 11025) <= 1
         assert torch.allclose(heard[0, :11024], tone(22050.0)[0, :11024], atol=3e-3)
-    sounds = clips()
-    assert resampled(sounds, sample_rate=RATE, wanted=RATE) is sounds
 
 
 def test_every_metric_of_the_corpus_says_what_it_said():
@@ -228,8 +200,3 @@ def test_every_metric_of_the_corpus_says_what_it_said():
             # Six figures are kept; CDPAM is computed in float32, whose rounding goes with the processor.
             tolerance = 1e-3 if key == "cdpam.cdpam" else 1e-4 if key == "cdpam.cdpam_scaled" else 1e-5
             assert value == pytest.approx(figures[key], rel=tolerance, abs=1e-12), (pair, key)
-
-
-def test_nothing_is_relative_to_silence():
-    with raises(EvaluationError, name="truth", value=0.0):
-        relative_stft_error(clips(), 0 * clips(), sample_rate=RATE)

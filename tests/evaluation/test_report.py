@@ -18,12 +18,18 @@ from test_runner import planned
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.published import PUBLISHED, published_ratios
 from avmsf.evaluation.registry import METHODS
-from avmsf.evaluation.report import markdown, write_page, write_summary
-from avmsf.evaluation.report_tables import Section, sections
-from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder
+from avmsf.evaluation.report import draw_spectrogram, markdown, picture_levels, write_page, write_summary
+from avmsf.evaluation.results import (
+    CaseRecord,
+    ObjectRecord,
+    Outcome,
+    ResultsFolder,
+    StoredSound,
+    listening_gain,
+    write_sound,
+)
 from avmsf.evaluation.runner import run_objects
-from avmsf.evaluation.stored_sounds import StoredSound, draw_spectrogram, listening_gain, write_sound
-from avmsf.evaluation.summary import missing_of, object_values, summarize
+from avmsf.evaluation.tables import Section, missing_of, object_values, sections, summarize
 from factories.plate_set import fill_plates
 from factories.raising import raises
 
@@ -192,7 +198,8 @@ def test_a_pictures_line_is_where_the_tone_is(tmp_path: Path) -> None:
     time = torch.arange(16000) / 16000.0
     write_sound(tmp_path / "tone", torch.sin(2 * math.pi * 1000 * time), sample_rate=16000.0, gain=0.5)
     sound = StoredSound.read(tmp_path / "tone")
-    address = draw_spectrogram(sound, loudest=float(sound.levels.max()))
+    levels = picture_levels(sound)
+    address = draw_spectrogram(levels, loudest=float(levels.max()))
     picture = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
     shades = torch.from_numpy(np.array(picture))
     # From the top, on a logarithmic scale of 60 Hz to 8 kHz; a Hann window is two bins, some rows, wide at 1 kHz.

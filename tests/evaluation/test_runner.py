@@ -20,8 +20,7 @@ from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import ObjectFacts
 from avmsf.errors import AvmsfError, EvaluationError, FitError
 from avmsf.evaluation import align_split, evaluate
-from avmsf.evaluation.field_methods import FieldMethod
-from avmsf.evaluation.methods import FunctionMethod, method_named
+from avmsf.evaluation.methods import FieldMethod, FunctionMethod, method_named
 from avmsf.evaluation.modal_metrics import compare_modes, truth_at
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.plan import Evaluation

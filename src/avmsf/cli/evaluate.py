@@ -21,7 +21,7 @@ from avmsf.pipeline.config import TimeZero, ViewsConfig
 
 if TYPE_CHECKING:
     from avmsf.evaluation.registry import Protocol
-    from avmsf.evaluation.report_tables import Section
+    from avmsf.evaluation.tables import Section
     from avmsf.evaluation.task import Method
 
 _SHOWN = 5
@@ -209,8 +209,7 @@ def _protocol_of(options: Options) -> "Protocol":
 
 def _note_start(methods: "Sequence[Method]", time_zero: TimeZero | None) -> None:
     """Print which methods are configured for, or may have, another start of sounds than the evaluation has."""
-    from avmsf.evaluation.field_methods import FieldMethod
-    from avmsf.evaluation.methods import RecordedMethod
+    from avmsf.evaluation.methods import FieldMethod, RecordedMethod
 
     for method in methods:
         if isinstance(method, RecordedMethod) and time_zero == "peak":

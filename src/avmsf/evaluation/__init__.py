@@ -9,12 +9,12 @@ In go recordings with their contacts; out come one value for each metric, method
 - Metrics: spectral, log-mel and envelope distance (`metrics`); CDPAM (`cdpam`; Manocha et al., ICASSP 2021); CLAP score
   (`clap`); modal assurance criterion and errors of modes and gains against a simulation's (`modal_metrics`); error of
   located contacts (`localization`).
-- Methods: k nearest recordings, mean gains, thin-plate splines (`simple_methods`, `methods`), DiffSound and SonicGauss
-  (`avmsf.baselines`), files of other systems (`methods`), and configurations of the sound field (`field_methods`).
+- `methods`: all methods by name, those of the sound field as configurations of the pipeline. Their renderers: k nearest
+  recordings, mean gains, thin-plate splines (`simple_methods`), DiffSound and SonicGauss (`avmsf.baselines`), files.
 - `plan_evaluation` (`plan`) makes an `Evaluation`; `objects` makes what its methods read of objects. `run_objects`
   (`runner`) runs it in this process or on ray, into a `ResultsFolder` (`results`) that a stopped run goes on with;
-  `summary`, `report_tables` and `report` make means, ratios to `knn3`, and one report, as Markdown and as a page.
-  `published` has the paper's values.
+  `tables` makes means, ratios to `knn3` and tables, with the paper's values (`published`), and `report` one report, as
+  Markdown and as a page.
 
 Start at `evaluate` in `scores`, then `runner.CaseRun.outcome`.
 """

@@ -11,7 +11,7 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.field_methods import FieldMethod
+from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
 from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, table_modules

@@ -75,7 +75,7 @@ class MethodEntry:
 
 
 def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
-    return lambda title, **settings: MethodEntry(title, make=f"field_methods:{make}", settings={**common, **settings})
+    return lambda title, **settings: MethodEntry(title, make=f"methods:{make}", settings={**common, **settings})
 
 
 _process, _network = _made("gaussian_process"), _made("network", visual_input="visual")

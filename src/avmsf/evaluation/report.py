@@ -1,12 +1,19 @@
 """The files of a results folder: summary, times, and one report as Markdown and as a page that stands on its own."""
 
+import base64
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+import torch
+from jaxtyping import Float64
 from jinja2 import Environment, PackageLoader, select_autoescape
+from matplotlib import colormaps
 from matplotlib.figure import Figure
+from PIL import Image
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
@@ -14,15 +21,23 @@ from avmsf._utils.text import format_number
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
 from avmsf.evaluation.registry import METRICS
-from avmsf.evaluation.report_tables import Section, sections
-from avmsf.evaluation.results import ObjectRecord, ResultsFolder, file_word, write_json
+from avmsf.evaluation.results import (
+    RECORDED,
+    CaseRecord,
+    ObjectRecord,
+    Outcome,
+    ResultsFolder,
+    StoredSound,
+    file_word,
+    write_json,
+)
 from avmsf.evaluation.splits import evenly_spaced
-from avmsf.evaluation.stored_sounds import RECORDED, StoredContact, StoredSound, draw_spectrogram, stored_contacts
-from avmsf.evaluation.summary import missing_of, summarize, times_of
+from avmsf.evaluation.tables import Section, missing_of, sections, summarize, times_of
 from avmsf.export.web import report_directives, with_policy
 from avmsf.plotting.contacts import draw_contact
 from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.spectrograms import RANGE_DB, draw_spectrograms
+from avmsf.plotting.spectrograms import RANGE_DB, draw_spectrograms, log_spectrogram
+from avmsf.plotting.style import SEQUENTIAL
 
 SUMMARY, TIMES, TABLES, PAGE = "summary.json", "times.json", "report.md", "report.html"
 """The files next to `protocol.json` and the folder `objects`."""
@@ -32,6 +47,8 @@ MAX_PAGE_CHARACTERS = 13_000_000
 """Of the page's pictures and sounds; further contacts are omitted."""
 MAX_PAGE_OBJECTS = 4
 """Objects with sounds on the page, evenly spaced over all."""
+_LOWEST_HZ = 60.0
+"""Lower edge of the page's pictures, which are logarithmic in frequency above it."""
 
 
 def write_summary(
@@ -84,6 +101,24 @@ def _is_text(cell: str) -> bool:
     return any(mark.isalpha() and mark != "e" for mark in cell)
 
 
+class StoredContact(NamedTuple):
+    """One test contact of an object with stored sounds: its recording, and the predictions of all methods."""
+
+    record: ObjectRecord
+    name: str
+    recorded: str
+    """The recording's file."""
+    made: list[tuple[CaseRecord, Outcome]]
+
+
+def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
+    """Yield an object's contacts with stored sounds."""
+    files = {name: file for case in reversed(record.cases) for name, file in case.sounds.items()}
+    pairs = [(case, each) for case in record.cases for each in record.outcomes if each.case == case.key]
+    for name, file in files.items():
+        yield StoredContact(record, name, file, [pair for pair in pairs if name in pair[1].sounds])
+
+
 _Card = dict[str, str]
 """One sound on the page: its `title`, its `caption`, and the addresses of its `picture` and its `sound`."""
 
@@ -108,13 +143,14 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[
 
 def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
     recorded = StoredSound.read(folder / contact.recorded)
-    loudest, seconds = float(recorded.levels.max()), len(recorded.samples) / recorded.sample_rate
+    loudest, seconds = float(picture_levels(recorded).max()), len(recorded.samples) / recorded.sample_rate
 
     def card(title: str, caption: str, sound: StoredSound) -> _Card:
-        picture = draw_spectrogram(sound, loudest=loudest)
-        return {"title": title, "caption": caption, "picture": picture, "sound": sound.address}
+        picture = draw_spectrogram(picture_levels(sound), loudest=loudest)
+        return {"title": title, "caption": caption, "picture": picture, "sound": _address("audio/flac", sound.content)}
 
-    yield card(RECORDED, f"{seconds:.2g} s, {recorded.lowest:.0f} Hz to {recorded.sample_rate / 2:.0f} Hz", recorded)
+    band = "{:.0f} Hz to {:.0f} Hz".format(*_band(recorded.sample_rate))
+    yield card(RECORDED, f"{seconds:.2g} s, {band}", recorded)
     several = len({case.label for case, _ in contact.made}) > 1
     for case, outcome in contact.made:
         row = case.test.index(contact.name)
@@ -125,6 +161,36 @@ def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
         ]
         title = f"{outcome.method}, {case.label}" if several else outcome.method
         yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[contact.name]))
+
+
+def _band(sample_rate: float) -> tuple[float, float]:
+    """Return the lowest and the highest frequency of the page's pictures, Hz."""
+    return min(_LOWEST_HZ, sample_rate / 100), sample_rate / 2
+
+
+def picture_levels(sound: StoredSound) -> Float64[Tensor, "height width"]:
+    """Return the levels of a sound's picture, dB, from the lowest frequency up to half the sample rate."""
+    lowest, highest = _band(sound.sample_rate)
+    rate = sound.sample_rate
+    return log_spectrogram(sound.samples, sample_rate=rate, lowest=lowest, highest=highest, width=240, height=120)
+
+
+def draw_spectrogram(levels: Float64[Tensor, "height width"], *, loudest: float) -> str:
+    """Return the address of a picture of levels: time to the right, frequency upwards on a logarithmic scale.
+
+    Colors span 80 dB below `loudest`, dB, the brightest point of the recording it is compared with.
+    """
+    shown = ((levels - loudest) / RANGE_DB + 1).clamp(0, 1).flip(0)
+    picture = Image.fromarray((shown * 255).round().to(torch.uint8).numpy()).convert("P")
+    colors = (colormaps[SEQUENTIAL](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+    picture.putpalette(colors.tobytes())
+    memory = io.BytesIO()
+    picture.save(memory, format="PNG", optimize=True)
+    return _address("image/png", memory.getvalue())
+
+
+def _address(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def write_figures(results: ResultsFolder) -> list[Path]:

@@ -1,5 +1,9 @@
-"""A folder of results: one file per object, written atomically after every method, so that a kill loses one method."""
+"""A folder of results: one file per object, written atomically after every method, so that a kill loses one method.
 
+Some of the sounds are stored too, to be listened to and drawn.
+"""
+
+import io
 import json
 import math
 import re
@@ -8,6 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import soundfile
+import torch
+from jaxtyping import Float, Float64
+from scipy.signal import resample_poly
+from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import read_json
@@ -22,6 +33,13 @@ _MAX_BYTES = 64 << 20
 """Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
 _MAX_SHOWN = 160
 """Characters of a setting in a message."""
+RECORDED = "recorded"
+"""What the recordings are called next to the methods."""
+_PEAK = 0.25
+"""What recordings peak at, of full scale: louder sounds of a method have room above."""
+_MIN_RATE_HZ = 8000.0
+"""Below it browsers do not play."""
+_FULL_SCALE = 1 - 2**-15
 
 
 @dataclass(frozen=True)
@@ -181,6 +199,46 @@ class ResultsFolder:
         if not isinstance(read, dict):
             raise _damaged(path, "no JSON object")
         return read
+
+
+def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
+    """Return the gain of a recording and of the predictions next to it."""
+    peak = float(recorded.abs().max())
+    return _PEAK / peak if peak > 0 else 1.0
+
+
+def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, gain: float) -> None:
+    """Write a sound times `gain` as a FLAC file of 16 bits; what would clip is turned down to full scale.
+
+    Sounds at rates that browsers do not play are resampled by a whole factor. Raises EvaluationError.
+    """
+    factor = max(1, int(np.ceil(_MIN_RATE_HZ / sample_rate)))
+    samples = resample_poly(sound.double().numpy() * gain, factor, 1)
+    samples = samples * min(1.0, _FULL_SCALE / max(float(np.abs(samples).max(initial=0.0)), _FULL_SCALE))
+    memory = io.BytesIO()
+    soundfile.write(memory, samples, round(sample_rate * factor), subtype="PCM_16", format="FLAC")
+    write_whole(path, memory.getvalue(), raising=EvaluationError)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSound:
+    """A stored sound."""
+
+    content: bytes
+    """The file as it lies on the disk."""
+    samples: Float64[Tensor, " samples"]
+    sample_rate: float
+
+    @classmethod
+    def read(cls, path: Path) -> "StoredSound":
+        """Read a file that `write_sound` wrote. Raises EvaluationError where it is gone or damaged."""
+        try:
+            content = path.read_bytes()
+            samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")
+        except (OSError, soundfile.LibsndfileError) as error:
+            advice = "delete the object's file to compute it again"
+            raise EvaluationError.expected("a stored sound", got=str(error), file=path, advice=advice) from error
+        return cls(content, torch.from_numpy(samples), float(rate))
 
 
 def _damaged(path: Path, error: object) -> EvaluationError:

@@ -22,17 +22,25 @@ from avmsf._utils.caching import Given, Result, once
 from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
-from avmsf.evaluation.field_methods import FieldMethod
 from avmsf.evaluation.localization import located, write_map
-from avmsf.evaluation.methods import RecordedMethod
+from avmsf.evaluation.methods import FieldMethod, RecordedMethod
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import draw_other_recording
 from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.registry import METRICS, MetricEntry
-from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, failure_of, file_word
+from avmsf.evaluation.results import (
+    RECORDED,
+    CaseRecord,
+    ObjectRecord,
+    Outcome,
+    ResultsFolder,
+    failure_of,
+    file_word,
+    listening_gain,
+    write_sound,
+)
 from avmsf.evaluation.scores import Values, metric_values
 from avmsf.evaluation.splits import Case, align_split, evenly_spaced
-from avmsf.evaluation.stored_sounds import RECORDED, listening_gain, write_sound
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
 from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import ModeFinder
