@@ -70,7 +70,7 @@ def test_noise_is_no_part_of_a_sounds_energy(seconds):
     quiet, loud = (
         damped_blows("wood", heard_by="wood", noise_db=level)[:, : round(seconds * RATE)] for level in (-60.0, 0.0)
     )
-    modes = Extractor.of(field.bank, sample_rate=RATE, samples=quiet.shape[1])
+    modes = Extractor(field.bank, sample_rate=RATE, samples=quiet.shape[1])
     for clear, noisy in zip(quiet, loud, strict=True):
         energy = float(clear.double().square().sum())
         assert modes.extract(clear, color=field.residual).energy == pytest.approx(energy, rel=1e-3)
@@ -85,7 +85,7 @@ def test_a_sound_beneath_noise_is_no_less_than_its_modes() -> None:
     # measured by that all of them would explain all.
     field, locator, judged = damped_field("wood"), damped_locator("wood"), 0
     drowned = damped_blows("wood", length=0.2, heard_by="wood", noise_db=15.0)[:, : round(0.04 * RATE)]
-    modes = Extractor.of(field.bank, sample_rate=RATE, samples=drowned.shape[1])
+    modes = Extractor(field.bank, sample_rate=RATE, samples=drowned.shape[1])
     for sound in drowned:
         estimated = modes.extract(sound, color=field.residual)
         if 0.3 < estimated.energy / estimated.fitted < 0.6:

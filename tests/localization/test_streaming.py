@@ -123,7 +123,7 @@ def test_what_does_not_belong_to_the_object_is_counted_and_the_next_blow_found()
 
 def test_ringing_is_followed_and_fitted_exactly() -> None:
     size = torch.ones(len(BANK))
-    modes = Ringing.of(BANK, size, sample_rate=RATE, window=480)
+    modes = Ringing(BANK, size, sample_rate=RATE, window=480)
     amplitudes = torch.complex(*torch.randn(2, len(BANK), generator=torch.Generator().manual_seed(0)).double())
     sound = synthesize(amplitudes[None], BANK.frequency, BANK.damping, samples=1200, sample_rate=RATE)[0]
     assert torch.allclose(modes.render(amplitudes, 1200), sound, atol=1e-9)

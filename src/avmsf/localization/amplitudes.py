@@ -56,36 +56,23 @@ class Amplitudes:
         return min(1.0, max(0.0, energy / self.energy)) if self.energy > 0 else 0.0
 
 
-@dataclass(frozen=True, eq=False)
 class Extractor:
-    """All that the amplitudes of modes in sounds of one length need."""
+    """All that the amplitudes of a bank's modes, all below half the sample rate, need in sounds of one length."""
 
-    bank: ModalBank
-    sample_rate: float
-    """Hz."""
-    samples: int
-    highest: float
-    """Frequency in Hz up to which sounds hold anything: half the sample rate, or less where they were resampled."""
-    gram: Float64[Tensor, "two_modes two_modes"]
-    """Inner products of all sines and cosines."""
-    inverse: Float64[Tensor, "two_modes two_modes"]
-    """Its inverse: the covariance of the amplitudes' errors where the noise has variance one."""
-    mixing: Complex128[Tensor, "modes modes"]
-    """Unitary; `mixing.mH` makes mixtures of amplitudes whose errors are uncorrelated."""
-    spread: Float64[Tensor, " modes"]
-    """Variance of each mixture's error where the noise has variance one."""
-
-    @classmethod
-    def of(cls, bank: ModalBank, *, sample_rate: float, samples: int, highest: float | None = None) -> "Extractor":
-        """Return the extractor of a bank's modes, all below half the sample rate (Hz), and below `highest` if given."""
-        inner = gram(poles_of(bank, sample_rate), samples, power=0)
-        scale = torch.sqrt(torch.diagonal(inner))
-        ridge = _RIDGE * torch.eye(len(scale), dtype=inner.dtype)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(inner / (scale[:, None] * scale) + ridge))
-        inverse = inverse / (scale[:, None] * scale)
-        mixing, spread = _separate(inverse)
-        up_to = 0.5 * sample_rate if highest is None else min(highest, 0.5 * sample_rate)
-        return cls(bank, sample_rate, samples, up_to, inner, inverse, mixing, spread)
+    def __init__(self, bank: ModalBank, *, sample_rate: float, samples: int, highest: float = math.inf) -> None:
+        """Prepare for sounds of that many `samples` at `sample_rate` Hz, which hold anything up to `highest` Hz."""
+        self.bank, self.sample_rate, self.samples = bank, sample_rate, samples
+        self.highest = min(highest, 0.5 * sample_rate)
+        self.gram = gram(poles_of(bank, sample_rate), samples, power=0)
+        """Inner products of all sines and cosines, [two_modes, two_modes]."""
+        scale = torch.sqrt(torch.diagonal(self.gram))
+        ridge = _RIDGE * torch.eye(len(scale), dtype=self.gram.dtype)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(self.gram / (scale[:, None] * scale) + ridge))
+        self.inverse = inverse / (scale[:, None] * scale)
+        """Its inverse: the covariance of the amplitudes' errors where the noise has variance one."""
+        self.mixing, self.spread = _separate(self.inverse)
+        """Unitary, [modes, modes]: `mixing.mH` makes mixtures of amplitudes whose errors are uncorrelated; and the
+        variance of each mixture's error where the noise has variance one."""
 
     def extract(self, sound: Float[Tensor, " samples"], *, color: Residual | None) -> Amplitudes:
         """Return the amplitudes in a sound; `color` is the noise to expect, of which the shape alone counts.

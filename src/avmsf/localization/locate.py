@@ -271,7 +271,6 @@ def predict_ringing(
     begin = max(last, stop - round(_FIT_SECONDS * rate))
     audible = torch.nonzero(field.bank.frequency < min(0.5 * rate, highest or 0.5 * rate)).flatten()
     bank = field.bank.take(audible)
-    extractor = Extractor.of(bank, sample_rate=rate, samples=stop - begin)
-    values = extractor.extract(sound[begin:stop], color=None).values
+    values = Extractor(bank, sample_rate=rate, samples=stop - begin).extract(sound[begin:stop], color=None).values
     values = values * poles_of(bank, rate) ** (start - begin)
     return synthesize(values[None], bank.frequency, bank.damping, samples=samples, sample_rate=rate)[0]

@@ -152,7 +152,7 @@ class Locator:
 
     @cached_property
     def _lengths(self) -> "Callable[[int, float], _Length]":
-        return lru_cache(_MAX_CACHED_LENGTHS)(partial(_Length.of, self))
+        return lru_cache(_MAX_CACHED_LENGTHS)(partial(_Length, self))
 
     def _length(self, samples: int, highest: float) -> "_Length":
         with self._lock:
@@ -160,22 +160,10 @@ class Locator:
             return self._lengths(samples, highest)
 
 
-@dataclass(frozen=True, eq=False)
 class _Length:
-    """What depends on the length of a sound."""
+    """What depends on the length of a sound, for the modes up to `highest` Hz."""
 
-    extractor: Extractor
-    predicted: PredictedGains
-    """Amplitudes of the decorrelated mixtures of modes, in units of `unit`."""
-    gains: Complex64[Tensor, "points modes"]
-    """Gains of the modes themselves, in units of `unit`."""
-    unit: float
-    detuned: tuple[Extractor, ...]
-    """For the null model: of the modes at each of `DETUNINGS` that stay below the highest frequency, if any do."""
-
-    @classmethod
-    def of(cls, locator: Locator, samples: int, highest: float) -> "_Length":
-        """Return it for the modes up to `highest` Hz."""
+    def __init__(self, locator: Locator, samples: int, highest: float) -> None:
         whole, rate = locator.field.bank, locator.field.sample_rate
         highest = min(highest, 0.5 * rate)
         modes = torch.nonzero(whole.frequency < highest).flatten()
@@ -184,21 +172,23 @@ class _Length:
             advice = "record at a higher sample rate"
             raise LocationError.expected(f"some below {highest:g} Hz", highest, got=got, name="modes", advice=advice)
         bank = ModalBank(whole.frequency[modes].double(), whole.damping[modes].double())
-        extractor = Extractor.of(bank, sample_rate=rate, samples=samples, highest=highest)
+        self.extractor = Extractor(bank, sample_rate=rate, samples=samples, highest=highest)
         gains = locator.gains[:, modes]
         if locator.dampings is not None:
             gains = gains * _damping_corrected(bank.damping, locator.dampings[:, modes], samples / rate)
-        unit = float(gains.abs().square().mean().sqrt())
-        if unit == 0.0:
+        self.unit = float(gains.abs().square().mean().sqrt())
+        if self.unit == 0.0:
             raise LocationError.expected(
                 "gains above 0", 0.0, got="0 at all points", name="field", advice="fit it to other recordings"
             )
-        gains = gains / unit
-        predicted = _decorrelated(gains, locator.variance[:, modes] / unit**2, extractor)
+        self.gains = gains / self.unit
+        """Of the modes themselves, [points, modes], in units of `unit`."""
+        self.predicted = _decorrelated(self.gains, locator.variance[:, modes] / self.unit**2, self.extractor)
+        """Amplitudes of the decorrelated mixtures of modes, in units of `unit`."""
         below = [(factor, factor * bank.frequency < highest) for factor in DETUNINGS]
         banks = [ModalBank(factor * bank.frequency[low], bank.damping[low]) for factor, low in below if bool(low.any())]
-        detuned = tuple(Extractor.of(each, sample_rate=rate, samples=samples) for each in banks)
-        return cls(extractor, predicted, gains, unit, detuned)
+        self.detuned = [Extractor(each, sample_rate=rate, samples=samples) for each in banks]
+        """For the null model: of the modes at each of `DETUNINGS` that stay below the highest frequency, if any do."""
 
     def separate(self, amplitudes: Amplitudes) -> tuple[Complex128[Tensor, " modes"], Float64[Tensor, " modes"]]:
         """Return the amplitudes of decorrelated mixtures of modes, and the variances of their errors."""

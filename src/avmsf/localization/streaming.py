@@ -127,7 +127,7 @@ class StreamingLocalizer:
         self.filter = scipy.signal.butter(2, cut, "highpass", fs=rate, output="sos")
         strength = locator.gains[:, audible].abs().square().mean(0).sqrt()
         bank = field.bank.take(audible)
-        self._modes = Ringing.of(bank, strength, sample_rate=rate, window=self.window)
+        self._modes = Ringing(bank, strength, sample_rate=rate, window=self.window)
         memory = self.hop * (_MEMORY_HOPS + 2 * _SKIPPED_HOPS) + round(_ONSET_SEARCH_SECONDS * rate)
         self._history_samples = (self.later or self.window) + memory
         locator.prepare(*(each for each in (self.window, self.later) if each is not None))
@@ -255,29 +255,21 @@ _FAINTEST = 1e-3
 """Strength over the strongest mode's, that every mode has at least beforehand."""
 
 
-@dataclass(frozen=True, eq=False)
 class Ringing:
     """An object's modes at one sample rate, and how strong each is beforehand."""
 
-    poles: Complex128[Tensor, " modes"]
-    window: Complex128[Tensor, "window modes"]
-    """Powers of the poles."""
-    scale: Float64[Tensor, " two_modes"]
-    """Standard deviation of the sines' and cosines' amplitudes over the object's surface."""
-    vectors: Float64[Tensor, "two_modes two_modes"]
-    values: Float64[Tensor, " two_modes"]
-    """Eigenvectors and -values of the Gram matrix over a window, of amplitudes in units of `scale`: with these the fit
-    with any amount of noise is two small products."""
-
-    @classmethod
-    def of(cls, bank: ModalBank, size: Float[Tensor, " modes"], *, sample_rate: float, window: int) -> "Ringing":
-        """Return the ringing of modes that are as strong as `size` on average over the object, in any unit."""
-        poles = poles_of(bank, sample_rate)
+    def __init__(self, bank: ModalBank, size: Float[Tensor, " modes"], *, sample_rate: float, window: int) -> None:
+        """Take modes that are as strong as `size` on average over the object, in any unit."""
+        self.poles = poles_of(bank, sample_rate)
+        self.window = self.poles ** torch.arange(window)[:, None]
+        """Powers of the poles, [window, modes]."""
         relative = size.double() / size.double().max().clamp_min(torch.finfo(torch.float64).tiny)
-        scale = relative.clamp_min(_FAINTEST).repeat(2)
-        values, vectors = torch.linalg.eigh(gram(poles, window, power=0) * scale[:, None] * scale)
-        powers = poles ** torch.arange(window)[:, None]
-        return cls(poles, powers, scale, vectors, values.clamp_min(0.0))
+        self.scale = relative.clamp_min(_FAINTEST).repeat(2)
+        """Standard deviation of the sines' and cosines' amplitudes over the object's surface, [two_modes]."""
+        # In units of `scale`: with eigenvectors the fit with any amount of noise is two small products.
+        inner = gram(self.poles, window, power=0) * self.scale[:, None] * self.scale
+        values, self.vectors = torch.linalg.eigh(inner)
+        self.values = values.clamp_min(0.0)
 
     def render(self, amplitudes: Complex128[Tensor, " modes"], length: int) -> Float64[Tensor, " samples"]:
         """Return so many samples of what rings with amplitudes."""
