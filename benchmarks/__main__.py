@@ -3,6 +3,7 @@
 import argparse
 import inspect
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,9 +47,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for part in asked or parts:
             try:
                 _run(f"{each}.{part}", parts[part], settings, output)
-            except (AvmsfError, MissingDataError) as error:
+            except Exception as error:  # other parts do not need this one
                 failed = True
-                print(f"benchmarks {each}, {part}: {error}", file=sys.stderr)
+                known = isinstance(error, AvmsfError | MissingDataError)
+                print(f"benchmarks {each}, {part}: {error if known else traceback.format_exc()}", file=sys.stderr)
     return 2 if failed else 0
 
 

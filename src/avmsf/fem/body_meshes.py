@@ -45,7 +45,7 @@ class Tolerances:
     max_detail: float = 0.4
     max_knotted_ratio: float = 4.0  # triangles over those that `fill` should get, for no edge to be shared among three
     wall_dofs_per_vertex: float = 36.0  # degrees of freedom of a wall over the vertices of the mesh that it follows
-    peak_bytes: float = 377e6  # that the modes of `peak_dofs` take (benchmarks/fem)
+    peak_bytes: float = 377e6  # that the modes of `peak_dofs` take (benchmarks/proof.py)
     peak_dofs: int = 40_000
     peak_power: float = 1.1  # by which it grows with the degrees of freedom
     memory_safety: float = 2.0  # factor on that, for lumps take more than the walls it was measured on
