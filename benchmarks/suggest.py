@@ -24,10 +24,8 @@ from benchmarks.records import Measurement, Record, Settings, means, records
 
 FIRST, ROUNDS = 6, (8, 11, 15, 20)
 """Impacts to begin with, and after each round, when all ways are compared."""
-HELD_OUT = 3
-"""One recording of so many is held out, drawn at random."""
-STARTS = 3
-"""First contacts, spread evenly over the table."""
+HELD_OUT, STARTS = 3, 3
+"""One recording of so many is held out, drawn at random; and first contacts, spread evenly over the table."""
 SIM20_OBJECTS = ("plate-ceramic", "mug-ceramic", "bracket-steel", "blob-polycarbonate")
 
 
