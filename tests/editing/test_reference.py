@@ -42,14 +42,6 @@ def test_a_recording_begins_at_its_onset_at_the_fields_rate(tmp_path):
     torch.testing.assert_close(found, band_spectrum(sound_of(field)[:, :3990]), rtol=0, atol=2e-3)
 
 
-def test_references_are_told_apart_by_every_sample():
-    sounds = 1e-7 * sound_of(ringing_field())
-    other = sounds.clone()
-    other[0, [5, 6]] = other[0, [6, 5]]
-    described = [Reference.of(each, sample_rate=RATE).describe() for each in (sounds, sounds.clone(), other)]
-    assert described[0] == described[1] != described[2]
-
-
 def test_several_clips_each_sound_has_its_nearest(tmp_path):
     pitches = (0.6, 1.0, 1.7)
     for pitch in pitches:
@@ -143,14 +135,11 @@ def test_made_up_impacts_are_of_the_object_in_another_material():
     # Wood's modes are some ten hertz wide.
     assert float(power[(hertz > 0.8 * lowest) & (hertz < 1.2 * highest)].sum() / power.sum()) > 0.95
     assert made.start(struck()).decay_factor < 0.5
-
-
-def test_a_modes_size_does_not_depend_on_its_phase():
-    field, turn = ringing_field(), torch.linspace(0.0, 1.5, 6)
-    gains = field.gain_field.gains
-    turned = replace(field, gain_field=SameGains(gains * torch.exp(1j * turn)))
-    own, other = (Reference.of_material(each, CERAMIC, WOOD, seed=0) for each in (field, turned))
-    torch.testing.assert_close(other.clips, own.clips, rtol=1e-4, atol=1e-4)
+    # References are told apart by every sample, and a mode's size does not depend on its phase.
+    assert made.describe() == again.describe() != other.describe()
+    rotated = SameGains(field.gain_field.gains * torch.exp(1j * torch.linspace(0.0, 1.5, 6)))
+    same = Reference.of_material(replace(field, gain_field=rotated), CERAMIC, WOOD, count=6, seed=1)
+    torch.testing.assert_close(same.clips, made.clips, rtol=1e-4, atol=1e-4)
 
 
 def test_clipping_and_a_low_rate_are_warned_of(tmp_path):

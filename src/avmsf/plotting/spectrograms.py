@@ -67,7 +67,7 @@ def draw_spectrograms(
     """
     top = min(HIGHEST_HZ, highest, 0.5 * sample_rate)
     bottom = min(LOWEST_HZ, top / 50)
-    figure = titled_figure(title, max(8.0, 2.3 * len(columns) + 1.2), 2.2 * len(contacts) + 0.8)
+    figure = titled_figure(title, max(8.0, 2.3 * len(columns) + 1.2), max(3.4, 2.2 * len(contacts) + 0.8))
     grid = figure.subplots(len(contacts), len(columns), sharex=True, sharey=True, squeeze=False)
     mesh: QuadMesh | None = None
     longest = 0.0
@@ -97,7 +97,7 @@ def draw_spectrograms(
     for axes in grid[-1]:
         axes.set_xlabel("time (s)")
     if mesh is not None:
-        figure.colorbar(mesh, ax=grid, label="level (dB, 0 = loudest of the first column)", shrink=0.8)
+        figure.colorbar(mesh, ax=grid, label="level (dB re loudest at left)", shrink=0.8)
     return figure
 
 
