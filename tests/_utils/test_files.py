@@ -18,22 +18,6 @@ from factories.raising import raises
 NUMBERS = (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.ENAMETOOLONG, errno.EIO)
 
 
-@pytest.mark.parametrize("number", NUMBERS)
-def test_the_advice_fits_the_systems_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    def refuse(*arguments: object, **settings: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    for name in ("open", "mkdir"):
-        monkeypatch.setattr(os, name, refuse)
-    with raises(ExportError, file=tmp_path / "file", value=os.strerror(number)) as refused:
-        write_whole(tmp_path / "file", b"", raising=ExportError)
-    advice = way_out(OSError(number, ""))
-    assert str(refused.value).endswith(advice)
-    with pytest.raises(ExportError) as refused:
-        write_folder(tmp_path / "folder", {}, {})
-    assert str(refused.value).endswith(advice)
-
-
 def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()

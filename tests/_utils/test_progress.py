@@ -1,12 +1,29 @@
-"""The display of progress: what a pipe gets."""
+"""The display of progress: what moves on a terminal, and what a pipe gets."""
+
+import io
 
 import pytest
 
 from avmsf._utils.progress import ProgressDisplay
 
 
-@pytest.mark.parametrize(("options", "count"), [({"quiet": True}, 1), ({}, 4), ({"verbose": True}, 5)])
-def test_a_stage_is_a_line_quiet_leaves_notes_and_verbose_adds_parts(options, count, capsys) -> None:
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stream", "options", "count"),
+    [
+        (io.StringIO, {"quiet": True}, 1),
+        (io.StringIO, {}, 4),
+        (io.StringIO, {"verbose": True}, 5),
+        (Terminal, {}, None),
+    ],
+)
+def test_a_stage_is_a_line_quiet_leaves_notes_and_verbose_adds_parts(stream, options, count, monkeypatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stderr", stderr := stream())
     display = ProgressDisplay(**options)
     # Names that would be markup or a control sequence.
     for _ in range(2):
@@ -17,6 +34,8 @@ def test_a_stage_is_a_line_quiet_leaves_notes_and_verbose_adds_parts(options, co
             display.listener.ready("modes", None)
             display.objects()("mug", 1, 1)
             display.listener.note("few recordings")
-        text = capsys.readouterr().err
-        assert len(text.splitlines()) == count
-        assert "\x07" not in text
+    lines = stderr.getvalue().splitlines()
+    assert count is None or len(lines) == 2 * count
+    assert options or any(line.endswith("2.0 s") and "splat" in line for line in lines)
+    assert "\x07" not in stderr.getvalue()
+    assert ("[red]1" in stderr.getvalue()) == (stream is Terminal)

@@ -100,14 +100,3 @@ def test_writing_never_overwrites(tmp_path: Path) -> None:
     with raises(CaptureError, file="cup"):
         write_capture(invented(), tmp_path / "cup")
     assert sorted(path.name for path in (tmp_path / "cup").iterdir()) == before
-
-
-def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("avmsf.capture.folder.write_surface", full_disk)
-    with raises(CaptureError, file="cup") as caught:
-        write_capture(invented(), tmp_path / "cup")
-    assert isinstance(caught.value.__cause__, OSError)
-    assert list(tmp_path.iterdir()) == []

@@ -151,7 +151,9 @@ def test_few_contacts_close_together_or_on_few_points_are_judged_too() -> None:
         (near, CLOUD, "rows"),
         (torch.tensor([[0.1, 0.02, 0.0], [0.0, 0.1, 0.0]]), corners, "none"),
     ):
-        assert check_placement(contacts, points).fault == fault
+        placement = check_placement(contacts, points)
+        assert placement.fault == fault
+        assert "different frames" not in placement.describe()
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,10 @@ def test_peak_normalization_takes_the_blow_s_strength_out() -> None:
     soft, hard = (prepare(recording(*struck(newtons)[1:]), HAMMER) for newtons in (2.0, 50.0))
     assert (soft.newtons, hard.newtons) == pytest.approx((2.0, 50.0), rel=1e-12)
     assert np.allclose(soft.sound, hard.sound, rtol=0, atol=1e-12)
+    # A table's force overrules the channel's scale.
+    blow, scaled = recording(*struck(3.0)[1:]), replace(HAMMER, force_scale=10.0)
+    assert prepare(blow, scaled).newtons == pytest.approx(30.0, rel=1e-12)
+    assert prepare(blow, scaled, newtons=7.0).newtons == 7.0
 
 
 def test_forces_of_the_table_serve_where_there_is_no_channel(tmp_path: Path) -> None:
@@ -88,12 +92,6 @@ def test_forces_of_the_table_serve_where_there_is_no_channel(tmp_path: Path) -> 
     done = read_capture(folder, CaptureSettings(seconds=0.3, normalize="done")).impacts
     assert done.forces is not None
     assert torch.equal(done.sounds, raw.sounds)
-
-
-def test_a_table_s_force_overrules_the_channel_s_scale() -> None:
-    blow = recording(*struck(3.0)[1:])
-    assert prepare(blow, replace(HAMMER, force_scale=10.0)).newtons == pytest.approx(30.0, rel=1e-12)
-    assert prepare(blow, replace(HAMMER, force_scale=10.0), newtons=7.0).newtons == 7.0
 
 
 def test_the_force_channel_sets_time_zero_even_where_the_sound_comes_late() -> None:
@@ -228,13 +226,6 @@ def test_a_sound_starts_at_its_largest_sample(tmp_path: Path) -> None:
     assert len(prepare(recording(sound), CaptureSettings(time_zero="peak", align=False)).sound) == 4000
     impacts = read_capture(fill_plate(tmp_path), CaptureSettings(time_zero="peak")).impacts
     assert bool((impacts.sounds[:, 0].abs() == impacts.sounds.abs().amax(1)).all())
-
-
-def test_settings_start_where_they_are_asked_to() -> None:
-    own = CaptureSettings(align=False)
-    assert own.starting(None) == own.starting("onset") == own
-    assert own.starting("peak").from_peaks
-    assert not own.starting("peak").starting("onset").from_peaks
 
 
 @pytest.mark.parametrize("newtons", [None, (2.0, 0.5, 8.0)])

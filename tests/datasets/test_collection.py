@@ -103,25 +103,24 @@ def test_the_wrong_folder_is_told_from_the_right_one(place: Path, path: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("files", "found", "advice"),
+    ("files", "found"),
     [
-        (["100_Frisbee.zip", "10_bowl.zip"], ("100_Frisbee.zip", "10_bowl.zip"), "`unzip 100_Frisbee.zip`"),
-        (["audio_data_1_10.tar.gz"], ("audio_data_1_10.tar.gz",), "`tar -xf audio_data_1_10.tar.gz`"),
-        (["43_IronMortar/preprocessed/"], "preprocessed/", "RealImpact"),
-        (["1/vision/a.mp4", "2/vision/b.mp4"], ("1/", "2/"), "audio_data_1_10.tar.gz"),
-        (["1/audio/0/"], "audio/", "audio archives"),
-        (["readme.txt", "model.pth"], ("model.pth", "readme.txt"), "model.pth"),
+        (["100_Frisbee.zip", "10_bowl.zip"], ("100_Frisbee.zip", "10_bowl.zip")),
+        (["audio_data_1_10.tar.gz"], ("audio_data_1_10.tar.gz",)),
+        (["43_IronMortar/preprocessed/"], "preprocessed/"),
+        (["1/vision/a.mp4", "2/vision/b.mp4"], ("1/", "2/")),
+        (["1/audio/0/"], "audio/"),
+        (["readme.txt", "model.pth"], ("model.pth", "readme.txt")),
     ],
 )
-def test_what_is_there_instead_is_named(tmp_path: Path, files: list[str], found: object, advice: str) -> None:
+def test_what_is_there_instead_is_named(tmp_path: Path, files: list[str], found: object) -> None:
     for name in files:
         path = tmp_path / name
         (path if name.endswith("/") else path.parent).mkdir(parents=True, exist_ok=True)
         if not name.endswith("/"):
             path.touch()
-    with raises(DatasetError, file=tmp_path, value=found) as caught:
+    with raises(DatasetError, file=tmp_path, value=found):
         open_dataset(tmp_path)
-    assert advice in str(caught.value)
 
 
 def test_options_of_another_dataset_are_refused(place: Path) -> None:
@@ -140,9 +139,6 @@ def test_a_collection_reads_what_read_capture_reads(place: Path) -> None:
     assert one.impacts.sounds.equal(other.impacts.sounds)
     assert dataset.check().remarks == ("folders without impacts.csv are ignored: notes",)
     assert dataset.visual_source("bowl") is None
-    with raises(DatasetError, name="object", value="plate") as caught:
-        dataset.capture("plate")
-    assert "10_plate?" in str(caught.value)
 
 
 @pytest.mark.parametrize("sight", ["surface.ply", "images/a.png", "walk.mp4", "transforms.json", "splats.ply", "a.jpg"])

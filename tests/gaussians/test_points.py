@@ -60,21 +60,14 @@ def test_closest_points_are_a_ball_around_the_start():
     assert bool((distance[rows].diff() >= 0).all())
 
 
-@pytest.mark.parametrize("count", [1, 4, 40])
-def test_nearest_points_are_those_of_a_full_search(count):
-    points, queries = cloud(40), cloud(25, seed=1)
-    expected = torch.cdist(queries, points).argsort(dim=1)[:, :count]
-    assert torch.equal(nearest_points(points, queries, count=count), expected)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
-def test_ties_go_to_the_first_rows(count):
-    points = grid(4)
-    # Cell centers have four nearest, nodes have rings of four and more.
-    queries = torch.cat([points[:, :], points + torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64)])
-    squares = (queries[:, None] - points).square().sum(dim=2)
-    expected = squares.argsort(dim=1, stable=True)[:, :count]
-    assert torch.equal(nearest_points(points, queries, count=count), expected)
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 16])
+def test_nearest_points_are_those_of_a_full_search_and_ties_go_to_the_first_rows(count):
+    half = torch.tensor([0.5, 0.5, 0.0], dtype=torch.float64)
+    # On a grid cell centers have four nearest, nodes have rings of four and more.
+    for points, queries in ((cloud(40), cloud(25, seed=1)), (grid(4), torch.cat([grid(4), grid(4) + half]))):
+        squares = (queries[:, None] - points).square().sum(dim=2)
+        expected = squares.argsort(dim=1, stable=True)[:, :count]
+        assert torch.equal(nearest_points(points, queries, count=count), expected)
 
 
 def test_clusters_are_a_minimum_of_lloyds():

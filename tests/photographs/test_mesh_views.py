@@ -86,19 +86,6 @@ def test_an_unlit_picture_of_a_texture_is_the_texture_which_repeats(times: int) 
     assert bool((view.mask == 255).all())
 
 
-def test_a_checkerboards_fields_are_seen_where_they_lie() -> None:
-    board = np.kron(np.indices((8, 8)).sum(axis=0) % 2, np.ones((16, 16)))[..., None].repeat(3, axis=2) * 255
-    mesh = card(board.astype(np.uint8), half=0.3)
-    camera = aimed(torch.tensor([0.3, 0.2, -1.1]), (0.0, -1.0, 0.0), 240, 200, focal=250.0)
-    (view,) = render_views(mesh, [camera], ambient=1.0)
-    centers = (torch.arange(8) + 0.5) * 0.6 / 8 - 0.3
-    for row, y in enumerate(centers.tolist()):
-        for column, x in enumerate(centers.tolist()):
-            pixels, _ = camera.project(torch.tensor([[x, y, 0.0]]))
-            across, down = pixels[0].long().tolist()
-            assert view.image[down, across].tolist() == [255 * ((row + column) % 2)] * 3, (row, column)
-
-
 def test_texels_finer_than_pixels_give_their_mean() -> None:
     fine = (np.indices((500, 500)).sum(axis=0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, axis=2)
     (view,) = render_views(card(fine), [facing()], ambient=1.0, supersample=1)

@@ -109,15 +109,3 @@ def test_what_cannot_be_picked_is_refused_and_nothing_is_left(tmp_path: Path) ->
     with raises(CaptureError, file="full"):
         pick_frames(short, tmp_path / "full", count=2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["full", "short.avi", "text.mp4"]
-
-
-def test_an_interruption_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(frame: np.ndarray) -> float:
-        if abs(float(frame[4:12, 4:12].mean()) - 7 * 20) < 2:
-            raise KeyboardInterrupt
-        return sharpness(frame)
-
-    monkeypatch.setattr("avmsf.photographs.video.sharpness", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        pick_frames(film(tmp_path / "a.avi"), tmp_path / "images", count=6)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.avi"]
