@@ -83,13 +83,12 @@ def training_objects(recipes: Sequence[ObjectRecipe]) -> Iterator[tuple[Gaussian
 
 def pretrain(
     objects: Iterable[tuple[GaussianCloud, Impacts]],
-    sizes: SmallConfig | None = None,
+    sizes: SmallConfig,
     config: TrainingConfig = PRETRAINING,
     *,
     seed: int = 0,
 ) -> SmallWeights:
     """Train on objects' recordings. Raises EvaluationError where there is no object."""
-    sizes = SmallConfig() if sizes is None else sizes
     begun = time.process_time()
     tokens, places, logs = [], [], []
     for cloud, impacts in objects:
@@ -110,7 +109,6 @@ def pretrain(
     owners = torch.cat([torch.full((len(each),), row) for row, each in enumerate(places)])
     latents = torch.cat([codec.encode(each) for each in logs])
     logs.clear()
-
     loss = clip_loss(network.train(), features, owners, torch.cat(places), latents)
     losses = train(network.parameters(), loss, len(owners), config, seed=seed)
     report = {
