@@ -27,6 +27,7 @@ from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
 from factories.raising import raises
 from factories.small_scene import slab, slab_views, write_surface_file
+from factories.verbs import results_of
 from factories.views_folder import frames, ring, write_image, write_transforms
 
 Streams = pytest.CaptureFixture[str]
@@ -38,36 +39,33 @@ def found(folder: Path) -> VisualInputs:
     return visual
 
 
-def test_photographs_with_cameras_and_masks(tmp_path: Path) -> None:
-    write_transforms(tmp_path, frames(ring(4)))
-    assert found(tmp_path) == VisualInputs(4, "transforms.json", 0, None, None, None, ())
-    for name in "abcd":
-        write_image(tmp_path / "masks" / f"{name}.png")
-    assert found(tmp_path).masks == 4
-    assert found(tmp_path).problems == ()
+def images(folder: Path, *names: str) -> None:
+    for name in names:
+        write_image(folder / name)
 
 
-def test_masks_and_camera_files_that_name_no_photograph(tmp_path: Path) -> None:
+NAMED = [{**frame, "mask_path": f"cut/{name}.png"} for name, frame in zip("abcd", frames(ring(4)), strict=True)]
+MASKS: dict[str, tuple[Callable[[Path], object], int, int, list[str]]] = {
+    "none": (lambda folder: None, 4, 0, []),
+    "all": (lambda folder: images(folder, *(f"masks/{name}.png" for name in "abcd")), 4, 4, []),
+    "of no photograph": (lambda folder: images(folder, "masks/e.png"), 4, 0, ["masks/e.png"]),
+    "all but one": (lambda folder: images(folder, *(f"masks/{name}.png" for name in "acd")), 4, 3, ["b.png"]),
+    "named, not there": (lambda folder: write_transforms(folder, NAMED), 4, 0, ["4 photographs"]),
+    "an alpha channel": (lambda folder: Image.new("RGBA", (8, 8)).save(folder / "images" / "a.png"), 4, 1, ["b.png"]),
+    "no photograph": (lambda folder: (folder / "images" / "b.png").unlink(), 3, 0, ["b.png"]),
+}
+
+
+@pytest.mark.parametrize("case", MASKS)
+def test_photographs_with_cameras_and_masks(case: str, tmp_path: Path) -> None:
+    """What a change of the folder gives: photographs, those with a mask, and what the problems name."""
     write_transforms(tmp_path, frames(ring(4)))
-    write_image(tmp_path / "masks" / "e.png")
-    (tmp_path / "images" / "b.png").unlink()
+    change, photographs, masks, problems = MASKS[case]
+    change(tmp_path)
     visual = found(tmp_path)
-    missing, mask = visual.problems
-    assert "b.png" in missing
-    assert "masks/e.png" in mask
-    assert (visual.photographs, visual.masks) == (3, 0)
-
-
-def test_masks_that_some_photographs_lack_are_a_problem(tmp_path: Path) -> None:
-    write_transforms(tmp_path, frames(ring(4)))
-    for name in "acd":
-        write_image(tmp_path / "masks" / f"{name}.png")
-    (problem,) = found(tmp_path).problems
-    assert "b.png" in problem
-    named = [{**frame, "mask_path": f"cut/{name}.png"} for name, frame in zip("abcd", frames(ring(4)), strict=True)]
-    write_transforms(tmp_path / "named", named)
-    (problem,) = found(tmp_path / "named").problems
-    assert problem.startswith("4 photographs")
+    assert (visual.photographs, visual.cameras, visual.masks) == (photographs, "transforms.json", masks)
+    assert len(visual.problems) == len(problems)
+    assert all(name in problem for name, problem in zip(problems, visual.problems, strict=True))
 
 
 def test_an_empty_folder_of_images_is_refused_unless_a_mesh_shows_the_object(tmp_path: Path) -> None:
@@ -84,15 +82,6 @@ def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:
     write_image(tmp_path / "images" / ".avmsf" / "motion" / "view_000.png")
     assert pictures_in(tmp_path / "images", deep=True) == [tmp_path / "images" / f"{name}.png" for name in "abcd"]
     assert read_camera_file(tmp_path).without_camera() == []
-
-
-def test_an_alpha_channel_is_the_mask_of_its_photograph_alone(tmp_path: Path) -> None:
-    write_transforms(tmp_path, frames(ring(4)))
-    Image.new("RGBA", (8, 8)).save(tmp_path / "images" / "a.png")
-    assert found(tmp_path).masks == 1
-    (problem,) = found(tmp_path).problems
-    assert "b.png" in problem
-    assert "a.png" not in problem
 
 
 @pytest.mark.parametrize("installed", [True, False])
@@ -112,16 +101,11 @@ def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
     (tmp_path / "turn.mp4").touch()
     visual = found(tmp_path)
     assert visual == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", ())
-    assert found(tmp_path).reconstructs
+    assert visual.reconstructs
     write_surface_file(tmp_path)
     # Pictures next to a mesh may be its textures.
     assert found(tmp_path).mesh is not None
-    assert found(tmp_path).photographs == 0
     assert not found(tmp_path).reconstructs
-
-
-def test_what_cannot_be_used_is_a_problem(tmp_path: Path) -> None:
-    (tmp_path / "one.mp4").touch()
     (tmp_path / "two.mp4").touch()
     assert len(found(tmp_path).problems) == 1
     (tmp_path / "transforms.json").write_text("{}")
@@ -142,14 +126,10 @@ def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
     assert ("4 photographs" in line) == pictured
     following = f"avmsf fit {folder} -o field.safetensors" if pictured else f"avmsf modes {folder}"
     assert err.splitlines()[-1] == f"next: {following}"
-    assert main(["modes", str(folder)]) == 0
-    assert capsys.readouterr().err.splitlines()[-1].startswith("next: avmsf fit ")
     # The mask without a photograph is one; nor has noise a plain background, from which masks are found.
     assert out.splitlines()[-1] == ("readable, with 2 warnings" if pictured else "no problem found")
-    assert main(["check", str(folder), "--json"]) == 0
-    report: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert report["visual_inputs"]["photographs"] == 4 * pictured
-    assert len(report["visual_inputs"]["problems"]) == pictured
+    visual = results_of(capsys, "check", folder)[0]["visual_inputs"]
+    assert (visual["photographs"], len(visual["problems"])) == (4 * pictured, pictured)
 
 
 def pictured_slab(folder: Path) -> Path:
@@ -253,8 +233,7 @@ def test_the_unit_of_contacts_is_found_from_photographs(tmp_path: Path, capsys: 
     (folder / "capture.toml").unlink()
     proposed = [] if unit == "m" else [unit]
     for words, found in (((), proposed), (("--write-settings",), proposed), ((), [])):
-        assert main(["check", str(folder), "--json", *words]) in (0, 2)
-        proposals = json.loads(capsys.readouterr().out)["proposals"]
+        proposals = results_of(capsys, "check", folder, *words, code=None)[0]["proposals"]
         assert [each["value"] for each in proposals if each["key"] == "unit"] == found
     if proposed:
         assert CaptureSettings.read(folder / "capture.toml").unit == unit

@@ -1,4 +1,4 @@
-"""Ctrl-C: what is kept, what is said, and that the same command goes on to the same field."""
+"""Ctrl-C in a fit: what is kept, what is said, and that the same command goes on to the same field."""
 
 from pathlib import Path
 
@@ -11,26 +11,15 @@ from avmsf.field.store import load
 from factories.plate_capture import TINY, fill_plate
 
 NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
+Streams = pytest.CaptureFixture[str]
 
 
 class SoughtAgainError(Exception):
     """Modes were extracted although they are cached."""
 
 
-Streams = pytest.CaptureFixture[str]
-
-
-def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> list[int]:
-    """Let Ctrl-C come while a step is shown, once; return the steps that are shown."""
-    shown: list[int] = []
-
-    def show(self: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
-        shown.append(done)
-        if len(shown) == step:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(ProgressDisplay, "step", show)
-    return shown
+def stop(*arguments: object, **named: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_the_same_command_goes_on_to_the_same_field(
@@ -40,7 +29,14 @@ def test_the_same_command_goes_on_to_the_same_field(
     whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
     assert main(["fit", str(folder), "--output", str(whole), "--cache", str(tmp_path / "other"), *NETWORK]) == 0
     capsys.readouterr()
-    shown = interrupt_at(monkeypatch, 14)
+    shown: list[int] = []
+
+    def show(self: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
+        shown.append(done)
+        if len(shown) == 14:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(ProgressDisplay, "step", show)
     words = ["fit", str(folder), "--output", str(broken), *NETWORK]
     assert main(words) == 130
     assert (cache / "field.safetensors.checkpoint").exists()
@@ -60,39 +56,23 @@ def test_the_same_command_goes_on_to_the_same_field(
     assert (one - other).abs().max() < 1e-4 * one.abs().max()
 
 
-def test_an_interruption_before_training_keeps_nothing(
-    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from avmsf.modal.extraction import extract as kept
-
-    def stop(*arguments: object) -> None:
-        raise KeyboardInterrupt
-
-    folder = fill_plate(tmp_path / "plate")
-    monkeypatch.setattr(kept, "extract_modes", stop)
-    assert main(["fit", str(folder), "--output", str(tmp_path / "field.safetensors"), *NETWORK]) == 130
-    assert "interrupted" in capsys.readouterr().err.splitlines()[-1]
-    assert [path.name for path in tmp_path.iterdir()] == ["plate"]
-    assert not (folder / ".avmsf" / "modes.safetensors").exists()
-
-
-def test_an_interruption_as_training_begins_keeps_the_modes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_keeps_the_modes_once_they_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import avmsf.pipeline.fit as pipeline
-    from avmsf.modal.extraction import extract as kept
-
-    def stop(*arguments: object, **named: object) -> None:
-        raise KeyboardInterrupt
+    from avmsf.modal.extraction import extract
 
     def refuse(*arguments: object) -> None:
         raise SoughtAgainError
 
-    words = ["fit", str(fill_plate(tmp_path / "plate")), "--output", str(tmp_path / "field.safetensors"), *NETWORK]
-    with monkeypatch.context() as patched:
-        patched.setattr(pipeline, "fit_field", stop)
-        assert main(words) == 130
-    with monkeypatch.context() as patched:
-        patched.setattr(kept, "extract_modes", refuse)
-        # The modes that are kept are this method's alone.
-        with pytest.raises(SoughtAgainError):
-            main([*words, "--extraction", "short-time"])
-        assert main(words) == 0
+    folder = fill_plate(tmp_path / "plate")
+    words = ["fit", str(folder), "--output", str(tmp_path / "field.safetensors"), *NETWORK]
+    for module, name, kept in ((extract, "extract_modes", False), (pipeline, "fit_field", True)):
+        with monkeypatch.context() as patched:
+            patched.setattr(module, name, stop)
+            assert main(words) == 130
+        assert [path.name for path in tmp_path.iterdir()] == ["plate"]
+        assert (folder / ".avmsf" / "modes.safetensors").exists() == kept
+    monkeypatch.setattr(extract, "extract_modes", refuse)
+    # The modes that are kept are this method's alone.
+    with pytest.raises(SoughtAgainError):
+        main([*words, "--extraction", "short-time"])
+    assert main(words) == 0

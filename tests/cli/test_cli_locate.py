@@ -1,31 +1,37 @@
-"""`avmsf locate`: text, JSON, heat maps and clouds; and recordings without an impact on the object."""
+"""`avmsf locate`: text, JSON, heat maps and clouds; recordings without an impact on the object; true contacts."""
 
-import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import soundfile
 import torch
 import trimesh
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from avmsf.cli import main
-from avmsf.errors import LocationError
+from avmsf.cli.contacts import Contacts, rows_of
+from avmsf.cli.paths import OutputError
+from avmsf.errors import AvmsfError, CaptureError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
+from avmsf.plotting.clouds import ALL_SIDES, view_from
+from avmsf.plotting.style import FIRST, SECOND
 from factories.made_fields import BANK, positional
 from factories.raising import raises
-from factories.verbs import run_verb
+from factories.verbs import results_of, run_verb
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000, 4000
-STRUCK, SECOND = 68, 102
+STRUCK, SECOND_PLACE = 68, 102
 
 
 @dataclass(frozen=True)
@@ -40,122 +46,107 @@ class Place:
         soundfile.write(path, (peak * sound / sound.abs().max()).numpy(), rate, subtype="FLOAT")
         return str(path)
 
-    def blow(self, row: int, *, before: float = 0.1, bank: ModalBank = BANK, rate: int = RATE) -> Tensor:
-        """Return a blow in faint noise, with some quiet before it."""
+    def impact(self, row: int, *, before: float = 0.1, bank: ModalBank = BANK, rate: int = RATE) -> Tensor:
+        """Return an impact in faint noise, with some quiet before it."""
         gains = self.gains[row][None].to(torch.complex128)
-        sound = synthesize(
-            gains,
-            bank.frequency,
-            bank.damping,
-            samples=SAMPLES * rate // RATE,
-            sample_rate=float(rate),
-        )[0]
+        samples = SAMPLES * rate // RATE
+        sound = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=float(rate))[0]
         whole = torch.cat([torch.zeros(round(before * rate), dtype=torch.float64), sound])
         noise = torch.randn(len(whole), generator=torch.Generator().manual_seed(row), dtype=torch.float64)
         return whole + 1e-4 * sound.abs().max() * noise
 
+    def two(self, name: str) -> str:
+        first, second = self.impact(STRUCK), self.impact(SECOND_PLACE, before=0.4)
+        return self.wav(name, torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second)
+
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
-    folder = tmp_path_factory.mktemp("place")
-    zero = torch.zeros(len(BANK), dtype=torch.float64)
-    field = SoundField(
-        BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), float(RATE), SAMPLES, Origin("plate")
-    )
+    folder, zero = tmp_path_factory.mktemp("place"), torch.zeros(len(BANK), dtype=torch.float64)
+    noise, origin = Residual(torch.full((9,), 1e-3)), Origin("plate", trained_on=("fitted.wav",))
+    field = SoundField(BANK, positional(), zero, noise, float(RATE), SAMPLES, origin)
     save(field, folder / "plate.safetensors")
     locator = Locator.of(field)
     return Place(folder, str(folder / "plate.safetensors"), locator.points, locator.gains)
 
 
-def located(words: list[str], capsys: Streams) -> tuple[dict, str]:
-    assert run_verb("locate", *words, "--json") == 0
-    out, err = capsys.readouterr()
-    return json.loads(out), err
+@pytest.fixture
+def hit(place: Place) -> str:
+    return place.wav("hit.wav", -place.impact(STRUCK))
 
 
-def test_a_blow_is_found_drawn_and_told(place: Place, tmp_path: Path, capsys: Streams) -> None:
-    hit = place.wav("hit.wav", -place.blow(STRUCK))
-    printed, err = located([place.field, hit, "--output", str(tmp_path / "maps")], capsys)
-    (blow,) = printed["impacts"]
-    assert blow["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=1e-6)
-    assert blow["recording"] == hit
-    assert blow["explained_energy"] > 0.98
-    assert blow["mismatch_ratio"] < 0.01
-    assert blow["credible_region"]["probability"] == 0.9
-    # The field's own contacts, left out, are badly foretold by the others: the region is as wide as that makes it.
-    assert 0.0 < blow["credible_region"]["surface_fraction"] < 0.7
+def located(place: Place, capsys: Streams, *words: str, code: int = 0) -> tuple[dict[str, Any], str]:
+    return results_of(capsys, "locate", place.field, *words, code=code)
+
+
+def test_an_impact_is_found_drawn_and_told(place: Place, hit: str, tmp_path: Path, capsys: Streams) -> None:
+    printed, err = located(place, capsys, hit, "--output", str(tmp_path / "maps"))
+    (impact,) = printed["impacts"]
+    assert impact["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=1e-6)
+    assert impact["recording"] == hit
+    assert impact["explained_energy"] > 0.98
+    assert impact["mismatch_ratio"] < 0.01
+    # The field's own contacts, left out, are badly predicted by the others: the region is as wide as that makes it.
+    assert 0.0 < impact["credible_region"]["surface_fraction"] < 0.7
     assert f"{hit}: impact at (" in err
-    assert f"{100 * blow['explained_energy']:.0f} % of the sound" in err
+    assert f"{100 * impact['explained_energy']:.0f} % of the sound" in err
     assert (tmp_path / "maps" / "hit.png").read_bytes().startswith(b"\x89PNG")
     cloud = trimesh.load(tmp_path / "maps" / "hit.ply")
     likeliest = int(np.argmax(cloud.metadata["_ply_raw"]["vertex"]["data"]["probability"]))
-    assert cloud.vertices[likeliest] == pytest.approx(blow["position"], abs=1e-6)
+    assert cloud.vertices[likeliest] == pytest.approx(impact["position"], abs=1e-6)
+    regions = [
+        located(place, capsys, hit, "--probability", level)[0]["impacts"][0]["credible_region"]
+        for level in ("0.5", "0.999")
+    ]
+    assert (
+        regions[0]["surface_fraction"] < impact["credible_region"]["surface_fraction"] < regions[1]["surface_fraction"]
+    )
+    assert regions[0]["radius"] < regions[1]["radius"]
 
 
-def test_a_surer_region_is_larger(place: Place, capsys: Streams) -> None:
-    hit = place.wav("sure.wav", place.blow(STRUCK))
-    shares = []
-    for level in ("0.5", "0.999"):
-        printed, _ = located([place.field, hit, "--probability", level], capsys)
-        shares.append(
-            (
-                printed["impacts"][0]["credible_region"]["surface_fraction"],
-                printed["impacts"][0]["credible_region"]["radius"],
-            )
-        )
-    assert shares[0][0] < shares[1][0]
-    assert shares[0][1] < shares[1][1]
-
-
-def test_several_blows_are_told_apart(place: Place, capsys: Streams) -> None:
-    first, second = place.blow(STRUCK, before=0.1), place.blow(SECOND, before=0.4)
-    both = torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second
-    two = place.wav("two.wav", both)
-    printed, _ = located([place.field, two, "--several"], capsys)
-    assert [blow["seconds"] for blow in printed["impacts"]] == pytest.approx([0.1, 0.4], abs=0.002)
-    for blow, row in zip(printed["impacts"], (STRUCK, SECOND), strict=True):
-        assert blow["position"] == pytest.approx(place.points[row].tolist(), abs=0.01)
-    alone, err = located([place.field, two], capsys)
+def test_several_impacts_are_told_apart(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    two = place.two("two.wav")
+    printed, _ = located(place, capsys, two, "--several")
+    assert [impact["seconds"] for impact in printed["impacts"]] == pytest.approx([0.1, 0.4], abs=0.002)
+    for impact, row in zip(printed["impacts"], (STRUCK, SECOND_PLACE), strict=True):
+        assert impact["position"] == pytest.approx(place.points[row].tolist(), abs=0.01)
+    alone, err = located(place, capsys, two)
     assert len(alone["impacts"]) == 1
     assert "at 0.100 s and at 0." in err
 
 
 @pytest.mark.slow
-def test_no_blows_files_are_anothers(place: Place, tmp_path: Path, capsys: Streams) -> None:
-    first, second = place.blow(STRUCK, before=0.1), place.blow(SECOND, before=0.4)
-    both = torch.cat([first, torch.zeros(len(second) - len(first), dtype=torch.float64)]) + second
-    words = [place.field, place.wav("twin.wav", both), place.wav("twin-2.wav", first), "--several"]
-    printed, _ = located([*words, "--output", str(tmp_path)], capsys)
+def test_no_impacts_files_are_anothers(place: Place, tmp_path: Path, capsys: Streams) -> None:
+    words = [place.two("twin.wav"), place.wav("twin-2.wav", place.impact(STRUCK)), "--several"]
+    printed, _ = located(place, capsys, *words, "--output", str(tmp_path))
     stems = ["twin", "twin-2", "twin-2-2"]
-    assert [Path(blow["picture"]).stem for blow in printed["impacts"]] == stems
+    assert [Path(impact["picture"]).stem for impact in printed["impacts"]] == stems
     assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{end}" for stem in stems for end in ("png", "ply")}
 
 
-def test_a_known_force_counts(place: Place, capsys: Streams) -> None:
-    hit = place.wav("forced.wav", place.blow(STRUCK))
+def test_a_known_force_counts(place: Place, hit: str, capsys: Streams) -> None:
     shares = []
     for words in ([], ["--force", "1"], ["--force", "1", "--several"], ["--force", "1000"]):
-        printed, _ = located([place.field, hit, *words], capsys)
+        printed, _ = located(place, capsys, hit, *words)
         shares.append(printed["impacts"][0]["credible_region"]["surface_fraction"])
     assert shares[1] == pytest.approx(shares[2], abs=0.05)
     assert len({round(share, 3) for share in shares}) > 1
-    with raises(LocationError, name="force.expected", value=0.0):
-        run_verb("locate", place.field, hit, "--force", "0")
 
 
 def test_another_rate_and_clipping_are_said(place: Place, capsys: Streams) -> None:
-    fast = place.wav("fast.wav", place.blow(STRUCK, rate=16000), rate=16000)
-    printed, err = located([place.field, fast], capsys)
+    fast = place.wav("fast.wav", place.impact(STRUCK, rate=16000), rate=16000)
+    printed, err = located(place, capsys, fast)
     assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
     assert "note: " in err
     assert "resampled from 16000 Hz to the field's 8000 Hz" in err
-    loud = place.blow(STRUCK)
+    loud = place.impact(STRUCK)
     loud = loud.clamp(-0.4 * loud.abs().max(), 0.4 * loud.abs().max())
-    _, err = located([place.field, place.wav("loud.wav", loud, peak=1.0)], capsys)
-    assert "clipped" in err
+    assert "clipped" in located(place, capsys, place.wav("loud.wav", loud, peak=1.0))[1]
 
 
-def test_recordings_without_a_blow_on_the_object_have_no_place(place: Place, tmp_path: Path, capsys: Streams) -> None:
+def test_recordings_without_an_impact_on_the_object_have_no_place(
+    place: Place, tmp_path: Path, capsys: Streams
+) -> None:
     silent = str(place.folder / "silent.wav")
     soundfile.write(silent, np.zeros(SAMPLES), RATE)
     noise = torch.randn(SAMPLES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -163,67 +154,147 @@ def test_recordings_without_a_blow_on_the_object_have_no_place(place: Place, tmp
     cases = {
         silent: "silence",
         place.wav("noise.wav", noise): " dB",
-        place.wav("other.wav", place.blow(STRUCK, bank=other)): "a mismatch ratio of",
+        place.wav("other.wav", place.impact(STRUCK, bank=other)): "a mismatch ratio of",
     }
-    for path, reason in cases.items():
-        assert run_verb("locate", place.field, path, "--json", "--output", str(tmp_path)) == 2
-        out, err = capsys.readouterr()
-        (values,) = json.loads(out)["impacts"]
-        assert values["status"] == "not located"
-        assert values["position"] is None
+    printed, err = located(place, capsys, *cases, "--output", str(tmp_path), code=2)
+    for values, (path, reason) in zip(printed["impacts"], cases.items(), strict=True):
+        assert (values["status"], values["position"]) == ("not located", None)
         assert reason in values["reason"]
         assert f"{path}: not located: " in err
     assert not list(tmp_path.iterdir())
 
 
-def test_one_bad_recording_does_not_cost_the_others(place: Place, capsys: Streams) -> None:
-    silent, unreadable = str(place.folder / "quiet.wav"), place.folder / "text.wav"
-    missing = [str(place.folder / "missing.wav"), str(place.folder)]
-    soundfile.write(silent, np.zeros(SAMPLES), RATE)
+def test_one_bad_recording_does_not_cost_the_others(place: Place, hit: str, capsys: Streams) -> None:
+    unreadable, missing = place.folder / "text.wav", [str(place.folder / "missing.wav"), str(place.folder)]
     unreadable.write_text("no sound")
-    hit = place.wav("beside.wav", place.blow(STRUCK))
-    assert main(["locate", place.field, silent, str(unreadable), *missing, hit, "--json"]) == 2
-    out, err = capsys.readouterr()
-    printed = json.loads(out)
-    assert [blow["recording"] for blow in printed["impacts"]] == [silent, hit]
-    assert [blow["status"] for blow in printed["impacts"]] == ["not located", "located"]
+    printed, err = located(place, capsys, str(unreadable), *missing, hit, code=2)
+    assert [(impact["recording"], impact["status"]) for impact in printed["impacts"]] == [(hit, "located")]
     assert [each["recording"] for each in printed["failures"]] == [str(unreadable), *missing]
     assert "text.wav" in err
 
 
-def test_a_captures_settings_say_how_recordings_are_read(place: Place, tmp_path: Path, capsys: Streams) -> None:
-    blow = place.blow(STRUCK)
-    noise = torch.randn(len(blow), generator=torch.Generator().manual_seed(9), dtype=torch.float64)
-    path = place.folder / "stereo.wav"
-    soundfile.write(path, torch.stack([0.1 * noise, blow / blow.abs().max()], dim=1).numpy(), RATE, subtype="FLOAT")
-    assert run_verb("locate", place.field, str(path)) == 2
-    assert "response_channel" in capsys.readouterr().out
+@pytest.mark.parametrize("several", [(), ("--several",)])
+def test_a_captures_settings_say_how_recordings_are_read(
+    several: tuple[str, ...], place: Place, hit: str, tmp_path: Path, capsys: Streams
+) -> None:
+    impact = place.impact(STRUCK)
+    noise = torch.randn(len(impact), generator=torch.Generator().manual_seed(9), dtype=torch.float64)
+    path = str(place.folder / "stereo.wav")
+    soundfile.write(path, torch.stack([0.1 * noise, impact / impact.abs().max()], dim=1).numpy(), RATE, subtype="FLOAT")
+    assert "response_channel" in located(place, capsys, path, *several, code=2)[1]
     (tmp_path / "capture.toml").write_text("response_channel = 2\n")
-    printed, _ = located([place.field, str(path), "--settings", str(tmp_path / "capture.toml")], capsys)
-    assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
-
-
-def test_several_blows_are_read_as_one_is(place: Place, tmp_path: Path, capsys: Streams) -> None:
-    hit = place.wav("mono.wav", place.blow(STRUCK))
-    (tmp_path / "capture.toml").write_text("response_channel = 2\n")
-    for words in ([], ["--several"]):
-        printed, _ = located([place.field, hit, "--settings", str(tmp_path / "capture.toml"), *words], capsys)
+    for recording in (path, hit):
+        printed, _ = located(place, capsys, recording, "--settings", str(tmp_path / "capture.toml"), *several)
         assert printed["impacts"][0]["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=0.01)
 
 
-def test_what_cannot_be_done_is_said_in_one_line(place: Place, tmp_path: Path, capsys: Streams) -> None:
-    hit = place.wav("again.wav", place.blow(STRUCK))
+def test_the_true_contact_is_red_at_its_place_and_the_found_one_blue(
+    place: Place, hit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams
+) -> None:
+    figures: list[Figure] = []
+    monkeypatch.setattr("avmsf.plotting.pictures.save_picture", lambda figure, path: figures.append(figure))
+    points = place.points.double()
+    true = [f"{value:.9g}" for value in points[SECOND_PLACE].tolist()]
+    results, _ = located(place, capsys, hit, "--output", str(tmp_path), "--true-contact", *true)
+    assert results["summary"] is None
+    (impact,) = results["impacts"]
+    distance = float((points[STRUCK] - points[SECOND_PLACE]).norm())
+    relative = distance / float((points.amax(0) - points.amin(0)).norm())
+    assert impact["true_contact"] == pytest.approx(points[SECOND_PLACE].tolist(), abs=1e-6)
+    errors = {"error": distance, "rmed_posterior": relative, "rmed": relative, "in_region": False, "training": False}
+    assert {name: impact[name] for name in errors} == pytest.approx(errors, abs=1e-6)
+    (figure,) = figures
+    middle = 0.5 * (points.amax(0) + points.amin(0))
+    panels = [axes for axes in figure.axes if axes.get_title()]
+    for axes, side in zip(panels, ALL_SIDES * 2, strict=True):
+        scatter: Any = axes.collections[0]
+        colors = scatter.get_facecolors()[:, :3]
+        hue = colors / colors.max(axis=1, keepdims=True)
+        for row, mark in ((SECOND_PLACE, np.array(to_rgb(SECOND))), (STRUCK, np.array(to_rgb(FIRST)))):
+            marked = np.abs(hue - mark / mark.max()).max(axis=1) < 0.01
+            where = (points[row] - middle).numpy() @ view_from(side).T
+            # Points are sparse here: the nearest one alone has the mark's color.
+            assert np.asarray(scatter.get_offsets())[marked] == pytest.approx(where[None, :2], abs=1e-6)
+
+
+def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_not_trained_on(
+    place: Place, hit: str, tmp_path: Path, capsys: Streams
+) -> None:
+    points, names = place.points.double(), ("a/hit.wav", "b/hit.wav", "other.flac", "fitted.wav")
+    sound = soundfile.read(hit)[0]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        soundfile.write(tmp_path / name, sound, RATE)
+    # The field was fitted to a contact of the fourth; a row may have an absolute path, and the third none.
+    fitted = positional().contacts[0].double()
+    rows = ("b/hit.wav", points[SECOND_PLACE]), (tmp_path / "a" / "hit.wav", points[STRUCK]), ("fitted.wav", fitted)
+    table = tmp_path / "impacts.csv"
+    lines = [",".join([str(name), *(f"{1000 * value:.9g}" for value in where.tolist())]) for name, where in rows]
+    table.write_text("\n".join(["file,x,y,z", *lines]))
+    paths = [str(tmp_path / name) for name in names]
+    results, err = located(place, capsys, *paths, "--true-contact-table", str(table), "--unit", "mm")
+    first, second, third, fourth = results["impacts"]
+    distance = float((points[STRUCK] - points[SECOND_PLACE]).norm())
+    assert (first["error"], second["error"]) == pytest.approx((0.0, distance), abs=1e-6)
+    assert (first["in_region"], second["in_region"]) == (True, False)
+    assert [each.get("training") for each in (first, second, third, fourth)] == [False, False, None, True]
+    assert "1 training recording not counted" in err
+    relative = 0.5 * distance / float((points.amax(0) - points.amin(0)).norm())
+    wanted = {"impacts": 2, "training": 1, "median_error": 0.5 * distance, "in_region": 0.5}
+    wanted |= {"rmed": relative, "rmed_posterior": relative}
+    assert results["summary"] == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("names", "recording", "rows"),
+    [
+        (("hit.wav",), "a/hit.wav", [0]),
+        (("b/hit.wav",), "a/hit.wav", [0]),
+        (("hit.wav", "a/hit.wav"), "a/hit.wav", [1]),
+        (("hit.wav", "a/hit.wav"), "b/hit.wav", [0]),
+        (("a/hit.wav", "x/a/hit.wav", "y/a/hit.wav"), "/x/a/hit.wav", [1]),
+        (("/x/hit.wav", "/y/hit.wav"), "/y/hit.wav", [1]),
+        (("a/hit.wav", "b/hit.wav"), "c/hit.wav", [0, 1]),
+        (("other.wav", "a/hit.flac"), "a/hit.wav", []),
+    ],
+)
+def test_a_recording_has_the_row_with_most_of_its_path(names: tuple[str, ...], recording: str, rows: list[int]) -> None:
+    contacts = Contacts(torch.zeros(len(names), 3, dtype=torch.float64), names)
+    assert rows_of(contacts, Path(recording)) == rows
+
+
+TABLES: dict[str, dict[str, Any]] = {
+    "x,y,z\n0,0,0\n": {"name": "file"},
+    "tap,x_mm\n1,2\n": {"name": "file", "value": ["tap", "x_mm"]},
+    "x,y,z,file\n0,0,0\n": {"row": 2, "name": "file"},
+    "file,x,y,z\nhit.wav,120,40,0\n": {"row": 2},
+}
+WRONG: dict[str, dict[str, Any]] = {
+    "": {"name": "recordings", "value": 0},
+    "nowhere.wav": {"file": "nowhere.wav"},
+    "FOLDER": {"value": "a folder"},
+    "HIT --probability 1.5": {"name": "--probability", "value": 1.5},
+    "HIT --output FOLDER/file": {"value": "file"},
+    "HIT --settings FOLDER/nowhere": {"file": "nowhere"},
+    "HIT --force 0": {"name": "force.expected", "value": 0.0},
+    "HIT --true-contact 120 40 0": {"name": "--true-contact", "row": 0},
+    f"HIT --true-contact {math.nan} 0 0": {"name": "--true-contact", "row": 0},
+    "HIT --true-contact 0 0 0 --true-contact-table FOLDER/file": {"name": "--true-contact"},
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_what_cannot_be_done_is_refused(words: str, place: Place, hit: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    wrong = {
-        (place.field,): ("recording",),
-        (place.field, str(tmp_path / "nowhere.wav")): ("nowhere.wav", "a recording"),
-        (place.field, str(tmp_path)): (str(tmp_path), "a folder"),
-        (place.field, hit, "--probability", "1.5"): ("--probability", "1.5"),
-        (place.field, hit, "--output", str(tmp_path / "file")): (str(tmp_path / "file"), "a file"),
-        (place.field, hit, "--settings", str(tmp_path / "nowhere")): ("nowhere", "a capture.toml"),
-        (hit, hit): ("again.wav", "a sound field"),
-    }
-    for words, parts in wrong.items():
-        assert main(["locate", *words]) == 2
-        err = capsys.readouterr().err
-        assert all(part in err for part in parts), err
+    with raises(AvmsfError, **WRONG[words]):
+        run_verb("locate", place.field, *words.replace("HIT", hit).replace("FOLDER", str(tmp_path)).split())
+
+
+@pytest.mark.parametrize("text", TABLES)
+def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
+    text: str, place: Place, hit: str, tmp_path: Path
+) -> None:
+    table = tmp_path / "places.csv"
+    table.write_text(text)
+    with raises(OutputError if "hit.wav" in text else CaptureError, file=table, **TABLES[text]):
+        run_verb("locate", place.field, hit, "--true-contact-table", str(table))

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from test_cli_edit import PLACES, RATE, Echo, ceramic
+from test_cli_edit import PLACES, RATE, Echo, ceramic, interrupt_at
 
-from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.editing.stable_audio import StableAudio
@@ -65,16 +64,9 @@ def test_an_interrupted_edit_has_the_whole_curve(
         return found
 
     assert run_verb("edit", *words, "--output", str(tmp_path / "whole.safetensors")) == 0
-    shown = ProgressDisplay.step
-
-    def impatient(bar: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
-        shown(bar, stage, done, total, message)
-        if done == 3:
-            raise KeyboardInterrupt
-
     part = [*words, "--output", str(tmp_path / "part.safetensors")]
     with monkeypatch.context() as patched:
-        patched.setattr(ProgressDisplay, "step", impatient)
+        interrupt_at(patched, 3)
         assert main(["edit", *part]) == 130
     kept = tmp_path / "part.safetensors.clap.json"
     save_clap(tmp_path / "other", seed=1)
@@ -92,11 +84,3 @@ def test_an_interrupted_edit_has_the_whole_curve(
     kept.write_text(text, encoding="utf-8")
     assert run_verb("edit", *part, "--set", "guide.preview_every=3") == 0
     assert report("part.safetensors")["steps"] == [0, 3, 5]
-
-
-@pytest.mark.parametrize(("name", "given"), [("prompt", ("--like", "a.wav")), ("prompt.clap", ("--prompt", "a"))])
-def test_scores_need_a_prompt_and_previews(name: str, given: tuple[str, str], tmp_path: Path) -> None:
-    save(ceramic(), tmp_path / "plate.safetensors")
-    words = [str(tmp_path / "plate.safetensors"), "--output", str(tmp_path / "new.safetensors"), *given]
-    with raises(AvmsfError, name=name):
-        run_verb("edit", *words, *sets("prompt.clap=x guide.preview_every=0"))

@@ -1,22 +1,26 @@
 """What `--help` prints of every verb, and hints for names of earlier versions."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from avmsf.cli import RENAMED, main
+from avmsf.cli import RENAMED, VERBS, main
 from avmsf.cli.edit import Options as EditOptions
 from avmsf.cli.evaluate import Options as EvaluateOptions
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.options import Configured
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
+from avmsf.fem.material import material_named
 from avmsf.simulate.recipe import named_recipe
 from factories.raising import raises
 
 Streams = pytest.CaptureFixture[str]
+MOST_LINES = 50
+"""Of a help at 80 columns."""
 
 
 @pytest.mark.parametrize(
@@ -35,10 +39,30 @@ def test_an_error_names_a_setting(read: Callable[[list[str]], object], setting: 
         read(["--set", f"{setting}={value}"])
 
 
-@pytest.mark.parametrize("word", RENAMED)
-def test_verbs_of_earlier_versions_lead_to_those_of_today(word: str, capsys: Streams) -> None:
-    assert main([word]) == 2
-    assert RENAMED[word] in capsys.readouterr().err
+def test_names_of_earlier_versions_lead_to_those_of_today(capsys: Streams) -> None:
+    words = {word: [word] for word in RENAMED} | {"--at": ["render", "field.safetensors", "--at", "0", "0", "0"]}
+    for word, command in words.items():
+        assert main(command) == 2
+        assert RENAMED.get(word, "--position") in capsys.readouterr().err
+
+
+def test_a_similar_material_is_suggested() -> None:
+    with raises(AvmsfError, name="--to", value="wodo") as caught:
+        material_named("wodo", option="--to")
+    assert str(caught.value).endswith("wood?")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_help_fits_on_one_screen(verb: str, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit, match="0"):
+        main([verb, "--help"])
+    out = capsys.readouterr().out
+    # tyro folds the texts of options, not the paragraphs above them.
+    assert sum(max(1, -(-len(line) // 80)) for line in out.splitlines()) <= MOST_LINES
+    options = re.findall(r"^│ -[-\w]", out, re.MULTILINE)
+    assert len(options) <= 25
+    assert VERBS[verb] in " ".join(out.split())
 
 
 @pytest.mark.parametrize(
@@ -111,8 +135,3 @@ def test_values_are_numbers_words_truth_values_and_lists_of_these() -> None:
     made = FitOptions.parse(["mug", *(each for word in words for each in ("--set", word))]).all_settings
     assert (made.fit.fft_sizes, made.scene.splat.background) == ((512, 256), (1.0, 0.0, 0.5))
     assert (made.scene.lift.symmetry, made.body.wall, made.scene.views.source) == (False, 0.0, "mesh")
-
-
-def test_an_option_of_an_earlier_version_leads_to_that_of_today(capsys: Streams) -> None:
-    assert main(["render", "field.safetensors", "--at", "0", "0", "0", "-o", "s"]) == 2
-    assert "--position" in capsys.readouterr().err

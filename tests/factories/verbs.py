@@ -1,8 +1,12 @@
 """A verb of the command line, run in this process."""
 
+import json
 from importlib import import_module
+from typing import Any
 
-from avmsf.cli import options_of
+import pytest
+
+from avmsf.cli import main, options_of
 from avmsf.cli.output import display
 
 
@@ -16,3 +20,12 @@ def run_verb(*words: str) -> int:
     finally:
         display.json = False
     return code
+
+
+def results_of(streams: pytest.CaptureFixture[str], *words: object, code: int | None = 0) -> tuple[Any, str]:
+    """Run a command with --json that ends with a code, or any; return its results and what is on the standard error."""
+    streams.readouterr()
+    ended = main([*map(str, words), "--json"])
+    assert code is None or ended == code
+    out, err = streams.readouterr()
+    return json.loads(out), err

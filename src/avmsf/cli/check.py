@@ -1,6 +1,5 @@
 """`avmsf check`: what each recording of a capture is worth, what a dataset holds, and what is wrong."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,15 +17,12 @@ from avmsf.errors import CaptureError, ExtractionError
 
 if TYPE_CHECKING:
     from avmsf.capture import CaptureReport, Impacts
-    from avmsf.capture.proposals import Proposal
     from avmsf.cli.alignment import AlignmentReport
     from avmsf.modal.extraction.extract import Extraction
 
 UNREADABLE = 2
 _STRONGEST = 32
 """Modes by which recordings of inverted polarity are found."""
-MAX_PRINTED = 1000
-"""Rows, and messages below them, of the printed report: as much as a terminal's scrollback holds."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +75,7 @@ def run(options: Options) -> int:
     """Print the report; return 2 where the capture, or every object of a dataset, cannot be read."""
     from avmsf.capture.folder import check_and_read
     from avmsf.capture.issues import shared_problems
-    from avmsf.capture.proposals import propose_settings
+    from avmsf.capture.proposals import propose_settings, write_settings
     from avmsf.cli.alignment import AlignmentReport
     from avmsf.pipeline.visuals import inputs, misplaced
 
@@ -92,7 +88,8 @@ def run(options: Options) -> int:
     factor = next((each.value for each in outside if each.name == "unit"), None)
     proposals = propose_settings(options.capture, settings, factor=factor)
     if proposals and options.write_settings:
-        _write(options.capture, proposals)
+        path = write_settings(options.capture, proposals)
+        show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
         if any(each.key == "unit" for each in proposals):
             outside = [each for each in outside if each.name != "unit"]
     report, impacts = check_and_read(options.capture, settings)
@@ -105,9 +102,7 @@ def run(options: Options) -> int:
     problems += map(str, outside)
     lines = [_table(report, str(options.capture), aligned)] if report.recordings else []
     lines += [] if visual is None else [visual.sentence]
-    lines += problems[:MAX_PRINTED]
-    if len(problems) > MAX_PRINTED:
-        lines.append(f"and {len(problems) - MAX_PRINTED} more; --json prints all")
+    lines += problems
     if not options.write_settings:
         lines += [f"proposed: {each.line} (--write-settings writes it). {each.reason}" for each in proposals]
     elif not proposals:
@@ -148,18 +143,6 @@ def _modes(impacts: "Impacts") -> "Extraction | None":
         return None
 
 
-def _write(folder: Path, proposals: "Sequence[Proposal]") -> None:
-    """Write the proposals and print them; raise `CaptureError` where they cannot be written."""
-    from avmsf.capture.proposals import settings_text, write_settings
-
-    try:
-        path = write_settings(folder, proposals)
-    except CaptureError:
-        show(settings_text(proposals))
-        raise
-    show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
-
-
 def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None") -> str:
     delays, left, doubtful = dict[str, float](), list[str](), set[str]()
     if aligned is not None:
@@ -179,7 +162,7 @@ def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None
             decimals(row.double_hit_seconds, 3),
             *([decimals(None if row.file in left else delays.get(row.file), 2)] if delays else []),
         )
-        for row in report.recordings[:MAX_PRINTED]
+        for row in report.recordings
     ]
     return table(title, columns, rows, words=2)
 

@@ -12,7 +12,7 @@ import tyro
 from avmsf._utils.files import way_out
 from avmsf.cli.options import Common
 from avmsf.cli.output import say, show
-from avmsf.cli.paths import NewFolder, OutputError
+from avmsf.cli.paths import New, OutputError
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 
 BEGUN = ".begun"
@@ -38,7 +38,7 @@ class Options(Common):
     determine the thickness of the mug's wall, and tested on the other 4. With --json each command prints its object.
     """
 
-    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), NewFolder()]] = Path("demo")
+    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER"), New()]] = Path("demo")
     """Folder for all results, new, empty, or of an earlier or interrupted demo, which goes on from where it was."""
     resumes = True
 

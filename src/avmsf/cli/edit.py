@@ -9,7 +9,7 @@ import tyro
 
 from avmsf.cli.options import Configured, expect_device
 from avmsf.cli.output import doing, next_command, print_json, say, show
-from avmsf.cli.paths import FieldFile, NewFile, OutputError, PlotsFolder, arg
+from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg
 from avmsf.cli.settings import with_settings
 from avmsf.editing.config import STABLE_AUDIO, EditSettings, MaterialSettings
 from avmsf.errors import EditError
@@ -33,7 +33,7 @@ class Options(Configured):
 
     field: tyro.conf.Positional[FieldFile]
     """Field file, as `avmsf fit` writes it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), NewFile((".safetensors",))]
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), New((".safetensors",))]
     """File to write the edited field to."""
     to: _MaterialName = None
     """New material: ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
@@ -48,7 +48,7 @@ class Options(Configured):
     brightness: float = 0.0
     """Tilt of the spectrum, dB per octave."""
     mode_db: Annotated[_Pairs, arg("HZ DB")] = ()
-    """Raise the mode at this frequency of the field as it was; -inf mutes."""
+    """Raise the mode at this frequency; -inf mutes it."""
     mode_pitch: Annotated[_Pairs, arg("HZ FACTOR")] = ()
     """Factor on the frequency of the mode at this frequency."""
     mode_decay: Annotated[_Pairs, arg("HZ FACTOR")] = ()
@@ -58,11 +58,11 @@ class Options(Configured):
     model: Annotated[str, arg("FOLDER|NAME")] = STABLE_AUDIO
     """Stable Audio pipeline: a folder, or its name on the hub."""
     like: Annotated[tuple[Path, ...], arg("WAV|FOLDER ...")] = ()
-    """Recordings of another object to imitate: files or folders."""
+    """Recordings of another object to imitate."""
     like_material: _MaterialName = None
-    """Material to imitate statistically; --to follows the laws exactly."""
+    """Material to imitate statistically, not by its laws."""
     plots: PlotsFolder = None
-    """Draw modes and spectrograms and write the sounds before and after to this folder."""
+    """Draw and write the sounds before and after."""
     position: Annotated[tuple[float, float, float] | None, arg("X Y Z")] = None
     """Contact of these sounds, meters; by default the loudest."""
 
@@ -135,7 +135,7 @@ class Options(Configured):
             return
         settings.check_prompt(self.prompt)
         if prompted.generated is not None:
-            NewFile((".wav",)).check(prompted.generated)
+            New((".wav",)).check(prompted.generated)
 
 
 def run(options: Options) -> int:

@@ -45,9 +45,9 @@ class Options(Configured):
             Path, tyro.conf.arg(metavar="DATA"), Existing("a dataset, capture folders or one capture", ("a folder",))
         ]
     ]
-    """Folder of a dataset, of capture folders, or of one capture."""
+    """A dataset, a folder of captures, or one."""
     methods: _Names = ()
-    """Methods, separated by commas or blanks; by default the protocol's."""
+    """Methods, by commas or blanks; by default the protocol's."""
     objects: _Names = ()
     """Objects, likewise."""
     output: OutputFolder = None
@@ -59,23 +59,23 @@ class Options(Configured):
     counts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (16, 8, 4, 2, 1)
     """shots: numbers of training contacts."""
     starts: int = 1
-    """shots: first contacts that the choices start from."""
-    visual_source: Literal["best", "mesh"] = "best"
-    """Features by Gaussians of photographs, if any, or of the mesh."""
+    """shots: contacts that the choices start from."""
+    visual_source: Annotated[Literal["best", "mesh"], arg("best|mesh")] = "best"
+    """Features by photographs, if any (best), or of the mesh."""
     workers: int = 1
-    """Objects at a time; above 1 needs the extra `scale`."""
+    """Objects at a time; several need `scale`."""
     ray: Annotated[str | None, arg("ADDRESS")] = None
-    """Address of a ray cluster, or auto; data and results are at the same paths on its computers."""
+    """Address of a ray cluster with the same paths, or auto."""
     seed: int = 0
     """Seed of all methods."""
     device: Device = None
-    """Device for Gaussians, DINOv2 and training; by default the GPU."""
+    """For views and training; by default the GPU."""
     no_cdpam: Flag = False
-    """Leave out the metric CDPAM, which needs the extra `eval`."""
+    """Leave out CDPAM, which needs the extra `eval`."""
     cdpam_contacts: int = 8
     """Test contacts per case for CDPAM; 0 for all."""
-    time_zero: TimeZero | None = None
-    """Start of the sounds that are scored; with peak (paper) without comparison with ground truth."""
+    time_zero: Annotated[TimeZero | None, arg("onset|peak")] = None
+    """Start of the scored sounds; peak: as the paper."""
     contact_data: ContactData = None
     """ObjectFolder Real's contacts: SonicGauss's lists."""
     figures: Flag = False

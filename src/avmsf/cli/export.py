@@ -14,7 +14,7 @@ from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
 from avmsf.cli.options import Common, Flag, Int, Number, Unit, option_of
 from avmsf.cli.output import next_step, note, print_result
-from avmsf.cli.paths import ContactTable, FieldFile, NewFile, NewFolder, OtherCapture, PositionList, ShapeFile
+from avmsf.cli.paths import ContactTable, FieldFile, New, OtherCapture, PositionList, ShapeFile, arg
 from avmsf.errors import ExportError
 from avmsf.export.writing import POINTS, SUFFIXES, Axis, Format, Precision, check_free
 from avmsf.modal.config import PulseShape
@@ -68,40 +68,40 @@ class Options(Common):
     to: Format
     """Format to write."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
-    """A folder, or a file (.html, .glb, .dsp, .lib, .uff)."""
+    """Folder, or file (.html, .glb, .dsp, .lib, .uff)."""
     object: ShapeFile = None
-    """Mesh or Gaussians to show; by default the capture's or the body."""
-    object_unit: Unit = "m"
-    """Unit of the object's mesh."""
+    """Mesh or Gaussians to show; by default the capture's."""
+    object_unit: Annotated[Unit, arg("UNIT")] = "m"
+    """m (default), cm, mm, in or ft, of the object's mesh."""
     capture: OtherCapture = None
-    """Capture: its mesh is shown, and a page plays its recordings."""
+    """Its mesh is shown, and a page plays its recordings."""
     contacts: Int = None
     """Maximum number of contacts, spread over the object."""
     position: PositionList = ()
-    """faust, gltf, uff, wavs: a contact in place of these; once for each."""
+    """A contact in place of these; once for each."""
     contact_table: ContactTable = None
     """Table of such contacts: x,y,z and perhaps nx,ny,nz."""
-    unit: Unit = "m"
-    """Unit of --position and --contact-table."""
+    unit: Annotated[Unit, arg("UNIT")] = "m"
+    """Of --position and --contact-table."""
     overwrite: Flag = False
     """Replace a file, or the folder of an earlier export."""
-    forces: tuple[float, ...] = (1.0,)
-    """wavs: force of each layer, newtons if known, else relative."""
-    contact_times: Annotated[tuple[float, ...], tyro.conf.arg(metavar="SECONDS ...", help_behavior_hint="")] = ()
-    """wavs: of each layer's hammer; 0 as recorded; by default by Hertz's law."""
+    forces: Annotated[tuple[float, ...], tyro.conf.arg(metavar="F ...")] = (1.0,)
+    """wavs: force of each layer."""
+    contact_times: Annotated[tuple[float, ...], arg("SECONDS ...")] = ()
+    """wavs: of each layer; by default by Hertz's law."""
     seconds: Number = None
     """wavs: length; by default that of the training sounds."""
-    pulse: PulseShape = "half-sine"
+    pulse: Annotated[PulseShape, arg("half-sine|hertz")] = "half-sine"
     """wavs: force over the contact time."""
     up: Axis = "z"
-    """gltf: axis of the object's frame that points up."""
+    """gltf: axis that points up."""
     no_noise: Flag = False
-    """faust, wavs: write the modes without the residual noise."""
+    """faust, wavs: the modes without the residual noise."""
     functions: int = 16
-    """uff: points with frequency response functions."""
+    """uff: points with response functions."""
     variant: Annotated[str, tyro.conf.arg(metavar="NAME")] = "original"
-    """avmsf-demo: name of the sound of this object."""
-    precision: Precision = "float32"
+    """avmsf-demo: name of the sound."""
+    precision: Annotated[Precision, arg("float16|float32")] = "float32"
     """avmsf-demo: number format of the gains."""
 
     @property
@@ -121,7 +121,7 @@ class Options(Common):
             raise ExportError.expected("1 or more", self.contacts, name="--contacts")
         # A web page is a file or, by a name without its suffix, a folder.
         suffixes = SUFFIXES.get(self.to, ())
-        (NewFile(suffixes, or_folder=self.to == "web") if suffixes else NewFolder()).check(self.output)
+        (New(suffixes, or_folder=self.to == "web") if suffixes else New()).check(self.output)
         check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
 
     @classmethod

@@ -4,13 +4,13 @@ import shlex
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from avmsf._utils.text import counted, listed
+from avmsf._utils.text import listed
 from avmsf.capture.filenames import expect_views
-from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import TABLE, CaptureSettings
 from avmsf.cli.options import (
     Configured,
     Device,
@@ -24,7 +24,7 @@ from avmsf.cli.options import (
     read_settings,
 )
 from avmsf.cli.output import display, doing, next_command, next_step, print_json, print_result, show
-from avmsf.cli.paths import CacheFolder, Existing, NewFile, OutputError, PlotsFolder, SettingsFile, arg
+from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, SettingsFile, arg
 from avmsf.cli.settings import with_settings
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
@@ -34,7 +34,6 @@ from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset, TimeZe
 
 if TYPE_CHECKING:
     from avmsf.evaluation.scores import Scores
-    from avmsf.mesh.surface import Surface
     from avmsf.pipeline.stages import StageFolder
 
 _STAGES = {"field.safetensors": "fit", "points.safetensors": "features"}
@@ -67,47 +66,47 @@ class Options(Configured):
             Existing("a capture folder, or a mesh with --material", ("a folder", "a mesh or Gaussians")),
         ]
     ]
-    """Capture folder; with --material also without recordings, or a mesh."""
-    output: Annotated[Path | None, arg("FIELD.safetensors", "-o")] = None
-    """File of the field, by default only in the cache; with --until of its stage (.ply, .obj, .glb)."""
-    until: Stage | None = None
-    """Stop after a stage that needs no recordings."""
+    """Capture folder, or with --material a mesh."""
+    output: Annotated[Path | None, arg("FILE", "-o")] = None
+    """The field (.safetensors), by default in the cache; with --until .ply, .obj, .glb, .safetensors."""
+    until: Annotated[Stage | None, arg("STAGE")] = None
+    """Stop after gaussians, features or surface."""
     cache: CacheFolder = None
-    """Cache of the stages' outputs, by default CAPTURE/.avmsf."""
+    """Cache of the stages, by default CAPTURE/.avmsf."""
     settings: SettingsFile = None
     """A capture.toml in place of the folder's own."""
     plots: PlotsFolder = None
-    """With --until surface: draw it to surface.png in this folder."""
+    """Draw what is made, as `avmsf info --plots` does."""
     material: Name = None
-    """Approximate field without recordings, of ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
+    """Approximate field without recordings: of ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
     train_fraction: Number = None
-    """Fit to this fraction of the contacts, and score the others."""
+    """Fit to this part of the contacts, score the others."""
     train_count: Int = None
-    """Fit to so many contacts, as far apart as possible, and score the others."""
+    """Fit to so many, spread contacts, score the others."""
     start: int = 0
-    """Row of impacts.csv, from 0, whose contact this choice starts from."""
+    """Row of impacts.csv where this choice starts."""
     features: Annotated[
         Path | None,
-        arg("FEATURES.safetensors"),
+        arg("FILE"),
         Existing("features, as avmsf fit --until features writes them", ("features",)),
     ] = None
-    """Features by --until features, by default those of the folder's views where the gain model reads any."""
+    """Features, in place of those of the folder's views."""
     without_shape: Flag = False
     """Fit to the positions of the contacts alone."""
-    gain_model: Annotated[GainModelName | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """By default auto, a Gaussian process over all families. network: the paper's."""
-    extraction: Annotated[ExtractionMethod | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """How modes are extracted, see `avmsf modes --help`."""
+    gain_model: Annotated[GainModelName | None, arg("NAME")] = None
+    """auto (default), network (paper), smooth, thin-plate, symmetry, visual or elastic."""
+    extraction: Annotated[ExtractionMethod | None, arg("NAME")] = None
+    """high-resolution (default) or short-time (paper)."""
     modes: Int = None
     """Modes at most, by default 128."""
-    time_zero: Annotated[TimeZero | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Start of the sounds; by default that of capture.toml."""
+    time_zero: Annotated[TimeZero | None, arg("onset|peak")] = None
+    """Start of the sounds, by default of capture.toml."""
     device: Device = None
-    """Device for Gaussians, DINOv2 and training, by default the GPU."""
+    """For views and training, by default the GPU."""
     seed: Int = None
     """Random seed of all stages, by default 0."""
-    preset: Preset = "default"
-    """All settings; paper: everything as published, which takes hours."""
+    preset: Annotated[Preset, arg("default|paper")] = "default"
+    """paper: all settings as published; takes hours."""
 
     usual = PRESETS["default"]
 
@@ -132,9 +131,7 @@ class Options(Configured):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if self.output is not None:
-            NewFile(_SUFFIXES[self.until]).check(self.output)
-        if self.plots is not None and self.until != "surface":
-            raise OutputError.expected("--until surface with it", self.until, name="--plots")
+            New(_SUFFIXES[self.until]).check(self.output)
         config = self.all_settings
         expect_device(config.device, raising=FitError)
         settings = read_settings(self.capture, self.settings)
@@ -200,6 +197,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     from avmsf._utils.files import copy_whole
     from avmsf.capture import read_capture
     from avmsf.cli.alignment import AlignmentReport
+    from avmsf.cli.info import draw_field
     from avmsf.cli.report import compare, features_lines, field_lines, parts_words, score_table
     from avmsf.evaluation.splits import split
     from avmsf.features.store import load_features, read_report
@@ -240,6 +238,8 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     lines += field_lines(fitted, path, settings=display.verbose)
     lines += [f"wrote {path}", *([] if made.surface is None else [f"the object's surface is {made.surface}"])]
     show("\n".join(lines))
+    if options.plots is not None:
+        draw_field(fitted, options.plots, recorded=None if test is None else made.modes.aligned(test))
     print_json(
         {
             "field": str(path),
@@ -272,6 +272,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
 def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
     """Compute a field without recordings, and print a summary."""
     from avmsf._utils.files import copy_whole
+    from avmsf.cli.info import draw_field
     from avmsf.cli.report import quality_words
     from avmsf.field.store import load
     from avmsf.pipeline.fit import guess_in_stages
@@ -285,6 +286,8 @@ def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
     values = {"field": str(path), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
     values |= {"sample_rate": guessed.sample_rate, "trained_on": [], "report": guessed.origin.report}
     print_result("\n".join([*quality_words(guessed, path), f"wrote {path}"]), values)
+    if options.plots is not None:
+        draw_field(guessed, options.plots)
     next_command("avmsf render", path, _RENDER)
 
 
@@ -292,70 +295,39 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
     """Make Gaussians, features or a surface of the folder's views, and print what they are."""
     from avmsf._utils.files import copy_whole, write_whole
     from avmsf.capture.checks import check_one_unit, find_surface
-    from avmsf.cli.report import features_lines
-    from avmsf.features.store import read_report
-    from avmsf.gaussians.ply import read_splats
+    from avmsf.capture.proposals import contacts_of
+    from avmsf.capture.table import in_folder, read_rows
+    from avmsf.cli.info import describe_shape
     from avmsf.mesh.surface import read_surface, write_surface
     from avmsf.pipeline.scene import SceneStages
     from avmsf.pipeline.shape import keep_surface, object_shape
 
-    check_one_unit(options.capture, settings)
-    stages, config = options.stages, options.all_settings.scene
+    folder, stages, words = options.capture, options.stages, "-o field.safetensors"
+    check_one_unit(folder, settings)
     scene = SceneStages(
-        options.capture, stages, config, settings=settings, listener=display.listener, device=options.device
+        folder, stages, options.all_settings.scene, settings=settings, listener=display.listener, device=options.device
     )
     scene.expect_any()
-    values: dict[str, Any]
-    following, words = "avmsf fit", "-o field.safetensors"
+    contacts = None
+    if options.plots is not None and (folder / TABLE).is_file():
+        with in_folder(folder):
+            contacts = contacts_of(read_rows(folder)[0], settings)
     with stages.lock("avmsf fit"):
         match options.until:
             case "gaussians":
-                made, key, values = scene.cloud, "cloud", {"gaussians": len(read_splats(scene.cloud.path))}
-                lines, following, words = [counted(values["gaussians"], "Gaussian")], "avmsf info", "--plots plots"
+                made = scene.cloud
             case "features":
-                made, key, values = scene.features, "features", read_report(scene.features.path)
-                lines = features_lines(values)
+                made = scene.features
                 model = "--preset paper" if options.preset == "paper" else "--gain-model visual"
                 words = f"--features {shlex.quote(str(options.output or made.path))} {model} {words}"
             case _:
-                made = keep_surface(scene, *object_shape(find_surface(options.capture, settings), scene))
-                surface = read_surface(made.path)
-                key, values, lines = "surface", {"triangles": len(surface.faces)}, [surface_words(surface)]
-                if options.plots is not None:
-                    _draw(surface, options.capture, settings, options.plots / "surface.png")
-                    lines.append(f"wrote {options.plots / 'surface.png'}")
+                made = keep_surface(scene, *object_shape(find_surface(folder, settings), scene))
         path = options.output or made.path
         kind = _MESH_KINDS.get(path.suffix.lower())
         if kind is not None:
             write_whole(path, partial(write_surface, read_surface(made.path), kind=kind), raising=OutputError)
         elif options.output is not None:
             copy_whole(made.path, options.output)
-    print_result("\n".join([*lines, f"wrote {path}"]), {key: str(path), **values})
-    next_command(following, path if following == "avmsf info" else options.capture, words)
-
-
-def _draw(surface: "Surface", folder: Path, settings: CaptureSettings, picture: Path) -> None:
-    """Draw a surface with the contacts of the folder's table. Raises CaptureError for a bad table."""
-    import torch
-
-    from avmsf.capture.settings import TABLE
-    from avmsf.capture.table import in_folder, parse_row, read_rows
-    from avmsf.plotting.pictures import save_picture
-    from avmsf.plotting.surfaces import draw_surface
-
-    contacts = None
-    if (folder / TABLE).is_file():
-        with in_folder(folder):
-            rows = [parse_row(row, settings).contact for row in read_rows(folder)[0]]
-        contacts = torch.tensor(rows, dtype=torch.float64)
-    save_picture(draw_surface(surface, title=f"{folder.resolve().name}: surface", contacts=contacts), picture)
-
-
-def surface_words(surface: "Surface") -> str:
-    """Return a message on a surface's size, and on whether it is closed."""
-    import trimesh
-
-    mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
-    extent = " x ".join(f"{1000 * side:.3g}" for side in mesh.extents)
-    words = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2"
-    return f"{words}, {f'closed, volume {1e6 * mesh.volume:.3g} cm3' if mesh.is_watertight else 'not closed'}"
+        values = describe_shape(path, options.plots, contacts=contacts)
+    print_result(f"wrote {path}", values)
+    next_command("avmsf fit", folder, words)

@@ -1,4 +1,4 @@
-"""`avmsf info`: what a field, Gaussians or features hold, as text and pictures."""
+"""`avmsf info`: what a field, Gaussians, features or a surface hold, as text and pictures."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,17 +8,15 @@ import tyro
 
 from avmsf._utils.text import counted
 from avmsf.cli.options import Common, Flag, expect_capture, read_settings
-from avmsf.cli.output import doing, next_command, print_json, print_result, say, show
-from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, arg, kind_of
-from avmsf.errors import SceneError
-from avmsf.gaussians.ply_header import read_header
+from avmsf.cli.output import doing, next_command, print_json, say, show
+from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+    from matplotlib.figure import Figure
     from torch import Tensor
 
     from avmsf.capture import Impacts
-    from avmsf.features.feature_field import FeatureField
     from avmsf.field.sound_field import SoundField
 
 _DRAWN_POINTS, _LISTED_POINTS = 4000, 500
@@ -27,20 +25,21 @@ _DRAWN_CONTACTS = 4
 _BATCH = 1024
 """Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+Axis = Literal["x", "y", "z"]
 
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Describe a field, Gaussians or features, and draw them with --plots."""
+    """Describe a field, Gaussians, features or a mesh, and draw them with --plots."""
 
     file: tyro.conf.Positional[
         Annotated[
             Path,
             tyro.conf.arg(metavar="FILE"),
-            Existing("a field, Gaussians or features", ("a sound field", "features", "a mesh or Gaussians")),
+            Existing("a field, Gaussians, features or a mesh", ("a sound field", "features", "a mesh or Gaussians")),
         ]
     ]
-    """A field (.safetensors), Gaussians (.ply) or features (.safetensors), as `avmsf fit` writes them."""
+    """A field (.safetensors), Gaussians (.ply), features (.safetensors) or a mesh, as `avmsf fit` writes them."""
     all: Flag = False
     """Field: list all modes, not only those of most energy."""
     capture: OtherCapture = None
@@ -50,45 +49,36 @@ class Options(Common):
     plots: PlotsFolder = None
     """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
     posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
-    cloud.png. Features: features.png."""
-    cloud: Annotated[Path | None, arg("CLOUD.ply"), Existing("Gaussians, as a .ply file", ("a mesh or Gaussians",))] = (
-        None
-    )
-    """Features: also draw the colors of the Gaussians that the features lie on."""
-    up: Literal["x", "y", "z"] = "z"
+    cloud.png. Features: features.png. Mesh: surface.png."""
+    up: Axis = "z"
     """Gaussians and features: axis that points up."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        for cloud in (self.file if self.file.suffix.lower() == ".ply" else None, self.cloud):
-            if cloud is not None:
-                read_header(cloud)
         if self.capture is not None:
             expect_capture(self.capture, read_settings(self.capture, self.settings))
 
 
 def run(options: Options) -> int:
     """Describe and draw a file, whose kind its content shows."""
-    if options.file.suffix.lower() == ".ply":
-        _describe_gaussians(options)
-    elif kind_of(options.file) == "features":
-        _describe_features(options)
-    else:
+    if kind_of(options.file) == "a sound field":
         _describe_field(options)
+        return 0
+    print_json(describe_shape(options.file, options.plots, up=options.up))
+    if options.plots is None:
+        next_command("avmsf info", options.file, "--plots plots")
     return 0
 
 
 def _describe_field(options: Options) -> None:
     from avmsf.capture import read_capture
-    from avmsf.cli.report import describe, field_lines, levels, mode_rows, mode_table, score_table
+    from avmsf.cli.report import describe, field_lines, mode_rows, mode_table, score_table
     from avmsf.evaluation.scores import evaluate
     from avmsf.field.store import load
 
     field = load(options.file)
-    points = field.gain_field.points
-    level = levels(gains_at(field, points[:: max(1, len(points) // _LISTED_POINTS)]))
-    rows, supporting = mode_rows(field.bank, level, field.is_mode)
+    rows, supporting = mode_rows(field.bank, mode_levels(field), field.is_mode)
     values = {**describe(field), "modes": rows, "supporting_poles": supporting}
     of = ", levels on average over the object"
     lines = [*field_lines(field, options.file), mode_table(of, rows, len(supporting), every=options.all)]
@@ -105,7 +95,7 @@ def _describe_field(options: Options) -> None:
         values |= {"compared_with": {**recordings, "scores": {"field": scores.mean()}}}
     show("\n".join(lines))
     if options.plots is not None:
-        _draw_field(field, options.plots, level=level, recorded=compared)
+        draw_field(field, options.plots, recorded=compared)
     print_json(values)
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
 
@@ -117,10 +107,16 @@ def gains_at(field: "SoundField", points: "Float[Tensor, 'points 3']") -> "Float
     return torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])
 
 
-def _draw_field(
-    field: "SoundField", folder: Path, *, level: "Float[Tensor, ' modes']", recorded: "Impacts | None"
-) -> None:
-    """Write the figures of a field, with some of the recordings `recorded` next to its sounds."""
+def mode_levels(field: "SoundField") -> "Float[Tensor, ' modes']":
+    """Return each mode's root mean square gain over the object against the strongest pole's, dB."""
+    from avmsf.cli.report import levels
+
+    points = field.gain_field.points
+    return levels(gains_at(field, points[:: max(1, len(points) // _LISTED_POINTS)]))
+
+
+def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:
+    """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
     from avmsf.field.posterior import has_posterior, relative_gain_std, spectrum_band
     from avmsf.gaussians.points import farthest_points
     from avmsf.pipeline.record import modes_words
@@ -135,7 +131,7 @@ def _draw_field(
     points = points[:: max(1, len(points) // _DRAWN_POINTS)]
     gains, title = gains_at(field, points)[:, kept], f"gains of the modes of most energy of {name}"
     pictures = {
-        "modes": draw_modes(field.bank, level, is_mode=kept, title=f"{modes} of {name}"),
+        "modes": draw_modes(field.bank, mode_levels(field), is_mode=kept, title=f"{modes} of {name}"),
         "gains": draw_gains(points, gains, field.bank.take(kept), title=title),
     }
     if recorded is not None:
@@ -169,74 +165,73 @@ def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
     return impacts.take(rows), "not training recordings" if len(rows) < len(impacts) else "none a training recording"
 
 
-def _describe_gaussians(options: Options) -> None:
+def describe_shape(
+    path: Path, plots: Path | None, *, up: Axis = "z", contacts: "Float[Tensor, 'contacts 3'] | None" = None
+) -> dict[str, Any]:
+    """Print what Gaussians, features or a surface hold, draw them in the folder `plots`, and return plain values."""
+    from avmsf.gaussians.ply import holds_gaussians
+    from avmsf.plotting.pictures import save_picture
+
+    drawn = plots is not None
+    if kind_of(path) == "features":
+        text, values, picture = _features(path, drawn, up)
+    elif holds_gaussians(path):
+        text, values, picture = _gaussians(path, drawn, up)
+    else:
+        text, values, picture = _surface(path, drawn, contacts)
+    show(text)
+    if plots is not None and picture is not None:
+        stem = "cloud" if values["kind"] == "gaussians" else values["kind"]
+        save_picture(picture, plots / f"{stem}.png")
+        say(f"wrote {plots / stem}.png")
+    return {"file": str(path), **values}
+
+
+def _gaussians(path: Path, drawn: bool, up: Axis) -> "tuple[str, dict[str, Any], Figure | None]":
     from avmsf.gaussians.ply import read_splats
     from avmsf.plotting.clouds import draw_cloud
 
-    cloud = read_splats(options.file)
+    cloud = read_splats(path)
     extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
-    count = counted(len(cloud), "Gaussian")
-    text = f"{options.file}: {count}, {' x '.join(f'{side:.3g}' for side in extent)} m"
-    values = {"kind": "gaussians", "file": str(options.file), "count": len(cloud), "extent_meters": extent}
-    print_result(text, values)
-    if _draws(options):
-        title = f"{options.file.name}: {count}"
-        _save(draw_cloud(cloud.centers, {"color": cloud.colors}, title=title, up=_UP[options.up]), "cloud", options)
+    title = f"{path.name}: {counted(len(cloud), 'Gaussian')}"
+    picture = draw_cloud(cloud.centers, {"color": cloud.colors}, title=title, up=_UP[up]) if drawn else None
+    values = {"kind": "gaussians", "count": len(cloud), "extent_meters": extent}
+    return f"{title}, {' x '.join(f'{side:.3g}' for side in extent)} m", values, picture
 
 
-def _describe_features(options: Options) -> None:
+def _features(path: Path, drawn: bool, up: Axis) -> "tuple[str, dict[str, Any], Figure | None]":
     from avmsf.cli.report import features_lines
     from avmsf.features.feature_field import GEOMETRY
     from avmsf.features.store import load_features, read_report
     from avmsf.plotting.clouds import component_colors, draw_cloud
     from avmsf.symmetry.symmetries import Symmetries
 
-    features, report = load_features(options.file), read_report(options.file)
+    features, report = load_features(path), read_report(path)
     count, dim = features.features.shape
-    text = f"{options.file}: {dim} features of {features.encoder} on {count} points"
-    values = {"kind": "features", "file": str(options.file), "encoder": features.encoder, "points": count, "dim": dim}
-    print_result(
-        "\n".join([text, *(features_lines(report) if "encoder" in report else [])]), {**values, "report": report}
-    )
-    if not _draws(options):
-        return
-    symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
-    rows = {} if options.cloud is None else {"color": _colors_of(options.cloud, features)}
-    # The positions would outweigh the other features.
-    positions = 3 if features.encoder.startswith(f"{GEOMETRY} and ") else 0
-    rows["features"] = component_colors(features.features[:, positions:])
-    title = f"{options.file.name}: {features.encoder} on {count} points"
-    _save(
-        draw_cloud(features.points, rows, title=title, symmetries=symmetries, up=_UP[options.up]), "features", options
-    )
+    lines = [f"{path.name}: {dim} features of {features.encoder} on {count} points"]
+    values = {"kind": "features", "encoder": features.encoder, "points": count, "dim": dim, "report": report}
+    picture = None
+    if drawn:
+        symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
+        # The positions would outweigh the other features.
+        positions = 3 if features.encoder.startswith(f"{GEOMETRY} and ") else 0
+        rows = {"features": component_colors(features.features[:, positions:])}
+        picture = draw_cloud(features.points, rows, title=lines[0], symmetries=symmetries, up=_UP[up])
+    return "\n".join([*lines, *(features_lines(report) if "encoder" in report else [])]), values, picture
 
 
-def _draws(options: Options) -> bool:
-    """Return whether pictures are asked for; where not, print how to get them."""
-    if options.plots is None:
-        next_command("avmsf info", options.file, "--plots plots")
-    return options.plots is not None
+def _surface(
+    path: Path, drawn: bool, contacts: "Float[Tensor, 'contacts 3'] | None"
+) -> "tuple[str, dict[str, Any], Figure | None]":
+    import trimesh
 
+    from avmsf.mesh.surface import read_surface
+    from avmsf.plotting.surfaces import draw_surface
 
-def _save(picture: Any, stem: str, options: Options) -> None:
-    from avmsf.plotting.pictures import save_picture
-
-    assert options.plots is not None
-    save_picture(picture, options.plots / f"{stem}.png")
-    say(f"wrote {options.plots / stem}.png")
-
-
-def _colors_of(path: Path, features: "FeatureField") -> "Float[Tensor, 'points 3']":
-    """Return the colors of the Gaussians that the features lie on."""
-    import torch
-    from scipy.spatial import cKDTree
-
-    from avmsf.gaussians.ply import read_splats
-
-    cloud = read_splats(path)
-    apart, rows = cKDTree(cloud.centers.numpy()).query(features.points.numpy())
-    if apart.any():
-        wanted, got = f"the {len(features.points)} Gaussians of the features", f"{len(cloud)} others"
-        advice = "name the file that the features were computed on"
-        raise SceneError.expected(wanted, len(cloud), got=got, file=path, name="--cloud", advice=advice)
-    return cloud.take(torch.from_numpy(rows)).colors
+    surface = read_surface(path)
+    mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
+    extent = " x ".join(f"{1000 * side:.3g}" for side in surface.vertices.amax(0) - surface.vertices.amin(0))
+    closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
+    text = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2, {closed}"
+    picture = draw_surface(surface, title=f"{path.name}: surface", contacts=contacts) if drawn else None
+    return f"{path.name}: {text}", {"kind": "surface", "triangles": len(surface.faces)}, picture

@@ -11,14 +11,13 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
-from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.issues import Issues
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.settings import settings_of as capture_settings_of
 from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.cli.paths import InputError, arg, path_mark
 from avmsf.cli.settings import Assignments, SettingsTable, as_toml, settings_of
-from avmsf.errors import AvmsfError, CaptureError
+from avmsf.errors import AvmsfError
 
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
 """An option that is off unless it is given."""
@@ -32,8 +31,6 @@ _RENAMED = {"--at": "--position", "--picture": "--plots", "--to-material": "--to
 """Options of earlier versions, and what they are called now."""
 DEVICES = ("cpu", "cuda")
 """Kinds of devices that commands compute on."""
-_PLY_HEADER_BYTES = 1 << 16
-"""Bytes in which the header of a .ply ends: a hundred times those of a mesh with colors and normals."""
 _BORDERS = re.compile(r"[─│╭╮╰╯|+]|-{3,}")
 """What tyro draws around a message."""
 _MORE = re.compile(r"Argument helptext:|For full helptext|Got errors:")
@@ -53,7 +50,7 @@ class Common:
     verbose: Flag = False
     """Print each step of the work as it begins."""
     json: Flag = False
-    """Print the results as one JSON object to standard output."""
+    """Print the results as one JSON object."""
     resumes: ClassVar[bool] = False
     """Whether an interrupted command goes on from where it was when it is repeated."""
 
@@ -91,8 +88,8 @@ def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | N
         found = _MORE.split(box.getvalue().strip().partition("\n")[2])[0]
         commas = any(re.fullmatch(r"-?[\d.]+(,-?[\d.]+)+", word) for word in words)
         advice = "separate numbers by blanks" if commas else f"`avmsf {verb} --help` lists the options"
-        got = " ".join(_BORDERS.sub(" ", found).split()).rstrip(".")
-        raise InputError.expected("options of this command", got=got, name=verb, advice=advice) from None
+        words_of_tyro = " ".join(_BORDERS.sub(" ", found).split()).rstrip(".")
+        raise InputError(f"{words_of_tyro}; {advice}", name=verb) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,11 +97,11 @@ class Configured(Common, ABC):
     """Options of the verbs that have more settings than options."""
 
     set: Assignments = ()
-    """Change a setting, such as splat.steps=500; once for each."""
+    """Change a setting, such as splat.steps=500; repeatable."""
     config: SettingsTable = None
-    """Take settings from this file; other options come after it."""
+    """Take settings from a file; options come after it."""
     print_config: Flag = False
-    """Print all settings as a file for --config, and do nothing else."""
+    """Print all settings as such a file, and stop."""
     usual: ClassVar[object]
     """The settings where nothing changes them."""
     resumes: ClassVar[bool] = True
@@ -160,18 +157,5 @@ def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
 
 
 def expect_capture(folder: Path, settings: CaptureSettings) -> int:
-    """Return the number of impacts of a capture folder's table.
-
-    Raises `CaptureError` where the table cannot be used, and where the surface is a .ply without such a header.
-    """
-    impacts = present_impacts(folder, read_impacts(folder, settings, Issues()), Issues())
-    surface = find_surface_file(folder, settings)
-    if surface is not None and surface.suffix.lower() == ".ply" and surface.is_file():
-        with surface.open("rb") as file:
-            start = file.read(_PLY_HEADER_BYTES)
-        if not start.startswith(b"ply") or b"end_header" not in start:
-            raise CaptureError.expected(
-                "a mesh or point cloud", start[:8], got="a file without the header of a .ply", file=surface,
-                advice="export it again",
-            )  # fmt: skip
-    return len(impacts)
+    """Return the number of impacts of a capture folder's table. Raises `CaptureError` where it cannot be used."""
+    return len(present_impacts(folder, read_impacts(folder, settings, Issues()), Issues()))

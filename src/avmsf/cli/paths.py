@@ -69,37 +69,27 @@ class Existing:
 
 
 @dataclass(frozen=True)
-class NewFile:
-    """Marks the path of a file to write."""
+class New:
+    """Marks the path of a file or a folder to write."""
 
-    suffixes: tuple[str, ...]
-    """Endings of its format, in lower case."""
+    suffixes: tuple[str, ...] = ()
+    """Endings of a file's format, in lower case; none for a folder."""
     or_folder: bool = False
-    """Whether the path of a folder may be given instead."""
+    """Whether the path of a folder may be given instead of a file."""
 
     def check(self, path: Path) -> None:
-        """Raise `OutputError` for a path where no file can be written, and for the ending of another format."""
-        suffix = path.suffix.lower()
-        if self.or_folder and (is_folder(path) or suffix not in _FILE_SUFFIXES):
+        """Raise `OutputError` for a path where nothing can be written, and for the ending of another format."""
+        suffix, folder = path.suffix.lower(), is_folder(path)
+        if (self.or_folder or not self.suffixes) and (folder or suffix not in _FILE_SUFFIXES):
+            expect_writable(path / "file")
             return
-        expect_writable(path)
+        if self.suffixes:
+            expect_writable(path)
         if suffix not in self.suffixes:
-            wanted = f"a name that ends in {' or '.join(self.suffixes)}{self.or_folder * ', or a folder'}"
-            got = path.suffix or "no ending"
-            raise OutputError.expected(wanted, path.suffix, got=got, file=path, name="suffix", advice="rename it")
-
-
-@dataclass(frozen=True)
-class NewFolder:
-    """Marks the path of a folder to write to."""
-
-    def check(self, path: Path) -> None:
-        """Raise `OutputError` for a path where no folder can be made, and for a name with the ending of a file."""
-        if not is_folder(path) and path.suffix.lower() in _FILE_SUFFIXES:
-            got, advice = f"one with {path.suffix}", f"use {path.with_suffix('')}"
-            wanted = "the name of a folder"
+            ending = f"a name that ends in {' or '.join(self.suffixes)}" if self.suffixes else ""
+            wanted = ", or ".join(filter(None, [ending, "the name of a folder" * (self.or_folder or not ending)]))
+            got, advice = path.suffix or "no ending", "rename it"
             raise OutputError.expected(wanted, path.suffix, got=got, file=path, name="suffix", advice=advice)
-        expect_writable(path / "file")
 
 
 def arg(metavar: str, *aliases: str, name: str | None = None) -> Any:
@@ -119,9 +109,9 @@ OtherCapture = Annotated[Path | None, arg("CAPTURE"), Existing("a capture folder
 ShapeFile = Annotated[Path | None, arg("MESH|PLY"), Existing("a mesh or Gaussians", ("a mesh or Gaussians",))]
 SettingsFile = Annotated[Path | None, arg("FILE.toml"), Existing("a capture.toml")]
 ContactData = Annotated[Path | None, arg("FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))]
-OutputFolder = Annotated[Path | None, arg("FOLDER", "-o"), NewFolder()]
-PlotsFolder = Annotated[Path | None, arg("FOLDER"), NewFolder()]
-CacheFolder = Annotated[Path | None, arg("FOLDER"), NewFolder()]
+OutputFolder = Annotated[Path | None, arg("FOLDER", "-o"), New()]
+PlotsFolder = Annotated[Path | None, arg("FOLDER"), New()]
+CacheFolder = Annotated[Path | None, arg("FOLDER"), New()]
 ContactTable = Annotated[Path | None, arg("TABLE.csv"), Existing("a table of contacts")]
 PositionList = Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], arg("X Y Z")]
 """Vectors, one for each time that the option is given."""
@@ -151,10 +141,10 @@ def is_folder(path: Path) -> bool:
         raise unwritable(path, error, raising=OutputError) from error
 
 
-def path_mark(hint: Any) -> Existing | NewFile | NewFolder | None:
+def path_mark(hint: Any) -> Existing | New | None:
     """Return what a type's paths have to be; None where it has no such mark."""
     for each in getattr(hint, "__metadata__", ()):
-        if isinstance(each, Existing | NewFile | NewFolder):
+        if isinstance(each, Existing | New):
             return each
     return next((found for each in get_args(hint) if (found := path_mark(each)) is not None), None)
 

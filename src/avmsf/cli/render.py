@@ -10,7 +10,7 @@ import tyro
 
 from avmsf.cli.options import Common, Flag, Number, Unit
 from avmsf.cli.output import doing, next_command, note, print_result
-from avmsf.cli.paths import ContactTable, FieldFile, NewFile, OutputError, PositionList, expect_writable
+from avmsf.cli.paths import ContactTable, FieldFile, New, OutputError, PositionList, expect_writable
 from avmsf.errors import PositionWarning
 from avmsf.modal.config import PulseShape
 from avmsf.simulate.recipe import MAX_CONTACT_SECONDS
@@ -30,9 +30,7 @@ class Options(Common):
 
     field: tyro.conf.Positional[FieldFile]
     """Field file, as `avmsf fit` writes it."""
-    output: Annotated[
-        Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER|FILE.wav"), NewFile((".wav",), or_folder=True)
-    ]
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER|FILE.wav"), New((".wav",), or_folder=True)]
     """Folder for the sounds; for one contact also a wav file."""
     position: PositionList = ()
     """A contact in the object's frame; once for each."""

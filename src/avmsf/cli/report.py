@@ -18,7 +18,6 @@ from avmsf.cli.output import decimals, display, table
 from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.task import Renderer
-from avmsf.field.config import NETWORK
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import SoundField
@@ -77,7 +76,10 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
             ("noise", f"{values['residual_rms']:.2g} (root mean square of the residual)"),
             ("object", f"{values['points']} points, {extent} m"),
         ]
-        rows += _settings_rows(values["pipeline"]) if "guess" not in report else []
+        made = values["pipeline"]
+        if "extraction" in made and "guess" not in report:
+            rows.append(("extraction", f"{made['extraction']}, {made['modes']} modes at most"))
+            rows.append(("gain model", f"{made['gain_model']}, {counted(made['fit']['steps'], 'step')} end to end"))
     if field.body is not None:
         rows.append(("body", f"{field.body} (the most probable one{_gained(report)})"))
         rows += [("warning", field.body.warning)] if field.body.warning else []
@@ -108,22 +110,6 @@ def _gains_words(gains: dict[str, Any]) -> str:
         return "computed without recordings: mode shapes of a body, each times its level"
     families = ", ".join(dict.fromkeys(gains["families"]))
     return f"Gaussian process over {families} kernels, by {counted(gains['contacts'], 'contact')}"
-
-
-def _settings_rows(pipeline: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return lines on the stages that made the field, if its file names them."""
-    fit, scene, rows = pipeline["fit"], pipeline.get("scene"), []
-    if "extraction" in pipeline:
-        rows.append(("extraction", f"{pipeline['extraction']}, {pipeline['modes']} modes at most"))
-        rows.append(("gain model", pipeline["gain_model"]))
-    if scene is not None:
-        lift, count = scene["lift"], scene["views"]["count"]
-        of = f"{lift['weighting']} mean over {count or 'all'} views, {lift['components'] or 'all'} components"
-        rows.append(("features", f"{pipeline['encoder']}, {of}, onto {lift['onto']}"))
-    learned = f"{fit['clusters']} clusters, {fit['warmup_steps']} steps of warm-up, "
-    network = learned if pipeline.get("gain_model") == NETWORK else ""
-    rows.append(("fit", f"{network}{counted(fit['steps'], 'step')} end to end, seed {fit['seed']}"))
-    return rows
 
 
 def _edit_words(edit: dict[str, Any]) -> str:

@@ -50,7 +50,7 @@ class Options(Configured):
     sample_rate: Int = None
     """Sample rate, Hz; by default 48000."""
     thickness: Number = None
-    """Wall, meters; by default random for a shape, solid for a mesh."""
+    """Wall, meters; by default random, of a mesh solid."""
     size: Number = None
     """Longest side of the bounding box, meters."""
     views: Int = None
