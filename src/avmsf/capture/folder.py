@@ -45,6 +45,15 @@ class Capture:
         surface = "no surface" if self.surface is None else repr(self.surface)
         return f"Capture({self.name!r}, {self.impacts}, {surface})"
 
+    def __len__(self) -> int:
+        """Return the number of impacts."""
+        return len(self.impacts)
+
+    @property
+    def sample_rate(self) -> float:
+        """Samples per second of the recordings, Hz."""
+        return self.impacts.sample_rate
+
     def write(self, folder: str | Path) -> None:
         """Write a folder that is read back to the same values, see `write_capture`."""
         write_capture(self, folder)
