@@ -1,12 +1,15 @@
 """Baselines that are scored next to a field."""
 
+import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from avmsf.cli.report import compare
-from avmsf.evaluation.scores import evaluate
+from avmsf.errors import EvaluationError
+from avmsf.evaluation.scores import Scores, evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
@@ -14,6 +17,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.modal.extraction.extract import extract_modes
+from factories.raising import raises
 from oracles.plate import Plate, sample_contacts, strike
 
 
@@ -40,3 +44,15 @@ def test_neighbors_by_direction_are_scored_where_directions_are_known(directed: 
         alike = evaluate(MeanWaveform(alike_train), alike_test).mean()
         assert by_direction.mean() == pytest.approx(alike, rel=1e-5)
         assert scores["mean waveform of 3 nearest"].mean() != pytest.approx(alike, rel=0.1)
+
+
+def test_scores_are_a_data_frame_where_pandas_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = Scores(("a.wav", "b.wav"), {"l1": torch.tensor([1.0, 2.0]), "envelope": torch.tensor([3.0, 4.0])})
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with raises(EvaluationError, name="pandas"):
+        scores.to_frame()
+    stand_in = SimpleNamespace(DataFrame=lambda columns, index: (columns, index))
+    monkeypatch.setitem(sys.modules, "pandas", stand_in)
+    columns, index = scores.to_frame()
+    assert index == ["a.wav", "b.wav"]
+    assert {name: each.tolist() for name, each in columns.items()} == {"l1": [1.0, 2.0], "envelope": [3.0, 4.0]}

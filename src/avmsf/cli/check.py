@@ -17,7 +17,7 @@ from avmsf.errors import CaptureError, ExtractionError
 
 if TYPE_CHECKING:
     from avmsf.capture import CaptureReport, Impacts
-    from avmsf.cli.alignment import AlignmentReport
+    from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.modal.extraction.extract import Extraction
 
 UNREADABLE = 2
@@ -76,7 +76,7 @@ def run(options: Options) -> int:
     from avmsf.capture.folder import check_and_read
     from avmsf.capture.issues import shared_problems
     from avmsf.capture.proposals import propose_settings, write_settings
-    from avmsf.cli.alignment import AlignmentReport
+    from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.pipeline.visuals import inputs, misplaced
 
     if options.is_dataset:

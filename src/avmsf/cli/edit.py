@@ -98,44 +98,42 @@ class Options(Configured):
     def check_inputs(self) -> None:
         """Raise the package's errors for an edit that cannot be done or written, before anything is loaded."""
         super().check_inputs()
-        settings = self.all_settings
-        self._check_guide(settings)
+        settings, usual, guides = self.all_settings, self.usual, self.guides
+        if len(guides) > 1:
+            wanted, advice = "one of --prompt, --like and --like-material", "use one after the other"
+            raise EditError.expected(wanted, tuple(guides), name=guides[0], advice=advice)
         for option, name in (("--to", self.to), ("--from", self.old), ("--like-material", self.like_material)):
             if name is not None:
                 material_named(name, option=option)
-        wanted = "--to, --scale or a constant of a material with it"
-        if settings.material.law != MaterialSettings.law and not self.changes_material:
-            raise EditError.expected(wanted, name="material.law")
-        if self.old is not None and not (self.changes_material or self.like_material):
-            raise EditError.expected(f"{wanted}, or --like-material", name="--from")
-        if self.position is not None and self.plots is None:
-            raise EditError.expected("--plots with it", name="--position")
-        if not (self.changes_material or self.changes_modes or self.guides):
-            wanted = "an edit: --to, --scale, --pitch, --decay, --brightness, --mode-db, --mode-pitch, --mode-decay"
-            raise EditError.expected(
-                f"{wanted}, --prompt, --like, --like-material or --set material.young=PASCALS", name="options"
-            )
+        law = settings.material.law != MaterialSettings.law
+        material, guide = (
+            "--to, --scale or a constant of a material with it",
+            "--prompt, --like or --like-material as well",
+        )
+        unused = {
+            "parameters": (not guides and settings.parameters != usual.parameters, guide),
+            "guide": (not guides and settings.guide != usual.guide, guide),
+            "--model": (self.prompt is None and self.model != STABLE_AUDIO, "--prompt as well"),
+            "prompt": (self.prompt is None and settings.prompt != usual.prompt, "--prompt as well"),
+            "material.law": (law and not self.changes_material, material),
+            "--from": (self.old is not None and not (self.changes_material or self.like_material), material),
+            "--position": (self.position is not None and self.plots is None, "--plots with it"),
+            "options": (
+                not (self.changes_material or self.changes_modes or guides),
+                "an edit, such as --to",
+            ),
+        }
+        for name, (wrong, wanted) in unused.items():
+            if wrong:
+                raise EditError.expected(wanted, name=name)
+        expect_device(settings.prompt.device, raising=EditError)
+        if self.prompt is not None:
+            settings.check_prompt(self.prompt)
+            if settings.prompt.generated is not None:
+                New((".wav",)).check(settings.prompt.generated)
         if self.output.exists() and self.field.exists() and self.output.samefile(self.field):
             wanted, advice = "another file than the field to edit", "choose another --output"
             raise OutputError.expected(wanted, got="the same", file=self.output, name="--output", advice=advice)
-
-    def _check_guide(self, settings: EditSettings) -> None:
-        """Raise EditError for more than one guide, an empty prompt, and settings of a guide that is not given."""
-        if len(self.guides) > 1:
-            wanted, advice = "one of --prompt, --like and --like-material", "use one after the other"
-            raise EditError.expected(wanted, tuple(self.guides), name=self.guides[0], advice=advice)
-        usual, prompted = self.usual, settings.prompt
-        for name in ("parameters", "guide") if not self.guides else ():
-            if getattr(settings, name) != getattr(usual, name):
-                raise EditError.expected("--prompt, --like or --like-material as well", name=name)
-        expect_device(prompted.device, raising=EditError)
-        if self.prompt is None:
-            if prompted != usual.prompt or self.model != STABLE_AUDIO:
-                raise EditError.expected("--prompt as well", name="prompt" if self.model == STABLE_AUDIO else "--model")
-            return
-        settings.check_prompt(self.prompt)
-        if prompted.generated is not None:
-            New((".wav",)).check(prompted.generated)
 
 
 def run(options: Options) -> int:

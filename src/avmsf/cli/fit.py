@@ -160,17 +160,14 @@ class Options(Configured):
     def _check_unused(self, config: PipelineConfig) -> None:
         """Raise FitError for options that nothing would read."""
         given = {each.name for each in fields(self) if getattr(self, each.name) != each.default}
-        for name in ("gain_model", "time_zero"):
-            if getattr(config, name) != getattr(self.usual, name):
-                given.add(name)
-        if config.gain_model in ("auto", "elastic"):
-            given.discard("gain_model")
-        if config.body.supports == "try":
-            given.add("body.supports")
+        given |= {name for name in ("gain_model", "time_zero") if getattr(config, name) != getattr(self.usual, name)}
+        given -= {"gain_model"} if config.gain_model in ("auto", "elastic") else set()
+        given |= {"body.supports"} if config.body.supports == "try" else set()
         fitted = ("train_fraction", "train_count", "start", "features", "without_shape")
-        unread = {"until": fitted, "material": (*fitted, "until", "time_zero", "gain_model", "body.supports")}
-        for other, names in unread.items():
-            chosen = getattr(self, other)
+        for other, chosen, names in (
+            ("until", self.until, fitted),
+            ("material", self.material, (*fitted, "until", "time_zero", "gain_model", "body.supports")),
+        ):
             for name in (each for each in names if chosen and each in given):
                 wanted, advice = f"no --{other} with it", "leave one out"
                 raise FitError.expected(wanted, chosen, name=option_of(name), advice=advice)
@@ -196,12 +193,12 @@ def run(options: Options) -> int:
 def _fit(options: Options, settings: CaptureSettings) -> None:
     from avmsf._utils.files import copy_whole
     from avmsf.capture import read_capture
-    from avmsf.cli.alignment import AlignmentReport
     from avmsf.cli.info import draw_field
     from avmsf.cli.report import compare, features_lines, field_lines, parts_words, score_table
     from avmsf.evaluation.splits import split
     from avmsf.features.store import load_features, read_report
     from avmsf.field.store import load
+    from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.pipeline.fit import fit_in_stages
     from avmsf.pipeline.visuals import expect_shape
 

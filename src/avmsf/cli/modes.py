@@ -56,8 +56,8 @@ class Options(Common):
 def run(options: Options) -> int:
     """Print the modes."""
     from avmsf.capture import read_capture
-    from avmsf.cli.alignment import AlignmentReport
     from avmsf.cli.report import levels, mode_rows, mode_table
+    from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.modal.extraction.extract import extract_modes
     from avmsf.modal.extraction.finders import finder_named
     from avmsf.modal.extraction.quality import measure_quality

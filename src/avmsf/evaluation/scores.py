@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -47,6 +48,17 @@ class Scores:
             metric: float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.nan
             for metric, values in self.values.items()
         }
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame of a row for each recording, by its name, and a column for each metric.
+
+        Raises EvaluationError where pandas, which is no dependency, is not installed.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ModuleNotFoundError as error:
+            raise EvaluationError.expected("pandas", name="pandas", advice="pip install pandas") from error
+        return pandas.DataFrame({name: each.numpy() for name, each in self.values.items()}, index=list(self.names))
 
 
 def evaluate(
