@@ -36,6 +36,8 @@ from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000.0, 1200
+# Meshes here have no colors.
+pytestmark = pytest.mark.filterwarnings("ignore::avmsf.errors.CaptureWarning")
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +214,6 @@ WRONG: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::avmsf.errors.CaptureWarning")
 @pytest.mark.parametrize("words", WRONG)
 def test_what_cannot_be_exported_is_refused(
     words: str, field_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -33,7 +33,7 @@ VERBS = {
     "modes": "List the modes of an object: frequencies, dampings and levels, from all recordings of a capture.",
     "fit": "Fit a sound field to a capture and write it to one file.",
     "render": "Write the sounds of impacts anywhere on the object as wav files.",
-    "info": "Describe a field, Gaussians or features, and draw them with --plots.",
+    "info": "Describe a field, Gaussians, features or a mesh, and draw them with --plots.",
     "locate": "Find where on the object the impact of a recording was, with a heat map and the uncertainty.",
     "edit": "Change a field's material, size, pitch or decay, or optimize it towards a text prompt or recordings.",
     "suggest": "Suggest where to record next: the contacts that reduce the expected error of the field most.",

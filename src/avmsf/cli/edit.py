@@ -26,9 +26,8 @@ _MaterialName = Annotated[str | None, arg("MATERIAL")]
 class Options(Configured):
     """Change a field's material, size, pitch or decay, or optimize it towards a text prompt or recordings.
 
-    Material and size first, by the laws of linear modal analysis; then the modes; then the optimization towards one of
-    --prompt, --like and --like-material, whose preview is next to the output while it runs. The pattern of each mode
-    over the object stays, so the edited field can be rendered and used for localization like any other.
+    Material and size first, by the laws of linear modal analysis, then modes, then the optimization towards --prompt,
+    --like or --like-material, with a preview next to the output. The pattern of each mode over the object stays.
     """
 
     field: tyro.conf.Positional[FieldFile]

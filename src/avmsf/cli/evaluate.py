@@ -26,15 +26,14 @@ if TYPE_CHECKING:
 
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
-_Names = Annotated[tuple[str, ...], arg("NAME ...")]
+_Names = Annotated[tuple[str, ...], arg("NAMES")]
 
 
 @dataclass(frozen=True)
 class Options(Configured):
     """Evaluate methods at held-out contacts, on all objects of a dataset.
 
-    Every value is kept as it is computed: methods or objects can be added later. The folder of results holds
-    summary.json, report.md and report.html, which shows and plays sounds.
+    Methods and objects can be added later. The results are summary.json, report.md and report.html, with sounds.
     """
 
     protocol: tyro.conf.Positional[
@@ -54,14 +53,14 @@ class Options(Configured):
     """Results, by default evaluation/DATASET/PROTOCOL."""
     cache: CacheFolder = None
     """Features, which several evaluations may share."""
-    test: Annotated[tuple[str, ...], arg("RECORDING ...")] = ()
+    test: Annotated[tuple[str, ...], arg("NAMES")] = ()
     """predefined: recordings to test on, such as 009.wav."""
     counts: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (16, 8, 4, 2, 1)
     """shots: numbers of training contacts."""
     starts: int = 1
-    """shots: contacts that the choices start from."""
+    """shots: number of first contacts."""
     visual_source: Annotated[Literal["best", "mesh"], arg("best|mesh")] = "best"
-    """Features by photographs, if any (best), or of the mesh."""
+    """Features of photographs, if any, or of the mesh."""
     workers: int = 1
     """Objects at a time; several need `scale`."""
     ray: Annotated[str | None, arg("ADDRESS")] = None

@@ -21,7 +21,7 @@ from avmsf.cli.paths import Existing, InputError, arg
 T = TypeVar("T")
 Assignments = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg("NAME=VALUE", name="set")]
 """Settings, one for each time that the option is given."""
-SettingsTable = Annotated[Path | None, arg("FILE.toml"), Existing("settings, as --print-config writes them")]
+SettingsTable = Annotated[Path | None, arg("FILE"), Existing("settings, as --print-config writes them")]
 _OTHER: Any = object()
 """Stands for a value of another type."""
 _WIDTH = 100
