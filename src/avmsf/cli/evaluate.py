@@ -33,7 +33,7 @@ _Names = Annotated[tuple[str, ...], arg("NAMES")]
 class Options(Configured):
     """Evaluate methods at held-out contacts, on all objects of a dataset.
 
-    Methods and objects can be added later. The results are summary.json, report.md and report.html, with sounds.
+    The results are summary.json, report.md and report.html, which plays sounds.
     """
 
     protocol: tyro.conf.Positional[
