@@ -102,14 +102,14 @@ def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
     visual = found(tmp_path)
     assert visual == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", ())
     assert visual.reconstructs
-    write_surface_file(tmp_path)
-    # Pictures next to a mesh may be its textures.
-    assert found(tmp_path).mesh is not None
-    assert not found(tmp_path).reconstructs
     (tmp_path / "two.mp4").touch()
     assert len(found(tmp_path).problems) == 1
     (tmp_path / "transforms.json").write_text("{}")
     assert "transforms.json" in found(tmp_path).problems[0]
+    write_surface_file(tmp_path)
+    # Pictures next to a mesh may be its textures.
+    assert found(tmp_path).mesh is not None
+    assert not found(tmp_path).reconstructs
 
 
 @pytest.mark.parametrize("pictured", [True, False])

@@ -199,7 +199,7 @@ def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(
 
 def test_clouds_and_features_are_drawn(kept: Path, tmp_path: Path, capsys: Streams) -> None:
     assert main(["info", str(kept / "cloud.ply"), "--plots", str(tmp_path / "a")]) == 0
-    words = ["info", str(kept / "features.safetensors"), "--cloud", str(kept / "cloud.ply")]
+    words = ["info", str(kept / "features.safetensors")]
     assert main([*words, "--plots", str(tmp_path / "b")]) == 0
     out, _ = capsys.readouterr()
     assert "features: descriptors" in out
