@@ -43,6 +43,7 @@ RECORDINGS = [
     (np.zeros(0), "", None, 0),
     (np.where(np.arange(4000) == 7, np.nan, ring()), "", None, 1),
     (ring(0.015), "", "samples", 120),
+    (np.where(np.arange(4000) < 3900, 1e-4 * NOISE, np.roll(ring(), 3900)), "", "samples", pytest.approx(99, abs=3)),
     (np.linspace(-0.1, 0.1, 12), "highpass = 20", "samples", 12),
     (ring(), "highpass = 1e-300", "highpass", 1e-300),
     (ring(), "highpass = 1.9", "highpass", 1.9),
