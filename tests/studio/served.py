@@ -1,20 +1,30 @@
 """The real server in a thread, asked over a socket, so that nothing tidies up what the tests send."""
 
+import asyncio
 import http.client
 import json
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Coroutine, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from avmsf.studio.guard import MAX_UPLOAD_BYTES, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
 from avmsf.studio.server import listen, make_server
 from avmsf.studio.studio import Studio, StudioConfig
+
+T = TypeVar("T")
+
+
+def run_async(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Run a coroutine to its end in a thread of its own: Playwright leaves a loop running in the main thread."""
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(asyncio.run, coroutine).result()
 
 
 @dataclass(frozen=True)

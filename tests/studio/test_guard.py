@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, new_token
-from event_loop import run_async
 from opened_plate import blow, open_plate
-from served import Served, served
+from served import Served, run_async, served
 
 LARGEST = 200_000
 

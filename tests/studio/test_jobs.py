@@ -15,8 +15,8 @@ import pytest
 from avmsf.errors import CaptureError
 from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.responses import RequestError
-from event_loop import run_async
 from factories.raising import raises
+from served import run_async
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
 pytestmark = [

@@ -12,7 +12,6 @@ import torch
 
 from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.web import single_file
 from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 from factories.struck_table import RATE, struck_table
@@ -419,15 +418,6 @@ def test_a_sound_that_the_browser_holds_back_is_asked_for_and_told(any_page: "Pa
     assert found == [1, True, False]
 
 
-@pytest.mark.parametrize("shape", ["half-sine", "hertz"])
-@pytest.mark.parametrize("contact_time", [0.0, 3e-5, 1.3e-4, 1e-3, 7.77e-3])
-def test_pulses_are_those_of_python(any_page: "Page", shape: Any, contact_time: float) -> None:
-    """Incomplete beta functions there, numerical integrals here."""
-    found = any_page.evaluate("([time, shape]) => Array.from(pulseSamples(time, 44100, shape))", [contact_time, shape])
-    expected = ForcePulse(contact_time, shape).samples(44_100.0).numpy()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize("damping", [0.0, 30.0, 2500.0])
 @pytest.mark.parametrize(("frequency", "contact_time"), [(300.0, 0.0), (300.0, 0.002), (2600.0, 0.0005), (900.0, 0.02)])
 def test_a_mallet_leaves_a_mode_swinging_as_the_page_draws_it(
@@ -496,21 +486,3 @@ def test_a_damaged_bundle_is_told(any_page: "Page", change: dict[str, Any], word
     any_page.unroute("**/manifest.json")
     any_page.unroute("**/odd.bin")
     assert words in said
-
-
-def test_a_page_in_one_file_sounds_the_same_from_a_disk(
-    browser: "Browser", table: SampledField, tmp_path: Path
-) -> None:
-    """Opened as a file, where a browser fetches nothing from beside the page."""
-    modules = {f"page/{module.name}": module.read_bytes() for module in PAGE.glob("*.js")}
-    page_files = {**modules, "index.html": (BLANK + START).encode(), "page/start.js": MODULE.encode()}
-    path = tmp_path / "ball.html"
-    path.write_text(single_file(make_bundle(table), page_files))
-    opened = browser.new_page()
-    asked: list[str] = []
-    opened.on("request", lambda request: asked.append(request.url))
-    opened.goto(path.as_uri())
-    opened.evaluate("window.loaded")
-    assert error(heard(opened, [{"row": 1}]), table.render(torch.tensor([1]))[0]) < 1e-6
-    assert not [url for url in asked if not url.startswith(("data:", "blob:", path.as_uri()))]
-    opened.close()
