@@ -45,7 +45,7 @@ async def same(result: Any) -> Any:
 
 def run(text: str, *, task: Any = TEST, finish: Callable[[Any], Awaitable[Any]] = same) -> list[Any]:
     async def all_events() -> list[Any]:
-        job = Job(task, finish, script(text))
+        job = Job("test", task, finish, script(text))
         await job.run()
         return [event async for _, event in job.listen()]
 
@@ -95,11 +95,11 @@ def test_a_result_that_cannot_be_taken_is_an_error_and_the_next_job_runs(raised:
 
     async def two() -> tuple[Any, Any]:
         jobs = Jobs(script("say(result={})"))
-        first = jobs.start(TEST, broken)
+        first = jobs.start("test", TEST, broken)
         events = [event async for _, event in first.listen()]
         assert not await first.cancel()
         await jobs.close()
-        return events, [event async for _, event in jobs.start(TEST, same).listen()]
+        return events, [event async for _, event in jobs.start("test", TEST, same).listen()]
 
     [first], second = run_async(asyncio.wait_for(two(), 30))
     assert first["error"].startswith(words)
@@ -115,7 +115,7 @@ def test_a_result_that_is_being_taken_is_told_to_whoever_stops_the_job() -> None
             await go.wait()
             return {"revision": 2}
 
-        job = Jobs(script("say(result={})")).start(TEST, slow)
+        job = Jobs(script("say(result={})")).start("test", TEST, slow)
         await begun.wait()
         stopping = asyncio.create_task(job.cancel())
         await asyncio.sleep(0.05)
@@ -128,7 +128,7 @@ def test_a_result_that_is_being_taken_is_told_to_whoever_stops_the_job() -> None
 
 def test_who_comes_later_gets_what_was_missed() -> None:
     async def listen() -> list[list[Any]]:
-        job = Job(TEST, same, script("for n in range(4): say(done=n)\nsay(result={})"))
+        job = Job("test", TEST, same, script("for n in range(4): say(done=n)\nsay(result={})"))
         await job.run()
         return [[number async for number, _ in job.listen(after=after)] for after in (0, 3)]
 
@@ -171,7 +171,7 @@ def pair(begin: str, child: str = WAITS) -> tuple[str, ...]:
 def test_cancelling_ends_all_processes_also_of_a_worker_that_does_not_end_itself(worker: tuple[str, ...]) -> None:
     async def cancel() -> list[Any]:
         jobs = Jobs(worker)
-        job = jobs.start(TEST, same)
+        job = jobs.start("test", TEST, same)
         async for _ in job.listen():
             break
         await job.cancel()
@@ -198,14 +198,14 @@ def test_a_worker_and_its_processes_end_where_its_server_was_killed() -> None:
 def test_one_job_runs_at_a_time() -> None:
     async def start_two() -> None:
         jobs = Jobs(script("time.sleep(60)"))
-        first = jobs.start(TEST, same)
+        first = jobs.start("test", TEST, same)
         with raises(RequestError, name="job", value="test") as refused:
-            jobs.start({"task": "lead"}, same)
+            jobs.start("test", {"task": "lead"}, same)
         assert (refused.value.status, refused.value.more) == (409, {"job": first.identifier})
         assert jobs.current is first
         await first.cancel()
         jobs.command = script("say(result={})")
-        second = jobs.start({"task": "lead"}, same)
+        second = jobs.start("test", {"task": "lead"}, same)
         assert [event async for _, event in second.listen()] == [{"taken": {}}]
         assert jobs.current is None
         with raises(RequestError, name="job", value="another"):
@@ -221,7 +221,7 @@ def test_one_job_runs_at_a_time() -> None:
 def test_the_last_job_of_a_task_tells_how_it_ended(text: str, failure: str | None) -> None:
     async def end() -> list[str | None]:
         jobs = Jobs(script(text))
-        job = jobs.start(TEST, same)
+        job = jobs.start("test", TEST, same)
         running = jobs.failure("test")
         if failure == "it was stopped":
             await job.cancel()

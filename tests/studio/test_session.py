@@ -52,7 +52,7 @@ def test_sliders_do_what_the_tasks_do() -> None:
 
 
 def test_sliders_are_read_back_and_change_nothing_at_rest() -> None:
-    sliders = Sliders.read({**WOODEN, "law": "velocity", "modes": [{"mode": 3, "db": None}]})
+    sliders = Sliders.read({**WOODEN, "modes": [{"mode": 3, "db": None}]})
     assert Sliders.read(sliders.to_json()) == sliders
     assert sliders.to_json()["modes"] == [{"mode": 3, "db": None, "pitch": 1.0, "decay": 1.0}]
     assert Sliders.read(REST.to_json()) == REST == Sliders.read({"base": 1})
@@ -73,9 +73,7 @@ def test_sliders_are_read_back_and_change_nothing_at_rest() -> None:
         ({"modes": [{"mode": 0, "level": 3}]}, "a mode", ["level"]),
         ({"material": "wood"}, "material", "wood"),
         ({"material": {"to": 3}}, "material.to", 3),
-        ({"law": "paper"}, "law", "paper"),
         ({"pitch": 10**400}, "pitch", 10**400),
-        ({"law": [1]}, "law", [1]),
         ({"modes": [{"mode": 0, "db": -900}]}, "db", -900.0),
         ({"brightness": 400}, "brightness", 400.0),
         ({"louder": 2}, "an edit", ["louder"]),

@@ -50,14 +50,12 @@ _NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
 
 
 def read_contact(query: Mapping[str, str]) -> Impact:
-    """Return the contact, meters, of a query x, y, z, with the direction nx, ny, nz and the force, newtons, if given.
+    """Return the contact, meters, of a query x, y, z, with the direction nx, ny, nz if given.
 
     Raises RequestError (400).
     """
     names = (*REQUIRED[1:], *(DIRECTION if any(name in query for name in DIRECTION) else ()))
     cells = {REQUIRED[0]: "recording", **{name: query.get(name, "") for name in names}}
-    if "newtons" in query:
-        cells[FORCE] = query["newtons"]
     try:
         impact = parse_row(Row(0, cells, decimal_comma=False), CaptureSettings())
         check_distances([impact], CaptureSettings())
@@ -108,8 +106,6 @@ class ImpactTable:
         numbers = dict(zip(REQUIRED[1:], (value / settings.meters for value in impact.contact), strict=True))
         if impact.direction is not None:
             numbers |= dict(zip(DIRECTION, impact.direction, strict=True))
-        if impact.newtons is not None:
-            numbers[FORCE] = impact.newtons
         header = [] if self.names else [self._line([REQUIRED[0], *numbers])]
         written = {name: repr(float(value)) for name, value in numbers.items()}
         if any("," in row.cells.get(name, "") for row in self.rows for name in (*REQUIRED[1:], *DIRECTION, FORCE)):
@@ -194,12 +190,11 @@ class CaptureEditor:
                 if added["digest"] == _digest(content) and math.dist(added["contact"], impact.contact) < 1e-9:
                     return added
             recording = read_upload(content)
-            self._check_usable(recording, newtons=impact.newtons)
-            needed = {"direction": (DIRECTION[0], impact.direction), "force": (FORCE, impact.newtons)}
-            for name, (column, value) in needed.items():
-                if column in table.names and value is None:
-                    wanted = f"a {name} as in all rows"
-                    raise bad_request(name, wanted, got="none", advice="add it", status=422, file=table.path)
+            self._check_usable(recording, newtons=None)
+            missing = {"force": FORCE} if impact.direction else {"direction": DIRECTION[0], "force": FORCE}
+            for name in (name for name, column in missing.items() if column in table.names):
+                wanted = f"a {name} as in all rows"
+                raise bad_request(name, wanted, got="none", advice="add it", status=422, file=table.path)
             file = self._next_name(table)
             _write(self.folder / file, _as_wav(content, recording))
             try:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from avmsf.editing.config import STABLE_AUDIO
-from avmsf.editing.material import LAWS, edit, infer_material
+from avmsf.editing.material import edit, infer_material
 from avmsf.editing.modal_edit import EDITS, remarks
 from avmsf.errors import EditError
 from avmsf.fem.material import material_named
@@ -59,8 +59,6 @@ class Sliders:
     """Factor on the times in which modes die away."""
     brightness: float = 0.0
     """Decibels an octave."""
-    law: str = "displacement"
-    """What the recordings go with; see `change_material`."""
     modes: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
     """By row in the bank of the field as it was opened: the change of its level, `db` or MUTE, and factors on `pitch`
     and `decay` in addition to those of all modes."""
@@ -73,7 +71,7 @@ class Sliders:
         outside `_LIMITS`, and for more rows than modes.
         """
         sliders = ("size", "pitch", "decay", "brightness")
-        _check_keys(request, ("base", "material", "law", "modes", *sliders), "an edit")
+        _check_keys(request, ("base", "material", "modes", *sliders), "an edit")
         material = request.get("material") or {}
         _check_keys(material, ("from", "to"), "material")
         rows = request.get("modes") or []
@@ -90,11 +88,8 @@ class Sliders:
             if mode in changes:
                 raise bad_request("modes", "one row per mode", [mode], got=f"several of mode {mode}")
             changes[mode] = {name: _number(row, name) for name in ("db", "pitch", "decay")}
-        law = request.get("law", "displacement")
-        if not isinstance(law, str) or law not in LAWS:
-            raise bad_request("law", f"one of {', '.join(LAWS)}", law)
         values = {name: _number(request, name) for name in sliders}
-        return cls(_name(material, "to"), _name(material, "from"), law=law, modes=changes, **values)
+        return cls(_name(material, "to"), _name(material, "from"), modes=changes, **values)
 
     def to_json(self) -> dict[str, Any]:
         """Return what `read` makes these sliders of."""
@@ -111,13 +106,12 @@ class Sliders:
         if old is None and (new is not None or self.size != 1.0):
             old, known = infer_material(ground, option=f'"{OLD_MATERIAL}"', new=new)
             notes.append(known)
-        if replace(self, old=None, law=REST.law) != REST:
+        if replace(self, old=None) != REST:
             edited = edit(
                 ground,
                 material=new,
                 old_material=old,
                 size=self.size,
-                law=LAWS[self.law],
                 brightness_db=self.brightness,
                 **self._mode_values(len(ground.bank)),
             )

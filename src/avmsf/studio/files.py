@@ -54,6 +54,7 @@ class Showcase:
 
     def __init__(self, opened: Opened, editor: CaptureEditor | None) -> None:
         self.opened, self.editor = opened, editor
+        self.meters = 1.0 if opened.object is not None else opened.settings.surface_meters
         self._shown: OrderedDict[int, Shown] = OrderedDict()
         self._lock = Lock()
 
@@ -65,11 +66,6 @@ class Showcase:
     def files_of(self, number: int) -> Mapping[str, bytes]:
         """Return a revision's files, or the last one's if they are no longer kept."""
         return self._shown.get(number, self.current).files
-
-    @property
-    def meters(self) -> float:
-        """Meters in one unit of the object's mesh."""
-        return 1.0 if self.opened.object is not None else self.opened.settings.surface_meters
 
     def show(self, revision: Revision) -> None:
         """Make a revision's files. Raises the errors of `make_bundle`, and StudioError without geometry."""

@@ -34,22 +34,13 @@ _MAX_STDERR_CHARACTERS = 4000
 """Characters of the process's standard error that are kept."""
 
 
-_TITLES = {
-    "make_field": "the reconstruction",
-    "make_object": "the reconstruction from the images",
-    "lead": "the guided edit",
-}
-"""What the worker's tasks are called in messages."""
-
-
 class Job:
     """One run of the worker, and its events."""
 
-    def __init__(self, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> None:
+    def __init__(self, title: str, task: Event, finish: Finish, command: Sequence[str] = WORKER) -> None:
         """Prepare `task` for the worker; `finish` turns its result into the last event, which may have an "error"."""
-        self.task, self.finish, self.command = task, finish, command
-        self.identifier, self.kind = secrets.token_hex(8), str(task["task"])
-        self.title = _TITLES.get(self.kind, self.kind)
+        self.title, self.task, self.finish, self.command = title, task, finish, command
+        self.identifier, self.kind = secrets.token_hex(8), task["task"]
         self.events: list[Event] = []
         self.ended = False
         self._cancelled = self._finishing = False
@@ -175,10 +166,10 @@ class Jobs:
             advice, running = "wait for it or stop it", current.identifier
             raise bad_request("job", "none that runs", current.title, advice=advice, status=409, job=running)
 
-    def start(self, task: Event, finish: Finish) -> Job:
+    def start(self, title: str, task: Event, finish: Finish) -> Job:
         """Start a job. Raises RequestError (409) while another one runs."""
         self.check_idle()
-        job = Job(task, finish, self.command)
+        job = Job(title, task, finish, self.command)
         self._jobs[job.identifier] = job
         self._running = asyncio.create_task(job.run())
         return job

@@ -79,11 +79,14 @@ class Finder:
 
     def _described(self, seconds: float, contact: ContactMap) -> dict[str, Any]:
         values = contact.describe(self.symmetries, LEVEL)
-        for each in (values, values["cosine"], *values["equivalent_points"]):
+        del values["cosine"]
+        for each in (values, *values["equivalent_points"]):
             each["position"] = [value / self.length for value in each["position"]]
         values["credible_region"]["radius"] /= self.length
-        packed = {name: _packed(getattr(contact, name)) for name in ("probability", "distance")}
-        return {"seconds": seconds, "row": contact.most_probable, **packed, **values}
+        # As the page unpacks it: float32, little endian.
+        probability = contact.probability.detach().to(torch.float32).numpy().astype("<f4").tobytes()
+        packed = base64.b64encode(probability).decode()
+        return {"seconds": seconds, "row": contact.most_probable, "probability": packed, **values}
 
 
 class Searches:
@@ -127,11 +130,6 @@ class Searches:
                 except Exception as error:  # the next revision's tables are to be made all the same
                     _report(error)
                 prepared = revision
-
-
-def _packed(values: Float[Tensor, " points"]) -> str:
-    """Return values as the page unpacks them: base64 of float32, little endian."""
-    return base64.b64encode(values.detach().to(torch.float32).numpy().astype("<f4").tobytes()).decode()
 
 
 def _report(error: Exception) -> None:

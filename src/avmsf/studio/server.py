@@ -101,13 +101,10 @@ def listen(port: int | None) -> socket.socket:
         listener.bind((_HOME, number))
         listener.listen()
         return listener
-    except OverflowError as error:
+    except (OSError, OverflowError) as error:
         listener.close()
-        raise StudioError.expected("0 to 65535", number, name="port", advice="leave --port out") from error
-    except OSError as error:
-        listener.close()
-        if error.errno == errno.EADDRINUSE and port is None:
+        if port is None and isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
             return listen(0)
         advice = "leave --port out, or give --port 0 for any free one"
-        got = f"{error.strerror!r} at {number}"
-        raise StudioError.expected("a free one", number, got=got, name="port", advice=advice) from error
+        wanted, got = "a free one from 0 to 65535", f"{error} at {number}"
+        raise StudioError.expected(wanted, number, got=got, name="port", advice=advice) from error

@@ -1,6 +1,5 @@
 """The state of one server, and the operations that the page requests: no HTTP, nothing that blocks the event loop."""
 
-import shutil
 import tempfile
 import traceback
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from avmsf.studio.edit import OLD_MATERIAL, Sliders, read_prompt, text_model
 from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Event, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
-from avmsf.studio.opening import Opened, find_object, shows_more
+from avmsf.studio.opening import Opened, shows_more
 from avmsf.studio.responses import NUMERIC_ERRORS, bad_request, error_response
 from avmsf.studio.session import Revision, Session
 
@@ -99,14 +98,8 @@ class Studio:
         return {"file": str(path), **self._changed(revision)}
 
     async def capture(self) -> dict[str, Any]:
-        """Return the impacts of the capture, and the name of the file that shows its object."""
-        described = await self.threads.run("read", self.require_editor().describe)
-        visible, running = find_object(self.opened), self.jobs.current
-        return {
-            **described,
-            "object": None if visible is None else visible.name,
-            "job": None if running is None else running.identifier,
-        }
+        """Return the impacts of the capture."""
+        return await self.threads.run("read", self.require_editor().describe)
 
     async def with_editor(self, act: Callable[[CaptureEditor], Result]) -> Result:
         """Change the capture's impacts, one request after another. Raises RequestError (404) without a capture."""
@@ -132,12 +125,12 @@ class Studio:
         output = str(self.folder / "reconstructed")
         chosen = {"preset": self.config.preset, "modes": self.config.modes}
         task = {"task": "make_field", "folder": str(editor.folder), "output": output, **chosen}
-        return {"job": self.jobs.start(task, self._take_field).identifier}
+        return {"job": self.jobs.start("the reconstruction", task, self._take_field).identifier}
 
     async def make_object(self) -> dict[str, Any]:
         """Begin to make Gaussians of the capture's pictures, to have something to click."""
         task = {"task": "make_object", "folder": str(self.require_editor().folder)}
-        return {"job": self.jobs.start(task, self._take_object).identifier}
+        return {"job": self.jobs.start("the reconstruction from the images", task, self._take_object).identifier}
 
     async def _lead(self, base: int, target: Event, *, recording: bytes | None = None) -> dict[str, Any]:
         """Start to optimize the field towards the recording, or the prompt in `target`."""
@@ -146,16 +139,13 @@ class Studio:
         self.jobs.check_idle()
         folder = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
         task = {"task": "lead", "field": str(folder / "field"), "output": str(folder / "led"), **target}
-        try:
-            if recording is not None:
-                (folder / "like.wav").write_bytes(recording)
-                task["recording"] = str(folder / "like.wav")
-            await self.threads.run("compute", save, field, folder / "field")
-            take = partial(self._take_led, base)
-            return {"job": self.jobs.start({**task, "steps": self.config.steps}, take).identifier}
-        except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
+        if recording is not None:
+            (folder / "like.wav").write_bytes(recording)
+            task["recording"] = str(folder / "like.wav")
+        await self.threads.run("compute", save, field, folder / "field")
+        take = partial(self._take_led, base)
+        task |= {"steps": self.config.steps}
+        return {"job": self.jobs.start("the guided edit", task, take).identifier}
 
     async def _compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
         """Compute with a user's values. Raises RequestError (422) if they give no result."""

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -112,11 +112,7 @@ def lead(task: Values, events: EventWriter) -> Values:
     return {"output": task["output"]}
 
 
-_TASKS: Mapping[str, Callable[[Values, EventWriter], Values]] = {
-    "make_field": make_field,
-    "make_object": make_object,
-    "lead": lead,
-}
+_TASKS = {"make_field": make_field, "make_object": make_object, "lead": lead}
 
 
 def main() -> int:
