@@ -133,6 +133,7 @@ def test_viewers_show_the_mesh_or_the_points(tmp_path):
     assert arrays[attributes["COLOR_0"]].tolist()[0] == [1.0, 0.0, 0.0]
     assert len(arrays[attributes["POSITION"]]) == 24
     np.testing.assert_allclose(np.linalg.norm(arrays[attributes["NORMAL"]], axis=1), 1.0, atol=1e-6)
+    assert (np.einsum("ij,ij->i", arrays[attributes["NORMAL"]], arrays[attributes["POSITION"]]) > 0).all()
     bounds = document["accessors"][attributes["POSITION"]]
     np.testing.assert_allclose([bounds["min"], bounds["max"]], [[-0.1, -0.05, -0.15], [0.1, 0.05, 0.15]], atol=1e-7)
     assert "extensionsRequired" not in document

@@ -9,7 +9,7 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import LocationError
 from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import Origin
-from avmsf.localization.likelihood import Force
+from avmsf.localization.likelihood import Force, Likelihood, PredictedGains
 from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import distinct_contacts
@@ -189,6 +189,14 @@ def test_a_sound_whose_modes_are_so_strong_at_no_place_has_none(taps):
         assert found.evidence <= 0.0
         with pytest.raises(LocationError):
             _ = found.position
+
+
+def test_the_evidence_is_a_mean_over_the_points():
+    gains, frequency = locator_of().gains[:200], bank().frequency
+    values, noise = gains[7].to(torch.complex128), torch.full((len(frequency),), 1e-4, dtype=torch.float64)
+    once, twice = (PredictedGains(each, 0.1 * each.abs(), frequency) for each in (gains, gains.repeat(2, 1)))
+    evidence = [Likelihood(predicted, values, noise).evidence() for predicted in (once, twice)]
+    assert evidence[1] == pytest.approx(evidence[0], abs=1e-3)
 
 
 def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
