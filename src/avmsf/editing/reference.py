@@ -3,7 +3,7 @@
 import hashlib
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -122,8 +122,52 @@ class Reference:
         return {"reference": self.name, "lengths": list(self.lengths), "samples_sha256": digest}
 
     def start(self, rendered: FieldAtContacts) -> ModalEdit:
-        """Return the common pitch and decay with which the field comes nearest, from a search over both."""
-        return _search_start(rendered, self._nearest)
+        """Return the edit by a common pitch and damping, up to 8 and 64 times either way, of least spectral error.
+
+        Modes are sparse: if a mode and its target are a third of an octave apart, the L1 distance of the spectra has no
+        gradient. So the pitch comes from optimal transport, which in one dimension is a match of quantiles: a common
+        factor on all frequencies moves the quantiles of the spectrum along a logarithmic axis by one step, and the best
+        of them is the mean or median difference of two spectra's. A grid over the smoothed spectra's overlap proposes
+        one more. The damping is searched on a grid for each proposal, and the loss of the optimization chooses. Only
+        the target's own duration counts: beyond its end it continues with the rendered sound, and a longer decay would
+        reduce the relative error.
+        """
+        rendered = rendered.first(_MAX_CONTACTS)
+        best = (math.inf, 0.0, 0.0)
+        for pitch in self._pitches(rendered):
+            step, damping = _MAX_LOG_DAMPING / 4, 0.0
+            tried: dict[float, float] = {}
+            # Nine places over the whole range, then three refinements about the best.
+            around = [step * place for place in range(-4, 5)]
+            for _ in range(4):
+                for each in around:
+                    if round(each, 9) not in tried:
+                        tried[round(each, 9)] = self._error(rendered, pitch, each)
+                damping, step = min(tried, key=lambda each: tried[each]), step / 2
+                around = [max(-_MAX_LOG_DAMPING, damping - step), min(_MAX_LOG_DAMPING, damping + step)]
+            best = min(best, (tried[damping], pitch, damping))
+        return ModalEdit.none(rendered.field.bank, pitch=best[1], damping=best[2])
+
+    def _pitches(self, rendered: FieldAtContacts) -> list[float]:
+        """Return proposals of log alpha: that of no change, and those by quantiles and overlap."""
+        sounds = rendered.sounds()
+        targets, weight = self._nearest(sounds)
+        own, aim = (band_spectrum(weight * each).mean(dim=0) for each in (sounds, targets))
+        differences = (_quantiles(aim) - _quantiles(own)).clamp(-_MAX_LOG_PITCH, _MAX_LOG_PITCH)
+        # Moved by whole bands along the logarithmic axis, spectra overlap more or less.
+        most = round(_MAX_LOG_PITCH / math.log(2.0) * _PER_OCTAVE)
+        moved = torch.nn.functional.pad(own, (most, most)).unfold(0, len(own), 1).flip(0)
+        shift = (int((moved - aim).abs().sum(dim=1).argmin()) - most) * math.log(2.0) / _PER_OCTAVE
+        return sorted({0.0, float(differences.mean()), float(differences.median()), shift})
+
+    def _error(self, rendered: FieldAtContacts, pitch: float, damping: float) -> float:
+        sounds = rendered.sounds(ModalEdit.none(rendered.field.bank, pitch=pitch, damping=damping))
+        if float(sounds.abs().max()) == 0.0:
+            return math.inf
+        sizes = [scaled_fft_size(size, sample_rate=self.sample_rate) for size in _FFT_SIZES]
+        targets, weight = self._nearest(sounds)
+        target = spectral_target(weight * targets, fft_sizes=sizes, hops=[size // 4 for size in sizes])
+        return float(spectral_loss(weight * sounds, target)) / len(sizes)
 
     def targets(self, sounds: Sounds, step: int, generator: torch.Generator) -> Sounds:
         """Return the nearest clip of each sound, which goes on as the sound itself where the clip ends."""
@@ -217,8 +261,6 @@ def _synthetic(
     )
 
 
-_TargetFunction = Callable[[Sounds], tuple[Sounds, Sounds]]
-"""Gives the targets of sounds, and the weight of each sample, 0 where there is no target, at most 1."""
 _OCTAVES = 9
 """Of the analyzed band, down from half the sample rate."""
 _PER_OCTAVE = 24
@@ -251,62 +293,9 @@ def band_spectrum(sounds: Sounds) -> Float[Tensor, "contacts bands"]:
     return amplitude / amplitude.sum(dim=1, keepdim=True).clamp_min(torch.finfo(amplitude.dtype).tiny)
 
 
-def _search_start(rendered: FieldAtContacts, targets_of: _TargetFunction) -> ModalEdit:
-    """Return the edit by a common pitch and damping alone, up to 8 and 64 times either way, of least spectral error.
-
-    Modes are sparse: if a mode and its target are a third of an octave apart, the L1 distance of the spectra has no
-    gradient. So the pitch comes from optimal transport, which in one dimension is a match of quantiles: a common factor
-    on all frequencies moves the quantiles of the spectrum along a logarithmic axis by one step, and the best of them is
-    the mean or median difference of two spectra's. A grid over the smoothed spectra's overlap proposes one more. The
-    damping is searched on a grid for each proposal, and the loss of the optimization chooses. Only the target's own
-    duration counts: beyond its end it continues with the rendered sound, and a longer decay would reduce the relative
-    error.
-    """
-    rendered = rendered.first(_MAX_CONTACTS)
-    best = (math.inf, 0.0, 0.0)
-    for pitch in _pitches(rendered, targets_of):
-        step, damping = _MAX_LOG_DAMPING / 4, 0.0
-        tried: dict[float, float] = {}
-        # Nine places over the whole range, then three refinements about the best.
-        around = [step * place for place in range(-4, 5)]
-        for _ in range(4):
-            for each in around:
-                if round(each, 9) not in tried:
-                    tried[round(each, 9)] = _error(rendered, targets_of, pitch, each)
-            damping, step = min(tried, key=lambda each: tried[each]), step / 2
-            around = [max(-_MAX_LOG_DAMPING, damping - step), min(_MAX_LOG_DAMPING, damping + step)]
-        best = min(best, (tried[damping], pitch, damping))
-    return ModalEdit.none(rendered.field.bank, pitch=best[1], damping=best[2])
-
-
-def _pitches(rendered: FieldAtContacts, targets_of: _TargetFunction) -> list[float]:
-    """Return proposals of log alpha: that of no change, and those by quantiles and overlap."""
-    sounds = rendered.sounds()
-    targets, weight = targets_of(sounds)
-    own, aim = (band_spectrum(weight * each).mean(dim=0) for each in (sounds, targets))
-    differences = (_quantiles(aim) - _quantiles(own)).clamp(-_MAX_LOG_PITCH, _MAX_LOG_PITCH)
-    # Moved by whole bands along the logarithmic axis, spectra overlap more or less.
-    most = round(_MAX_LOG_PITCH / math.log(2.0) * _PER_OCTAVE)
-    padded = torch.nn.functional.pad(own, (most, most))
-    moved = padded.unfold(0, len(own), 1).flip(0)
-    overlap = (moved - aim).abs().sum(dim=1)
-    shift = (int(overlap.argmin()) - most) * math.log(2.0) / _PER_OCTAVE
-    return sorted({0.0, float(differences.mean()), float(differences.median()), shift})
-
-
 def _quantiles(spectrum: Float[Tensor, " bands"]) -> Float[Tensor, " quantiles"]:
     """Return the frequencies below which 5, 10, ... 95 % of a spectrum lie, as logarithms up to a constant."""
     shares = torch.linspace(0.05, 0.95, 19, dtype=spectrum.dtype)
     below = torch.cumsum(spectrum, dim=0)
     band = torch.searchsorted(below / below[-1], shares).clamp(0, len(spectrum) - 1)
     return band.to(spectrum) * (math.log(2.0) / _PER_OCTAVE)
-
-
-def _error(rendered: FieldAtContacts, targets_of: _TargetFunction, pitch: float, damping: float) -> float:
-    sounds = rendered.sounds(ModalEdit.none(rendered.field.bank, pitch=pitch, damping=damping))
-    if float(sounds.abs().max()) == 0.0:
-        return math.inf
-    sizes = [scaled_fft_size(size, sample_rate=rendered.field.sample_rate) for size in _FFT_SIZES]
-    targets, weight = targets_of(sounds)
-    target = spectral_target(weight * targets, fft_sizes=sizes, hops=[size // 4 for size in sizes])
-    return float(spectral_loss(weight * sounds, target)) / len(sizes)
