@@ -26,7 +26,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.modal.extraction.finders import ShortTime
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 from factories.plate_set import PlateInputs, fill_plates
@@ -144,7 +144,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
 ) -> None:
     data, results = fill_plates(tmp_path / "plates", ("a",), count=20, truth=True), tmp_path / "results"
     asked: dict[bool, torch.Tensor] = {}
-    drawn: dict[str, tuple[ContactMap, torch.Tensor]] = {}
+    drawn: dict[str, tuple[ContactPosterior, torch.Tensor]] = {}
 
     def quick(method: FieldMethod, task: Task) -> SoundField:
         config = replace(QUICK, warmup_steps=0, steps=1)
@@ -154,7 +154,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
         asked[named["published"]] = named["vertices"]
         return located(*given, **named)
 
-    def draw(found: ContactMap, *, title: str, truth: torch.Tensor) -> Figure:
+    def draw(found: ContactPosterior, *, title: str, truth: torch.Tensor) -> Figure:
         drawn[title] = (found, truth)
         return Figure()
 

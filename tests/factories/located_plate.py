@@ -12,7 +12,7 @@ from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
@@ -106,11 +106,11 @@ def mirrored(contact: torch.Tensor) -> torch.Tensor:
     return torch.stack([contact, across, along, both]).float()
 
 
-def missed(found: ContactMap, row: int, contact: torch.Tensor) -> float:
+def missed(found: ContactPosterior, row: int, contact: torch.Tensor) -> float:
     """Return how far a row is from the contact or an image, over the diagonal."""
     return float((mirrored(contact) - found.points[row]).norm(dim=1).min()) / DIAGONAL
 
 
-def held(found: ContactMap, contact: torch.Tensor) -> bool:
+def held(found: ContactPosterior, contact: torch.Tensor) -> bool:
     nearest = torch.cdist(mirrored(contact), found.points).argmin(1)
     return bool(found.region(0.9)[nearest].any())

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from avmsf.errors import ArrayError, LocationError
-from avmsf.localization.contact_map import ContactMap, Peak
+from avmsf.localization.contact_map import ContactPosterior, Peak
 from avmsf.localization.locator import Locator
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.located_plate import PLATE, TrueGains, field_of, struck
@@ -26,12 +26,12 @@ def plate_symmetries() -> Symmetries:
     return Symmetries((RotationalSymmetry(axis(2), middle(), 2, 0.1),), mirrors, 0.005, 0.38, math.inf)
 
 
-def made(probability: list[float]) -> ContactMap:
+def made(probability: list[float]) -> ContactPosterior:
     """Return a map of points in a row, a centimeter apart."""
     points = torch.zeros(len(probability), 3)
     points[:, 0] = 0.01 * torch.arange(len(probability))
     chances = torch.tensor(probability, dtype=torch.float64)
-    return ContactMap(points, 1 - chances, chances, 0.9, 0.9, 0.1)
+    return ContactPosterior(points, 1 - chances, chances, 0.9, 0.9, 0.1)
 
 
 def test_region_is_the_smallest_set_of_that_probability():

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from avmsf.field.sound_field import Origin, SoundField
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
@@ -23,7 +23,7 @@ STRUCK = 68
 
 
 @cache
-def contact() -> ContactMap:
+def contact() -> ContactPosterior:
     """Return where a plate's field locates its own sound at the point `STRUCK`, with noise 60 dB down."""
     zero = torch.zeros(len(BANK), dtype=torch.float64)
     field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), RATE, SAMPLES, Origin("plate"))

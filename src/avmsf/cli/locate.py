@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from avmsf.cli.contacts import Contacts
     from avmsf.field.sound_field import SoundField
-    from avmsf.localization.contact_map import ContactMap
+    from avmsf.localization.contact_map import ContactPosterior
 
-    _Answer = tuple[dict[str, Any], ContactMap | None]
+    _Answer = tuple[dict[str, Any], ContactPosterior | None]
     """The values for an impact, and its map; None for one that could not be located."""
 
 UNLOCATED = 2
@@ -132,7 +132,7 @@ def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_A
     force, level = None if options.force is None else Force(options.force), options.probability
     locator, symmetries = cache(lambda: Locator.of(field)), cache(lambda: symmetries_of(field))
 
-    def describe(path: Path, seconds: float | None, contact: "ContactMap") -> "_Answer":
+    def describe(path: Path, seconds: float | None, contact: "ContactPosterior") -> "_Answer":
         several = contact.refusal is None and len(contact.peaks(level)) > 1
         values = contact.describe(symmetries() if several else None, level)
         return {"recording": str(path), "seconds": seconds, **values}, None if contact.refusal else contact
@@ -176,7 +176,7 @@ def _true_contact(contacts: "Contacts", recording: Path) -> "Float64[Tensor, ' 3
     return contacts.places[rows[0]]
 
 
-def _error(contact: "ContactMap", truth: "Float64[Tensor, ' 3']", level: float) -> dict[str, Any]:
+def _error(contact: "ContactPosterior", truth: "Float64[Tensor, ' 3']", level: float) -> dict[str, Any]:
     """Return how far the most probable contact is from the true one, and both estimates relative to the diagonal.
 
     `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`; `in_region` says whether the
@@ -260,7 +260,7 @@ def _name(path: Path, taken: set[str]) -> str:
 
 
 def _draw(
-    contact: "ContactMap", folder: Path, name: str, values: dict[str, Any], truth: "Float64[Tensor, ' 3'] | None"
+    contact: "ContactPosterior", folder: Path, name: str, values: dict[str, Any], truth: "Float64[Tensor, ' 3'] | None"
 ) -> dict[str, str]:
     import torch
 

@@ -17,7 +17,7 @@ from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.task import Renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.finders import ShortTime
@@ -37,7 +37,7 @@ _MAP = FileKind(
 
 
 Sound = Float[Tensor, " samples"]
-_Find = Callable[[Sound], tuple[dict[str, Float64[Tensor, " 3"]], ContactMap | None]]
+_Find = Callable[[Sound], tuple[dict[str, Float64[Tensor, " 3"]], ContactPosterior | None]]
 """Returns where a sound comes from, by the names of the errors, and the map of a field."""
 
 
@@ -50,7 +50,7 @@ def located(
     vertices: Float[Tensor, "vertices 3"] | None = None,
     published: bool = False,
     map_rows: Collection[int] = (),
-) -> tuple[dict[str, tuple[float, ...]], dict[int, ContactMap]]:
+) -> tuple[dict[str, tuple[float, ...]], dict[int, ContactPosterior]]:
     """Locate each recording of `test` by a method, among `CANDIDATES` of the object's points.
 
     Returns distances from the true contacts over the diagonal of the object's points, a value for each recording, and
@@ -109,7 +109,7 @@ def _field_finder(field: SoundField, points: Float64[Tensor, "points 3"], publis
     locator = Locator.of(field, points=points)
     gains = field.gains(points).double() if published else None
 
-    def find(sound: Sound) -> tuple[dict[str, Float64[Tensor, " 3"]], ContactMap | None]:
+    def find(sound: Sound) -> tuple[dict[str, Float64[Tensor, " 3"]], ContactPosterior | None]:
         distance = None if gains is None else published_distance(field, gains, sound)
         try:
             found = locator.locate(sound)
@@ -175,18 +175,18 @@ def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, " 3"
     return float((points.double() - right.double()).norm(dim=1).mean())
 
 
-def write_map(path: Path, found: ContactMap, *, truth: Float[Tensor, " 3"]) -> None:
+def write_map(path: Path, found: ContactPosterior, *, truth: Float[Tensor, " 3"]) -> None:
     """Write a map, and the true contact (meters). Raises EvaluationError where that cannot be."""
     tensors = {"points": found.points, "distance": found.distance, "probability": found.probability, "truth": truth}
     energies = torch.tensor([found.explained_energy, found.modal_energy, found.null_energy], dtype=torch.float64)
     write_tensors(path, {**tensors, "energies": energies}, "1", _MAP)
 
 
-def read_map(path: Path) -> tuple[ContactMap, Float[Tensor, " 3"]]:
+def read_map(path: Path) -> tuple[ContactPosterior, Float[Tensor, " 3"]]:
     """Return a map that `write_map` wrote, and the true contact. Raises EvaluationError where there is none."""
     _, tensors = read_tensors(path, _MAP)
     try:
         truth, energies = tensors.pop("truth"), tensors.pop("energies").tolist()
-        return ContactMap(tensors["points"], tensors["distance"], tensors["probability"], *energies), truth
+        return ContactPosterior(tensors["points"], tensors["distance"], tensors["probability"], *energies), truth
     except (KeyError, TypeError) as error:
         raise _MAP.damaged(path, error) from error

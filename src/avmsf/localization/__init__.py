@@ -1,7 +1,7 @@
 """Localization of impacts: the posterior of the contact over an object's surface.
 
-In go a `SoundField` and a recording; out comes a `ContactMap`: for each point of the surface the probability that the
-impact was there, and the paper's cosine distance between recorded and predicted gains (section Contact Localization).
+In go a `SoundField` and a recording; out comes a `ContactPosterior`: for each point of the surface the probability that
+the impact was there, and the paper's cosine distance of recorded and predicted gains (section Contact Localization).
 
 - `amplitudes`: least-squares amplitudes of known modes in a sound, with the covariance of their errors.
 - `prediction`: the field's gains over the surface and their variance; leave-one-out calibration of both (conformal

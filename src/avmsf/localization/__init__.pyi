@@ -1,4 +1,4 @@
-from .contact_map import ContactMap as ContactMap
+from .contact_map import ContactPosterior as ContactPosterior
 from .contact_map import Peak as Peak
 from .likelihood import Force as Force
 from .locate import locate as locate

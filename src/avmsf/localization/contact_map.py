@@ -90,7 +90,7 @@ class Peak:
 
 
 @dataclass(frozen=True, eq=False)
-class ContactMap:
+class ContactPosterior:
     """The posterior of one impact's contact over the points of a surface, and the paper's cosine distance.
 
     See the paper's section Contact Localization. Methods with a `level` raise LocationError for one that is not between
@@ -100,12 +100,12 @@ class ContactMap:
     def __repr__(self) -> str:
         notes = f"\nnote: {'; '.join(self.notes)}" if self.notes else ""
         if self.refusal is not None:
-            return f"ContactMap({len(self.points)} points, no position: {self.refusal}){notes}"
+            return f"ContactPosterior({len(self.points)} points, no position: {self.refusal}){notes}"
         where = ", ".join(f"{value + 0.0:.3f}" for value in self.position.tolist())
         others = len(self.peaks()) - 1
         more = f", {counted(others, 'other possible position')}" if others else ""
         radius = f"{LEVEL:.0%} within {1e3 * self.credible_radius():.2g} mm"
-        return f"ContactMap({len(self.points)} points, most probable ({where}) m, {radius}{more}){notes}"
+        return f"ContactPosterior({len(self.points)} points, most probable ({where}) m, {radius}{more}){notes}"
 
     points: Float32[Tensor, "points 3"]
     """Object frame, meters."""
@@ -132,7 +132,7 @@ class ContactMap:
     refusal: str | None = None
     """Why the recording was rejected, as that of another object; None if it was located."""
 
-    def rejected(self, reason: str) -> "ContactMap":
+    def rejected(self, reason: str) -> "ContactPosterior":
         """Return the map without a position and with NaN for every probability, and the reason as its `refusal`."""
         return replace(self, probability=torch.full_like(self.probability, math.nan), refusal=reason)
 

@@ -22,7 +22,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Extractor
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.likelihood import Force
 from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import Sound, at_field_rate, location_errors, open_recording, preprocess_recording
@@ -30,7 +30,7 @@ from avmsf.modal.inner_products import poles_of
 from avmsf.modal.synthesis import synthesize
 
 REJECT_ABOVE = 0.5
-"""Mismatch ratio (see `ContactMap`) above which a sound is taken for another object's."""
+"""Mismatch ratio (see `ContactPosterior`) above which a sound is taken for another object's."""
 WARN_ABOVE = 0.3
 """The same, above which a note says that it may be."""
 MIN_EXPLAINED = 0.1
@@ -50,7 +50,7 @@ def locate(
     force: Force | float | int | ArrayLike | None = None,
     locator: Locator | None = None,
     progress: bool = True,
-) -> ContactMap:
+) -> ContactPosterior:
     """Return where on the object a recorded impact was (paper, section Contact Localization, and a posterior).
 
     `recording` is the path of a sound file, a Recording, or the samples of one channel. Bare samples are at
@@ -92,7 +92,7 @@ def _locator_of(field: SoundField) -> Locator:
     return Locator.of(field)
 
 
-def assess_match(found: ContactMap) -> ContactMap:
+def assess_match(found: ContactPosterior) -> ContactPosterior:
     """Return where an impact was, with a refusal where that cannot be found, and with a note where it is uncertain.
 
     A sound is rejected where an object's modes do not fit it, and where the field explains its gains, over all
@@ -152,7 +152,7 @@ def locate_impacts(
     settings: CaptureSettings | None = None,
     force: Force | float | int | ArrayLike | None = None,
     locator: Locator | None = None,
-) -> list[tuple[float, ContactMap]]:
+) -> list[tuple[float, ContactPosterior]]:
     """Return the onset of each impact in a recording, seconds, and its map, in order.
 
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `preprocess_recording`; `force`, of

@@ -16,7 +16,7 @@ from avmsf._utils.arrays import ArrayLike, as_directions, as_vectors, short_repr
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.likelihood import Force, Likelihood, PredictedGains, cosine_distance
 from avmsf.localization.prediction import (
     calibrate_tempering,
@@ -91,7 +91,7 @@ class Locator:
         *,
         highest: float | None = None,
         force: Force | float | int | ArrayLike | None = None,
-    ) -> ContactMap:
+    ) -> ContactPosterior:
         """Return the posterior of the contact for a sound that starts at its onset, at the field's rate.
 
         The sound has 20 ms or more; what is longer than the training sounds is cut off. Modes above `highest` Hz are
@@ -126,7 +126,7 @@ class Locator:
         probability = torch.softmax(exponent * found.log_likelihood, 0)
         if self.smoothing is not None:
             probability = torch.from_numpy(self.smoothing @ probability.numpy())
-        return ContactMap(
+        return ContactPosterior(
             self.points,
             length.distance(values, noise),
             probability,

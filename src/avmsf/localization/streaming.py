@@ -19,7 +19,7 @@ from torch import Tensor
 from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locate import assess_match
 from avmsf.localization.locator import Locator
 from avmsf.modal.inner_products import gram, poles_of
@@ -56,7 +56,7 @@ class LocatedImpact:
 
     seconds: float
     """Its onset, from the stream's first sample on."""
-    map: ContactMap
+    map: ContactPosterior
     """The posterior of its contact."""
     used_seconds: float
     """Length of its sound that the estimate uses."""

@@ -1,6 +1,6 @@
 """Figures of sounds, modes, gains and surfaces, with matplotlib.
 
-In go plain values of the other packages: tensors of sounds and points, `ModalBank`, `ContactMap`, `Surface`,
+In go plain values of the other packages: tensors of sounds and points, `ModalBank`, `ContactPosterior`, `Surface`,
 `SpectrumBand`. Out comes a `matplotlib.figure.Figure`, never a window, which `save_picture` writes as png, pdf or svg.
 Every figure has one style (`style.styled`), with colors that color-blind people tell apart.
 

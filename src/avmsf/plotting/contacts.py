@@ -15,7 +15,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
-from avmsf.localization.contact_map import ContactMap
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.plotting.clouds import ALL_SIDES, Side, draw_cloud
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 
@@ -32,7 +32,7 @@ _DRAWN = 6000
 
 @styled
 def draw_contact(
-    contact: ContactMap,
+    contact: ContactPosterior,
     *,
     title: str,
     others: Float[Tensor, "others 3"] | None = None,
@@ -70,7 +70,7 @@ def draw_contact(
     return figure
 
 
-def contact_colors(contact: ContactMap) -> Float[Tensor, "points 3"]:
+def contact_colors(contact: ContactPosterior) -> Float[Tensor, "points 3"]:
     """Return colors, 0 to 1, dark purple for a thousandth of the greatest probability and less, up to yellow."""
     likely = contact.probability.double()
     share = likely / likely.max().clamp_min(torch.finfo(torch.float64).tiny)
@@ -78,7 +78,7 @@ def contact_colors(contact: ContactMap) -> Float[Tensor, "points 3"]:
     return _heat(level)
 
 
-def write_contact_cloud(contact: ContactMap, path: Path) -> None:
+def write_contact_cloud(contact: ContactPosterior, path: Path) -> None:
     """Write the object's points with their colors as a binary `.ply` that any viewer of point clouds opens.
 
     The vertices have the floats `probability` (they sum to one) and `cosine_distance` beside place and color. Raises

@@ -20,7 +20,7 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfError
 from avmsf.field.sound_field import SoundField
-from avmsf.localization.contact_map import LEVEL, ContactMap, enlarged, symmetries_of
+from avmsf.localization.contact_map import LEVEL, ContactPosterior, enlarged, symmetries_of
 from avmsf.localization.locate import locate_impacts
 from avmsf.localization.locator import Locator
 from avmsf.studio.capture import CaptureEditor
@@ -77,7 +77,7 @@ class Finder:
         impacts = locate_impacts(self.field, recording, settings=self.settings, locator=self.locator)
         return [self._described(seconds, contact) for seconds, contact in impacts]
 
-    def _described(self, seconds: float, contact: ContactMap) -> dict[str, Any]:
+    def _described(self, seconds: float, contact: ContactPosterior) -> dict[str, Any]:
         values = contact.describe(self.symmetries, LEVEL)
         del values["cosine"]
         for each in (values, *values["equivalent_points"]):
