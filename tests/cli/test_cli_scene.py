@@ -1,6 +1,5 @@
 """From pictures, a mesh or Gaussians to a field on the command line: what is made, kept, made anew and refused."""
 
-import json
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -15,11 +14,11 @@ from avmsf.features.store import load_features, read_report
 from avmsf.field.store import load
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
-from avmsf.mesh.surface import write_surface
 from avmsf.photographs.folder import write_views
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.settings import sets
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
+from factories.verbs import results_of
 
 Streams = pytest.CaptureFixture[str]
 LIFT = sets("lift.encoder=descriptors lift.points=1200")
@@ -52,9 +51,9 @@ def kept(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return cache
 
 
-def made_now(streams: Streams) -> dict[str, bool]:
-    values = json.loads(streams.readouterr().out)
-    return {each["stage"]: each["fresh"] for each in values["stages"]}
+def made_by(streams: Streams, *words: object) -> dict[str, bool]:
+    """Return which stages a command has made anew."""
+    return {each["stage"]: each["fresh"] for each in results_of(streams, *words)[0]["stages"]}
 
 
 def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
@@ -83,14 +82,11 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
 ) -> None:
     cache = tmp_path / "cache"
     shutil.copytree(kept, cache)
-    words = ["fit", str(capture), "--cache", str(cache), *SMALL, "--json"]
-    assert main(words) == 0
+    words = ["fit", capture, "--cache", cache, *SMALL]
     kept_all = dict.fromkeys(("views", "cloud", "features", "modes", "fit"), False)
-    assert made_now(capsys) == kept_all
-    assert main([*words, "--set", "fit.learning_rate=2e-3"]) == 0
-    assert made_now(capsys) == kept_all | {"fit": True}
-    assert main([*words, "--set", "lift.components=4"]) == 0
-    assert made_now(capsys) == kept_all | {"features": True, "fit": True}
+    assert made_by(capsys, *words) == kept_all
+    assert made_by(capsys, *words, "--set", "fit.learning_rate=2e-3") == kept_all | {"fit": True}
+    assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
 @pytest.mark.slow
@@ -186,8 +182,7 @@ def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(
     words = ["fit", str(capture), "--cache", str(tmp_path / "cache"), "--gain-model", "smooth", *SMALL_SPLAT, *TINY]
     stages = {}
     for given in ([], ["--features", str(kept / "features.safetensors")]):
-        assert main([*words, "--set", "lift.encoder=facebook/dinov2-base", *given, "--json"]) == 0
-        values = json.loads(capsys.readouterr().out)
+        values, _ = results_of(capsys, *words, "--set", "lift.encoder=facebook/dinov2-base", *given)
         assert values["surface"] is not None
         stages[len(given)] = [each["stage"] for each in values["stages"]]
     assert stages == {
@@ -197,14 +192,13 @@ def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(
     assert len(load_features(tmp_path / "cache" / "points.safetensors").points) > 100
 
 
-def test_clouds_and_features_are_drawn(kept: Path, tmp_path: Path, capsys: Streams) -> None:
-    assert main(["info", str(kept / "cloud.ply"), "--plots", str(tmp_path / "a")]) == 0
-    words = ["info", str(kept / "features.safetensors")]
-    assert main([*words, "--plots", str(tmp_path / "b")]) == 0
-    out, _ = capsys.readouterr()
-    assert "features: descriptors" in out
-    assert [path.name for path in (tmp_path / "a").iterdir()] == ["cloud.png"]
-    assert [path.name for path in (tmp_path / "b").iterdir()] == ["features.png"]
+@pytest.mark.parametrize("name", ["cloud", "features"])
+def test_clouds_and_features_are_described_and_drawn(name: str, kept: Path, tmp_path: Path, capsys: Streams) -> None:
+    file = kept / ("cloud.ply" if name == "cloud" else "features.safetensors")
+    values, err = results_of(capsys, "info", file, "--plots", tmp_path)
+    assert values["kind"] == ("gaussians" if name == "cloud" else "features")
+    assert ("Gaussians, " if name == "cloud" else "features: descriptors") in err
+    assert [path.name for path in tmp_path.iterdir()] == [f"{name}.png"]
 
 
 def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Streams) -> None:
@@ -219,15 +213,11 @@ def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Stre
 def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     places = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([PLATE.length, PLATE.width])
-    write_surface(
-        Surface(torch.cat([places, torch.zeros(500, 1)], dim=1), torch.zeros(0, 3, dtype=torch.int64)),
-        folder / "surface.ply",
-    )
+    points = Surface(torch.cat([places, torch.zeros(500, 1)], dim=1), torch.zeros(0, 3, dtype=torch.int64))
+    points.write(folder / "surface.ply")
     assert main(["fit", str(folder), *FIT, *MODES]) == 0
-    assert sorted(each.name for each in (folder / ".avmsf").glob("*.stage.json")) == [
-        "field.safetensors.stage.json",
-        "modes.safetensors.stage.json",
-    ]
+    made = {each.name.partition(".")[0] for each in (folder / ".avmsf").glob("*.stage.json")}
+    assert made == {"field", "modes"}
     assert len(load(folder / ".avmsf" / "field.safetensors").gain_field.points) == 500
 
 

@@ -1,6 +1,5 @@
 """The object's surface as an output of its own: alone, in three formats, and of a reconstruction."""
 
-import json
 import warnings
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import trimesh
 
 from avmsf.cli import main
 from avmsf.cli.info import gains_at
-from avmsf.cli.paths import OutputError
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from avmsf.mesh import Surface, read_surface
@@ -19,12 +17,10 @@ from avmsf.photographs.folder import write_views
 from avmsf.plotting.surfaces import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 from factories.plate_capture import PLATE, TINY, fill_plate
-from factories.raising import raises
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
-from factories.verbs import run_verb
+from factories.verbs import results_of
 
 Streams = pytest.CaptureFixture[str]
-FIT = TINY[:-2]
 
 
 @pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
@@ -55,21 +51,11 @@ def test_pictures_become_a_closed_surface_that_is_kept(tmp_path: Path) -> None:
 def test_a_fit_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     write_surface_file(folder)
-    assert main(["fit", str(folder), "--gain-model", "smooth", *FIT, "--modes", "12", "--json"]) == 0
-    out, err = capsys.readouterr()
-    values = json.loads(out)
+    values, err = results_of(capsys, "fit", folder, "--gain-model", "smooth", *TINY)
     assert values["surface"] == str(folder / ".avmsf" / "surface.ply")
-    assert values["surface"] in err.replace("\n", "")
+    assert values["surface"] in err
     assert torch.equal(read_surface(values["surface"]).vertices, slab().vertices)
     assert "surface" in [each["stage"] for each in values["stages"]]
-
-
-def test_what_cannot_be_written_is_refused_first(tmp_path: Path, capsys: Streams) -> None:
-    with raises(OutputError, name="suffix", value=".stl"):
-        run_verb("fit", str(tmp_path), "--until", "surface", "-o", str(tmp_path / "surface.stl"))
-    assert main(["fit", str(tmp_path), "--until", "surface", "--output", str(tmp_path / "surface.obj")]) == 2
-    assert "surface.obj" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_surface_is_drawn_with_two_cuts_through_its_middle(tmp_path: Path) -> None:
@@ -94,11 +80,13 @@ def test_contacts_are_drawn_in_the_view_and_near_each_cut() -> None:
     assert len(across_x.lines[0].get_xdata()) == 0
 
 
-def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Path) -> None:
+def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()
     write_surface_file(folder)
-    assert main(["fit", str(folder), "--until", "surface", "--plots", str(tmp_path)]) == 0
+    values, err = results_of(capsys, "fit", folder, "--until", "surface", "--plots", tmp_path)
+    assert (values["kind"], values["triangles"]) == ("surface", len(slab().faces))
+    assert "closed, volume" in err
     assert (tmp_path / "surface.png").read_bytes().startswith(b"\x89PNG")
     contacts = bar_contacts(6)
     for name, made in (("with", elastic_field), ("without", positional_field)):

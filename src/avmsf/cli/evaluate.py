@@ -77,7 +77,7 @@ class Options(Configured):
     """Start of the scored sounds; peak: as the paper."""
     contact_data: ContactData = None
     """ObjectFolder Real's contacts: SonicGauss's lists."""
-    figures: Flag = False
+    figures: Annotated[tyro.conf.FlagCreatePairsOff[bool], arg("", "--plots")] = False
     """Also draw spectrograms, and heat maps with localize."""
 
     usual = EvaluationSettings()

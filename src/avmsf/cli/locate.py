@@ -14,7 +14,7 @@ from avmsf._utils.text import counted, format_number
 from avmsf.capture.settings import CaptureSettings
 from avmsf.cli.options import Common, Flag, Number, Unit
 from avmsf.cli.output import doing, next_command, note, print_json, say, show
-from avmsf.cli.paths import ContactTable, Existing, FieldFile, OutputError, OutputFolder, SettingsFile, arg
+from avmsf.cli.paths import ContactTable, Existing, FieldFile, OutputError, PictureFolder, SettingsFile, arg
 from avmsf.errors import AvmsfError, LocationError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Options(Common):
     """True contacts of several recordings: columns file,x,y,z, such as impacts.csv."""
     unit: Unit = "m"
     """Unit of the true contacts; the field is in meters."""
-    output: OutputFolder = None
+    output: PictureFolder = None
     """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
 
     def check_inputs(self) -> None:

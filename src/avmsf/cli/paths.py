@@ -110,6 +110,7 @@ ShapeFile = Annotated[Path | None, arg("MESH|PLY"), Existing("a mesh or Gaussian
 SettingsFile = Annotated[Path | None, arg("FILE.toml"), Existing("a capture.toml")]
 ContactData = Annotated[Path | None, arg("FOLDER"), Existing("ObjectFolder Real's contacts", ("a folder",))]
 OutputFolder = Annotated[Path | None, arg("FOLDER", "-o"), New()]
+PictureFolder = Annotated[Path | None, arg("FOLDER", "-o", "--plots"), New()]
 PlotsFolder = Annotated[Path | None, arg("FOLDER"), New()]
 CacheFolder = Annotated[Path | None, arg("FOLDER"), New()]
 ContactTable = Annotated[Path | None, arg("TABLE.csv"), Existing("a table of contacts")]

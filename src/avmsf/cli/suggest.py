@@ -10,7 +10,7 @@ import tyro
 from avmsf._utils.text import counted, format_number
 from avmsf.cli.options import Common, Flag, expect_capture, read_settings
 from avmsf.cli.output import doing, next_step, print_json, say, show, table
-from avmsf.cli.paths import FieldFile, OtherCapture, OutputFolder, SettingsFile
+from avmsf.cli.paths import FieldFile, OtherCapture, PictureFolder, SettingsFile
 from avmsf.errors import FitError
 
 TABLE, PICTURE = "suggested.csv", "suggested.png"
@@ -43,7 +43,7 @@ class Options(Common):
     """Suggest on all of the body's surface, also where no photograph shows it, such as the side that it stood on."""
     settings: SettingsFile = None
     """Use this capture.toml instead of the candidates' own."""
-    output: OutputFolder = None
+    output: PictureFolder = None
     """Folder for suggested.csv, the list of contacts, and suggested.png, the contacts on the object."""
 
     def check_inputs(self) -> None:
