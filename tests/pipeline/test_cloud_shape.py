@@ -1,23 +1,29 @@
-"""Gaussians as shapes: without photographs, without what is far away, and moved onto a mesh."""
+"""Gaussians as shapes: without photographs, without what is far away, moved onto a mesh, and of an object's folder."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
+from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
 from avmsf.mesh import Surface
 from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.pipeline.scene import without_far
 from avmsf.pipeline.shape import OFF_MESH, moved_onto
 from factories.ball_views import MIDDLE, RADIUS
 from factories.clouds import random_cloud
+from factories.plate_capture import fill_plate
 from factories.raising import raises
+from factories.sonicgauss_cases import cloud
 
 CELLS = 48
 
@@ -90,6 +96,8 @@ def test_gaussians_meters_away_are_left_out_and_a_long_thin_object_is_kept_whole
 
 
 SPHERE = trimesh.creation.icosphere(4, 0.1)
+
+
 SURFACE = Surface(torch.from_numpy(SPHERE.vertices).float(), torch.from_numpy(SPHERE.faces))
 
 
@@ -120,3 +128,15 @@ def test_points_of_another_frame_and_a_cloud_change_nothing() -> None:
     bare = Surface(SURFACE.vertices, SURFACE.faces[:0])
     assert moved_onto(features, far) is features
     assert moved_onto(features, bare) is features
+
+
+def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tmp_path: Path) -> None:
+    for name in ("shown", "hidden"):
+        fill_plate(tmp_path / "set" / name, surface=False)
+    given = cloud(200)
+    write_splats(given, tmp_path / "set" / "shown" / "splats.ply")
+    looks = ObjectInputs(CaptureCollection(tmp_path / "set"), tmp_path / "cache")
+    assert torch.equal(looks.cloud("shown").centers, given.centers)
+    assert torch.equal(looks.cloud("shown", views=12).centers, given.centers)
+    with pytest.raises(SceneError):
+        looks.cloud("hidden")

@@ -14,7 +14,7 @@ from scipy.interpolate import RBFInterpolator
 from avmsf.field.gains import kernels
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Visual
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
@@ -226,3 +226,37 @@ def test_a_plate_bends_if_its_places_are_many_not_its_contacts():
     places = alike(scattered(2, 8, seed=6))
     found, expected = (each.between(places, places) for each in (family, once))
     assert torch.allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def object_points() -> tuple[torch.Tensor, torch.Tensor]:
+    """Return a line of points whose features repeat after half of it."""
+    along = torch.linspace(0.0, 1.0, 41)[:-1]
+    angle = 4 * torch.pi * along
+    return along[:, None] * torch.tensor([1.0, 0.0, 0.0]), torch.stack([angle.cos(), angle.sin()], dim=1)
+
+
+def test_visual_kernels_are_the_written_ones():
+    """Features by the root mean square distance between those of points, alone and times those of positions."""
+    points, features = object_points()
+    known = alike(points[::7].double())
+    squares = torch.cdist(features.double(), features.double()).square()
+    similar = [torch.exp(-0.5 * squares / squares.mean() / length**2)[::7, ::7] for length in (0.25, 0.5, 1.0)]
+    apart = torch.cdist(known.points, known.points).square()
+    near = [torch.exp(-0.5 * apart / length**2) for length in (0.2, 0.4, 0.8)]
+    expected = torch.stack(similar + [one * other for one in near for other in similar])
+    # Whatever the unit of the features.
+    for unit in (1.0, 100.0):
+        found = Visual(known, 1.0, points, unit * features).kernels()
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0.0)
+
+
+def test_places_of_similar_features_share_gains():
+    points, features = object_points()
+    known = alike(points[:20:2].double())
+    values = features[:20:2, :1].to(torch.complex128) * torch.tensor([1.0, 2.0j], dtype=torch.complex128)
+    ones = torch.ones(2, dtype=torch.float64)
+    gains = MeasuredGains(values, 0 * ones, 100.0 * ones.cumsum(0), ones)
+    families = [Unstructured(known, 1.0), Visual(known, 1.0, points, features)]
+    found = fit_mixture(families, gains, points, directional=False).predict(points[20::2].double()).mean
+    torch.testing.assert_close(found[:, 0].real, values[:, 0].real.float(), atol=0.1, rtol=0.0)
+    torch.testing.assert_close(found[:, 1].imag, values[:, 1].imag.float(), atol=0.2, rtol=0.0)
