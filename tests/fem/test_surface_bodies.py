@@ -114,16 +114,13 @@ def test_the_aircraft_is_filled(shared: Path):
     assert 10 < float(found.bodies[0].elastic.frequency[0]) < 20
 
 
-def apart() -> Surface:
-    one, other = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.1, 0.1, 0.1))
-    other.apply_translation((0.3, 0.0, 0.0))
-    return surface_of(trimesh.util.concatenate([one, other]))
+APART = [trimesh.creation.box(bounds=[(x, 0.0, 0.0), (x + 0.1, 0.1, 0.1)]) for x in (0.0, 0.3)]
 
 
 @pytest.mark.parametrize(
     ("make", "thicknesses", "refused"),
     [
-        (apart, [None, 0.001], ["solid body", "wall of 1 mm"]),
+        (lambda: surface_of(trimesh.util.concatenate(APART)), [None, 0.001], ["solid body", "wall of 1 mm"]),
         (sheet, [0.2], ["wall of 200 mm"]),
         (ball, [0.04], ["wall of 40 mm"]),
     ],

@@ -118,18 +118,13 @@ def test_an_edited_field_has_no_quality_and_its_surroundings_no_next_contact():
     assert edited.quality is None
 
 
-def on_plate(train):
-    """Return a field whose points are those of the whole plate, the unit square."""
-    side = torch.linspace(0.0, 1.0, 30)
-    points = torch.cat([torch.cartesian_prod(side, side), torch.zeros(900, 1)], 1)
-    return fit(train, FeatureField.from_points(points), extract_modes(train), CONFIG)
-
-
 def test_the_next_contact_is_where_no_contact_is_and_lowers_the_expected_error_most(tmp_path):
     train = parted(strikes(20))[0]
     # Nothing was recorded on the right half of the plate.
     left = train.take(torch.nonzero(train.contacts[:, 0] < 0.5).flatten().tolist())
-    field = on_plate(left)
+    side = torch.linspace(0.0, 1.0, 30)
+    plate = torch.cat([torch.cartesian_prod(side, side), torch.zeros(900, 1)], 1)
+    field = fit(left, FeatureField.from_points(plate), extract_modes(left), CONFIG)
     assert field.quality.next_contact[0] > 0.5
     contact = torch.tensor(field.quality.next_contact, dtype=torch.float64)
     assert field.quality.next_distance == pytest.approx(float((left.contacts - contact).norm(dim=1).min()))

@@ -45,13 +45,9 @@ def test_without_noise_a_sound_is_its_modes():
     assert torch.equal(recorded.render(CONTACTS, noise=False), silent.render(CONTACTS))
 
 
-def with_noise(kind: str) -> SoundField:
-    origin = field().origin
-    return replace(field(), origin=replace(origin, config=replace(origin.config, residual_noise=kind)))
-
-
 def test_gaussian_noise_is_the_draw_of_the_fits_seed():
-    sound_field = with_noise("gaussian")
+    config = replace(field().origin.config, residual_noise="gaussian")
+    sound_field = replace(field(), origin=replace(field().origin, config=config))
     generator = torch.Generator().manual_seed(sound_field.origin.config.seed)
     magnitude = sound_field.residual.magnitude
     assert torch.equal(sound_field.noise(), shape_noise(magnitude, contacts=1, samples=2400, generator=generator)[0])

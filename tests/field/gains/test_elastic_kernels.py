@@ -23,10 +23,9 @@ from avmsf.field.gains.elastic import (
     Elastic,
     frequency_log_prior,
 )
-from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
+from avmsf.field.gains.fitting import WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import log_evidence
-from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
 from factories.gain_cases import SIZE, draw, families, impacts, measured, plate
 from oracles import gain_model as oracle
@@ -37,14 +36,6 @@ PROFILES = len(PERTURBATIONS) + len(WIDTHS)
 
 def family(count: int = 10) -> Elastic:
     return Elastic(impacts(count, seed=1), SIZE, plate())
-
-
-def row_of(profile: int, shape: int, remainder: int) -> int:
-    return (profile * SHAPES + shape) * len(RESIDUALS) + remainder
-
-
-def fitted(sites: Sites, *, elastic: bool, gains: MeasuredGains) -> MixtureGains:
-    return fit_mixture(families(sites, elastic=elastic), gains, sites.points.float(), directional=True)
 
 
 def test_kernels_are_the_written_ones():
@@ -66,7 +57,8 @@ def test_kernels_are_the_written_ones():
         mixed = (shapes * nearness) @ shapes[:count].T
         share = RESIDUALS[remainder]
         expected = (1.0 - share) * mixed / mixed[:count].trace() * count + share * smooth
-        assert torch.allclose(kernels[row_of(profile, shape, remainder)], expected, rtol=1e-5, atol=1e-5)
+        row = (profile * SHAPES + shape) * len(RESIDUALS) + remainder
+        assert torch.allclose(kernels[row], expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("memory", [0, 10**9])
@@ -86,7 +78,8 @@ def test_a_body_is_of_no_weight_for_what_it_does_not_have():
     foreign = replace(
         gains, values=affine[:, None] * torch.tensor([1.0, -0.3j, 0.5, 2.0, 1.0j], dtype=torch.complex128)
     )
-    own, other = (fitted(sites, elastic=True, gains=each) for each in (gains, foreign))
+    points = sites.points.float()
+    own, other = (fit_mixture(families(sites), each, points, directional=True) for each in (gains, foreign))
     assert isinstance(own.families[-1], Elastic)
     assert float(own.shares()[-1].min()) > 0.95
     shares = other.shares()[-1] if isinstance(other.families[-1], Elastic) else torch.zeros(1)

@@ -179,11 +179,6 @@ def test_smooth_kernels_are_the_written_ones():
     assert torch.allclose(family.kernels(), torch.stack(smooth + mixed), rtol=1e-9, atol=1e-12)
 
 
-def spline_case(dimensions: int, count: int) -> tuple[ThinPlate, Sites, torch.Tensor]:
-    points = scattered(dimensions, count)
-    return ThinPlate(alike(points), 0.4), alike(scattered(dimensions, 8, seed=6)), draw(count, 2, seed=7)
-
-
 def mean_of(family: ThinPlate, row: int, share: int, sites: Sites, values: torch.Tensor) -> torch.Tensor:
     """Return the Gaussian process's mean with one kernel and one noise share."""
     weights = torch.zeros(1, len(NOISE_SHARES), values.shape[1], dtype=torch.float64)
@@ -198,7 +193,8 @@ def mean_of(family: ThinPlate, row: int, share: int, sites: Sites, values: torch
 @pytest.mark.parametrize("share", range(len(NOISE_SHARES)))
 def test_the_thin_plate_mean_is_scipys_spline(dimensions, count, share):
     """But for the affine part, which shrinks by its share b of the variance to b / (b + noise)."""
-    family, sites, values = spline_case(dimensions, count)
+    family, values = ThinPlate(alike(scattered(dimensions, count)), 0.4), draw(count, 2, seed=7)
+    sites = alike(scattered(dimensions, 8, seed=6))
     bending = count >= 2 * (dimensions + 1)
     points = family.reference.points.numpy()
     _, _, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)

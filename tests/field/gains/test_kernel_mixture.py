@@ -98,12 +98,6 @@ def hypotheses(**changes) -> Hypotheses:
     return replace(Hypotheses(kernels, torch.tensor([0, 1, 1, 2]), prior, log_prior), **changes)
 
 
-def spread_of(given: KernelMixture, cross: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
-    """Return the standard deviation at places of these covariances with the contacts, and variances."""
-    mean = torch.einsum("hpc,hcs->ps", cross, given.solve())
-    return (own.mT @ given.scale + given.explained(cross) - mean.square()).sqrt()
-
-
 def test_evidence_is_the_textbook_one():
     values, floor, _ = drawn()
     found = log_evidence(*(torch.from_numpy(each.copy()) for each in (among(), values, floor)))
@@ -124,7 +118,8 @@ def test_evidence_does_not_depend_on_the_batches(monkeypatch):
 def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
     joint = torch.from_numpy(joint_kernels().copy())
     cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
-    mean, spread = torch.einsum("hpc,hcs->ps", cross, mixture().solve()), spread_of(mixture(), cross, own)
+    mean = torch.einsum("hpc,hcs->ps", cross, mixture().solve())
+    spread = (own.mT @ mixture().scale + mixture().explained(cross) - mean.square()).sqrt()
     for series in range(SERIES):
         expected = textbook_prediction(
             list(range(CONTACTS)), list(range(CONTACTS, CONTACTS + PLACES)), series, noise=False

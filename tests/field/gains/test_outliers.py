@@ -97,11 +97,6 @@ def _exchanged(sites: Sites, one: int, other: int) -> Sites:
     return sites.take(rows)
 
 
-def _recorded(sites: Sites) -> Impacts:
-    names = tuple(f"hit{row}" for row in range(len(sites)))
-    return Impacts(sites.points.float(), torch.zeros(len(sites), 1), 1.0, names, sites.directions.float())
-
-
 def _dense_ratio(ratios: PredictiveRatios, row: int, others: list[int]) -> float:
     """The definition: each contact given the others, series by series."""
     rows = [*others, row]
@@ -152,7 +147,9 @@ def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
         # Within two steps of the grid of where it was really hit.
         apart = torch.tensor(found[row].place, dtype=torch.float64) - true.points[row]
         assert float(apart.norm()) < 2.0 / 11.0
-    assert "hit16" in found[9].describe(_recorded(labels), with_body=False)
+    names = tuple(f"hit{row}" for row in range(CONTACTS))
+    train = Impacts(labels.points.float(), torch.zeros(CONTACTS, 1), 1.0, names, labels.directions.float())
+    assert "hit16" in found[9].describe(train, with_body=False)
 
 
 def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() -> None:

@@ -55,11 +55,6 @@ def measured(values: torch.Tensor) -> MeasuredGains:
     return MeasuredGains(values, torch.zeros(modes, dtype=torch.float64), frequency, torch.ones_like(frequency))
 
 
-def fit(found: Symmetries, known: Sites, values: torch.Tensor) -> MixtureGains:
-    symmetric = Symmetric(known, SIZE, groups_of(found), directional=True)
-    return fit_mixture([symmetric], measured(values), known.points.float(), directional=True)
-
-
 def test_kernels_are_the_written_ones() -> None:
     """Of one mirror: thin plates of all images, the impacts' and the moved ones', with signs of both characters."""
     known, others = impacts(9), impacts(5, seed=1)
@@ -115,7 +110,9 @@ def test_gains_on_the_other_side_are_those_of_the_mirrored_contact_with_the_mode
     generator = torch.Generator().manual_seed(3)
     values = torch.randn(6, 4, generator=generator, dtype=torch.complex128)
     # Contacts 0 to 2 are struck on both sides, which gives the sign; 3 to 5 on one alone.
-    model = fit(of(X), known, torch.cat([values, sign * values[:3]]))
+    family = Symmetric(known, SIZE, groups_of(of(X)), directional=True)
+    gains = measured(torch.cat([values, sign * values[:3]]))
+    model = fit_mixture([family], gains, known.points.float(), directional=True)
     beyond = reflected(near).take(torch.arange(3, 6))
     here = near.take(torch.arange(3, 6))
     there, own = (model.predict(each.points, each.directions).mean for each in (beyond, here))
