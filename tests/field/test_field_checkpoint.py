@@ -127,6 +127,16 @@ def test_patience_survives_an_interruption(tmp_path):
     expect_same(fitted(tmp_path / "state", keys, config=PATIENT), uninterrupted(PATIENT))
 
 
+def test_a_look_that_was_cut_off_is_taken_again(tmp_path, monkeypatch):
+    stopped = uninterrupted(PATIENT).origin.report["steps"]
+    # Sounds are made once a step after the warm-up and once a look, of which the first comes before those steps.
+    with monkeypatch.context() as patch:
+        interrupt(patch, TrainingRun, "sounds", call=stopped + stopped // 10 + 1)
+        with pytest.raises(KeyboardInterrupt):
+            fitted(tmp_path / "state", config=PATIENT)
+    expect_same(fitted(tmp_path / "state", config=PATIENT), uninterrupted(PATIENT))
+
+
 def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):
     """A fit that is killed leaves a checkpoint behind as well, from the last time that one was due."""
     monkeypatch.setattr("avmsf._utils.checkpoint.SAVE_SECONDS", 0.0)

@@ -130,6 +130,7 @@ def test_without_a_direction_an_impact_goes_straight_into_the_body_or_as_its_nei
         assumed = field.training.directions[near]
     expect_close(parts(field, contacts), parts(field, contacts, assumed))
     expect_close(parts(field, contacts, torch.zeros(7, 3)), parts(field, contacts))
+    expect_close(parts(field, contacts, 3.0 * BLOWS), parts(field, contacts, BLOWS))
     askew = field.predict(contacts, BLOWS).mean
     assert torch.equal(askew, field.predict(contacts).mean) == (name not in DIRECTIONAL)
 

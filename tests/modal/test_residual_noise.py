@@ -102,6 +102,14 @@ def test_residual_is_hardly_raised_by_what_modes_leave_over():
     assert float(lowest.max()) > 16.0
 
 
+def test_residual_renders_with_the_spectrum_it_was_estimated_from():
+    magnitude = torch.linspace(2.0, 0.5, 33)
+    recorded = shape_noise(magnitude, contacts=16, samples=32000, generator=seeded(3))
+    found = estimate_residual(recorded, torch.zeros_like(recorded), bins=33)
+    assert isinstance(found, Residual)
+    assert float((20 * torch.log10(found.magnitude / magnitude)).abs().max()) < 1.0  # dB
+
+
 def test_sounds_that_are_their_modes_alone_leave_next_to_no_residual():
     # 120 dB below the modes' first swing.
     assert float(estimate_residual(ringing(3), ringing(3), bins=129).magnitude.max()) < 1e-6

@@ -205,6 +205,11 @@ def test_leave_out_is_what_the_other_groups_predict(groups):
                 assert one[rows, series].numpy() == pytest.approx(other, rel=rel, abs=1e-9)
 
 
+def test_a_lone_group_is_predicted_as_silence():
+    mean = mixture().leave_out(torch.zeros(CONTACTS, dtype=torch.int64)).mean
+    assert torch.allclose(mean, torch.zeros_like(mean), atol=1e-9)
+
+
 def test_weights_sum_to_one_and_none_is_negligible():
     given = hypotheses()
     found, kept = posterior(given, mixture().values, mixture().floor)

@@ -150,6 +150,13 @@ def test_at_most_as_many_as_asked_for_are_kept():
     assert float((few.frequency[:, None] - strongest).abs().amin(0).max()) < 1.0
 
 
+def test_a_single_sound_is_enough_without_its_contact():
+    impacts, truth = recorded(-40.0, seconds=0.25)
+    found = extract_sounds(impacts.sounds[:1], sample_rate=RATE)
+    assert len(found.bank) > 10
+    assert float((found.bank.frequency[:, None] / truth.frequency - 1).abs().amin(1).median()) < 1e-4
+
+
 def test_the_papers_method_finds_the_plates_strong_modes():
     impacts, truth = recorded(-40.0)
     found = extract_modes(impacts, ShortTime())

@@ -88,6 +88,12 @@ def test_selection_takes_the_modes_from_among_the_rest(others: tuple[list[float]
     assert chosen.damping.tolist() == TRUTH.damping.tolist()
 
 
+def test_selection_among_hundreds_spans_its_chunks():
+    chosen = select(record(TRUTH, noise=1e-3), with_others(torch.linspace(100.5, 3900.5, 400).tolist(), [4.0] * 400))
+    for pitch in TRUTH.frequency.tolist():
+        assert pitch in chosen.frequency
+
+
 def test_pruning_takes_one_of_two_that_are_equal():
     chosen = selection(record(TRUTH, noise=1e-3))
     kept = chosen.prune(with_others([300.0, 1500.0], [5.4, 33.0]), range_db=60.0)
