@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from avmsf.evaluation.case_run import Evaluation
 
 from avmsf.datasets import CaptureCollection
 from avmsf.errors import SceneError
-from avmsf.evaluation.case_run import Evaluation
 from avmsf.evaluation.methods import FunctionMethod
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.registry import PROTOCOLS

@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -158,23 +159,14 @@ def test_extraction_aligns_first_and_its_file_keeps_the_alignment(tmp_path: Path
 def test_measured_impulse_responses_cut_by_a_threshold_get_their_starts_back() -> None:
     files = sorted((SHARED / "tree43" / "impacts").glob("*.wav")) or sorted((SHARED / "tree43").glob("**/*.wav"))
     recordings = [read_recording(path) for path in files]
-    rate = recordings[0].sample_rate
-    onsets = [find_onset(each.response(), sample_rate=rate) for each in recordings]
-    length = min(each.frames - onset for each, onset in zip(recordings, onsets, strict=True))
-    lead = max(onsets)
-    files_ = [torch.from_numpy(each.response()).float() for each in recordings]
-    before = [
-        torch.cat([torch.full((lead - onset,), torch.nan), file[:onset]])
-        for file, onset in zip(files_, onsets, strict=True)
+    rate, sounds = recordings[0].sample_rate, [each.response() for each in recordings]
+    onsets = [find_onset(each, sample_rate=rate) for each in sounds]
+    lead, length = max(onsets), min(len(each) - onset for each, onset in zip(sounds, onsets, strict=True))
+    padded = [
+        np.concatenate([np.full(lead - onset, np.nan), each[: onset + length]])
+        for each, onset in zip(sounds, onsets, strict=True)
     ]
-    impacts = Impacts(
-        contacts=torch.zeros(len(files_), 3),
-        sounds=torch.stack([file[onset : onset + length] for file, onset in zip(files_, onsets, strict=True)]),
-        sample_rate=rate,
-        names=tuple(path.name for path in files),
-        before=torch.stack(before),
-        after=torch.zeros(len(files_), 0),
-    )
+    impacts = cut(torch.from_numpy(np.stack(padded)), rate=rate, lead=lead, samples=length)
     found = align(impacts)
     assert len(set(onsets)) > 1
     assert error(found.delays, -torch.tensor(onsets, dtype=torch.float64)) < 0.05
