@@ -1,4 +1,4 @@
-"""One gain field of every kind, for a plate whose mode shapes are known in closed form, made in a moment."""
+"""A plate whose mode shapes are products of cosines: impacts, gain models of them, a gain field of every kind."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,11 +8,12 @@ from pathlib import Path
 import torch
 
 from avmsf.features.feature_field import FeatureField
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import KernelFamily, Sites
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import BodyGains
@@ -20,13 +21,20 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from factories.gain_cases import SIDES, SIZE, draw, families, plate
+from factories.made_modes import sliding_plate
 
-BANK = ModalBank(
-    torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64),
-    torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64),
-)
-"""Measured modes, each a little off one of the plate's elastic ones."""
+SIDES = (0.24, 0.17, 0.004)
+SIZE = float(torch.tensor(SIDES, dtype=torch.float64).norm())
+POSITIONAL = (Unstructured, Smooth, ThinPlate)
+
+
+@cache
+def plate() -> ElasticModes:
+    return sliding_plate()
+
+
+def draw(*size: int, seed: int) -> torch.Tensor:
+    return torch.rand(*size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) - 0.5
 
 
 def places(count: int, *, seed: int) -> torch.Tensor:
@@ -37,11 +45,51 @@ def places(count: int, *, seed: int) -> torch.Tensor:
     return drawn.float().double()
 
 
-def blows(contacts: torch.Tensor, *, seed: int) -> torch.Tensor:
+def blows(contacts: torch.Tensor, *, seed: int, askew: float = 0.5) -> torch.Tensor:
     """Return unit vectors into the plate, up to some thirty degrees askew."""
-    askew = draw(len(contacts), 3, seed=seed)
-    askew[:, 2] = -contacts[:, 2].sign()
-    return askew / askew.norm(dim=1, keepdim=True)
+    directions = 2.0 * askew * draw(len(contacts), 3, seed=seed)
+    directions[:, 2] = -contacts[:, 2].sign()
+    return directions / directions.norm(dim=1, keepdim=True)
+
+
+def impacts(count: int, *, seed: int, askew: float = 0.5) -> Sites:
+    points = places(count, seed=seed)
+    return Sites(points, blows(points, seed=seed + 1000, askew=askew))
+
+
+def families(sites: Sites, *, elastic: bool = True) -> list[KernelFamily]:
+    found: list[KernelFamily] = [kind(sites, SIZE) for kind in POSITIONAL]
+    return [*found, Elastic(sites, SIZE, plate())] if elastic else found
+
+
+def measured(sites: Sites, *, noise: float = 0.02, factor: float = 1.0) -> MeasuredGains:
+    """Return gains of the plate's first five modes, the imaginary parts a third of the real ones, and noise."""
+    shapes = plate().gains(sites.points, sites.directions)[:, :5] * torch.linspace(2.0, 0.5, 5, dtype=torch.float64)
+    parts = torch.stack([shapes, shapes / 3.0], dim=2)
+    parts = parts + noise * shapes.std() * (12.0**0.5) * draw(*parts.shape, seed=3)
+    damping = torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64)
+    variance = torch.full((5,), 1e-5, dtype=torch.float64)
+    return MeasuredGains(torch.view_as_complex(parts), variance, factor * plate().frequency[:5], damping)
+
+
+@cache
+def model(*, elastic: bool = True, directional: bool = True, count: int = 14) -> MixtureGains:
+    """Return the model of some impacts, two of them at one place; the second mode is affine, the last one noise."""
+    sites = impacts(count, seed=1)
+    sites = sites.take(torch.tensor([*range(count - 1), 0]))
+    gains, points = measured(sites), impacts(50, seed=9).points.float()
+    gains.values[:, 1] += sites.directions[:, 2] * (1.0 + sites.points @ (40.0 * draw(3, seed=6))) * (300.0 - 100.0j)
+    gains.values[:, 4] = torch.view_as_complex(draw(count, 2, seed=7))
+    return fit_mixture(families(sites, elastic=elastic), gains, points, directional=directional)
+
+
+BANK = ModalBank(
+    torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64),
+    torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64),
+)
+
+
+"""Measured modes, each a little off one of the plate's elastic ones."""
 
 
 def struck(count: int, *, noise: float = 0.05) -> tuple[Sites, torch.Tensor]:
@@ -116,6 +164,8 @@ FIELDS: dict[str, Callable[[], GainModel]] = {
     "elastic": cache(elastic),
     "body": cache(body),
 }
+
+
 """All there are, by what tests call them; the same object at every call."""
 
 

@@ -27,7 +27,7 @@ from avmsf.field.gains.fitting import WeighedFamily, fit_mixture, hypotheses_of,
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import log_evidence
 from avmsf.field.gains.model import series_of
-from factories.gain_cases import SIZE, draw, families, impacts, measured, plate
+from factories.made_fields import SIZE, draw, families, impacts, measured, plate
 from oracles import gain_model as oracle
 
 SHAPES = 6

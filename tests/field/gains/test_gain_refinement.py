@@ -7,7 +7,7 @@ import torch
 
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.modal.modes import ModalBank
-from factories.gain_cases import draw, model
+from factories.made_fields import draw, model
 
 CONTACTS, MODES = 14, 5
 ORDER = torch.tensor([2, 4, 0])

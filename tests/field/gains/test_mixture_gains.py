@@ -11,7 +11,7 @@ from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
-from factories.gain_cases import draw, families, impacts, measured, model
+from factories.made_fields import draw, families, impacts, measured, model
 from oracles import gain_model as oracle
 
 ASKED = impacts(9, seed=5)

@@ -24,7 +24,7 @@ from avmsf.field.gains.outliers import (
     predicts_better,
     set_aside,
 )
-from factories.gain_cases import POSITIONAL, draw
+from factories.made_fields import POSITIONAL, draw
 from oracles import gain_model as oracle
 
 CONTACTS, MODES = 20, 12

@@ -1,7 +1,6 @@
 """Recordings aligned with one another: delays that are known, recordings that cannot be aligned, measured data."""
 
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,6 @@ RATE, SAMPLES, LEAD = 16000.0, 6000, 320
 FREQUENCY = torch.tensor([431.0, 902.5, 1370.0, 2204.0, 3317.0, 4750.0], dtype=torch.float64)
 DAMPING = torch.tensor([12.0, 18.0, 15.0, 30.0, 40.0, 60.0], dtype=torch.float64)
 PHASE = torch.tensor([0.3, 1.2, -0.7, 2.4, 0.0, 1.9], dtype=torch.float64)
-SHARED = Path(os.environ.get("AVMSF_SHARED", "../shared")).resolve() / "data"
 
 
 def gains(contacts: int, modes: int, *, seed: int = 0) -> Tensor:
@@ -155,10 +153,8 @@ def test_extraction_aligns_first_and_its_file_keeps_the_alignment(tmp_path: Path
     assert coherence(found.gains.to(torch.complex128), found.bank.damping) > 0.99
 
 
-@pytest.mark.skipif(not (SHARED / "tree43").is_dir(), reason="needs the measured data: set AVMSF_SHARED")
-def test_measured_impulse_responses_cut_by_a_threshold_get_their_starts_back() -> None:
-    files = sorted((SHARED / "tree43" / "impacts").glob("*.wav")) or sorted((SHARED / "tree43").glob("**/*.wav"))
-    recordings = [read_recording(path) for path in files]
+def test_measured_impulse_responses_cut_by_a_threshold_get_their_starts_back(shared: Path) -> None:
+    recordings = [read_recording(path) for path in sorted((shared / "tree43").glob("**/*.wav"))]
     rate, sounds = recordings[0].sample_rate, [each.response() for each in recordings]
     onsets = [find_onset(each, sample_rate=rate) for each in sounds]
     lead, length = max(onsets), min(len(each) - onset for each, onset in zip(sounds, onsets, strict=True))
