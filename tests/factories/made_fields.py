@@ -87,8 +87,6 @@ BANK = ModalBank(
     torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64),
     torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64),
 )
-
-
 """Measured modes, each a little off one of the plate's elastic ones."""
 
 
@@ -164,8 +162,6 @@ FIELDS: dict[str, Callable[[], GainModel]] = {
     "elastic": cache(elastic),
     "body": cache(body),
 }
-
-
 """All there are, by what tests call them; the same object at every call."""
 
 

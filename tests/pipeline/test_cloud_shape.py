@@ -105,8 +105,6 @@ def test_gaussians_meters_away_are_left_out_and_a_long_thin_object_is_kept_whole
 
 
 SPHERE = trimesh.creation.icosphere(4, 0.1)
-
-
 SURFACE = Surface(torch.from_numpy(SPHERE.vertices).float(), torch.from_numpy(SPHERE.faces))
 
 
