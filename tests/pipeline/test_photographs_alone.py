@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from avmsf.cli import main
-from avmsf.cli.report import field_lines
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
 from avmsf.mesh import read_surface
@@ -52,7 +51,7 @@ def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams)
 
 
 @pytest.mark.slow
-def test_the_thickness_of_a_wall_reaches_the_report_and_the_summary(tmp_path: Path, capsys: Streams) -> None:
+def test_the_thickness_of_a_wall_reaches_the_report(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "mug"
     shutil.copytree(EXAMPLE_FOLDER, folder)
     words = [*sets("splat.steps=100 splat.start_points=3000 lift.encoder=descriptors")]
@@ -65,8 +64,6 @@ def test_the_thickness_of_a_wall_reaches_the_report_and_the_summary(tmp_path: Pa
     assert found["median"] == pytest.approx(EXAMPLE.thickness, rel=0.4)
     field = load(made["field"])
     assert field.origin.report["thickness"] == found
-    interval = f"{1000 * found['low']:.2g} to {1000 * found['high']:.2g} mm"
-    assert any(interval in line for line in field_lines(field, Path("field.safetensors"), settings=False))
     # Gaussians lie below the surface; the field's points are on it.
     surface = read_surface(folder / CACHE / SURFACE)
     nearest = ClosestPoints(surface.vertices.double().numpy()[surface.faces.numpy()])

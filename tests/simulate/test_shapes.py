@@ -206,9 +206,8 @@ def test_colors_tell_places_apart() -> None:
 
 
 def test_what_cannot_be_made() -> None:
-    with raises(SimulationError, name="kind", value="cup") as caught:
+    with raises(SimulationError, name="kind", value="cup"):
         make_shape("cup")
-    assert ", ".join(sorted(KINDS)) in str(caught.value)
     with raises(SimulationError, name="seed", value=-1):
         make_shape("mug", seed=-1)
     with raises(SimulationError, name="size", value=0.0):
