@@ -66,8 +66,6 @@ def test_a_recording_holds_room_noise_alone_before_its_impact(simulation: Simula
 def test_the_truth_names_the_impact_in_every_file(simulation: Simulation, tmp_path: Path) -> None:
     write_simulation(simulation, tmp_path / "plate")
     truth = read_truth(tmp_path / "plate")
-    assert simulation.truth.starts is not None
-    assert torch.equal(truth.starts, simulation.truth.starts)
     recordings = [
         torch.from_numpy(read_recording(tmp_path / "plate" / name).channel(1)).float() for name in truth.names
     ]

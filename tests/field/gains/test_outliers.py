@@ -77,10 +77,6 @@ def _fit(sites: Sites, measured: MeasuredGains) -> Fit:
     return fit
 
 
-def _every(sites: Sites) -> Int[Tensor, " rows"]:
-    return torch.arange(len(sites))
-
-
 def _places() -> Sites:
     one = torch.linspace(0.0, 1.0, 12, dtype=torch.float64)
     grid = torch.cartesian_prod(one, one, torch.zeros(1, dtype=torch.float64))
@@ -92,7 +88,7 @@ def _found(sites: Sites, measured: MeasuredGains) -> tuple[Outlier, ...]:
 
 
 def _exchanged(sites: Sites, one: int, other: int) -> Sites:
-    rows = _every(sites)
+    rows = torch.arange(len(sites))
     rows[[one, other]] = rows[[other, one]]
     return sites.take(rows)
 
@@ -109,7 +105,7 @@ def _dense_ratio(ratios: PredictiveRatios, row: int, others: list[int]) -> float
 def _ratios() -> PredictiveRatios:
     sites = _sites(9)
     measured = _gains(sites, noise=0.1)
-    return PredictiveRatios(_fit(sites, measured)(_every(sites), WIDE_NOISE_SHARES), sites, measured)
+    return PredictiveRatios(_fit(sites, measured)(torch.arange(len(sites)), WIDE_NOISE_SHARES), sites, measured)
 
 
 def test_ratio_is_that_of_student_densities_given_the_other_contacts() -> None:
@@ -153,7 +149,7 @@ def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
 
 
 def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() -> None:
-    true, rows = _sites(), _every(_sites())
+    true, rows = _sites(), torch.arange(CONTACTS)
     text = sorted(range(CONTACTS), key=lambda row: str(row + 1))
     for given, order in (
         ([f"{row + 1}.wav" for row in text], torch.tensor(text).argsort()),
@@ -229,7 +225,7 @@ def test_gains_that_no_place_explains_are_no_wrong_label() -> None:
     measured = _gains(sites)
     generator = torch.Generator().manual_seed(0)
     measured.values[6] = 5.0 * torch.randn(MODES, dtype=torch.complex128, generator=generator)
-    ratios = PredictiveRatios(_fit(sites, measured)(_every(sites), WIDE_NOISE_SHARES), sites, measured)
+    ratios = PredictiveRatios(_fit(sites, measured)(torch.arange(len(sites)), WIDE_NOISE_SHARES), sites, measured)
     assert 6 in set_aside(ratios)
     assert _found(sites, measured) == ()
 
@@ -240,7 +236,7 @@ def test_leaving_wrong_labels_out_predicts_the_others_better_and_right_ones_not(
     for labels, better in ((_exchanged(true, 9, 16), True), (true, False)):
         measured = _gains(true)
         fit = _fit(labels, measured)
-        fewer, whole = fit(rows, NOISE_SHARES), fit(_every(true), NOISE_SHARES)
+        fewer, whole = fit(rows, NOISE_SHARES), fit(torch.arange(CONTACTS), NOISE_SHARES)
         kept = replace(measured, values=measured.values[rows])
         assert predicts_better(fewer.leave_one_out(), whole.leave_one_out()[rows], kept) == better
 
