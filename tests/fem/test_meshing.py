@@ -108,6 +108,8 @@ def test_noise_is_taken_out_of_a_mesh_by_as_much_as_it_has():
         before = np.sqrt((surface(clean.vertices + noise).distances ** 2).mean())
         assert np.sqrt((surface(found.vertices).distances ** 2).mean()) < 0.35 * before
         assert roughness(found) < 8.0
+        whole = checked(surface_of(mesh_of(clean.vertices + noise, clean.faces)), log=lambda words: None)
+        assert roughness(whole.mesh) < 8.0
         assert found.volume == pytest.approx(mesh_of(clean.vertices + noise, clean.faces).volume, rel=1e-9)
 
 
