@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from matplotlib.colors import to_hex
 
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
+from avmsf.plotting.clouds import ALL_SIDES, view_from
 from avmsf.plotting.contacts import contact_colors, draw_contact, write_contact_cloud
 from avmsf.plotting.pictures import save_picture
+from avmsf.plotting.style import FIRST, SECOND
 from factories.made_fields import BANK, positional
 
 RATE, SAMPLES = 8000.0, 3000
@@ -62,6 +65,13 @@ def test_a_picture_shows_both_maps_and_the_marks(tmp_path: Path) -> None:
     assert any("elevation -" in title for title in titles)
     assert "blue: " in figure.get_suptitle()
     assert "red: " in figure.get_suptitle()
+    # The plate is flat: from above and from below all marks are seen at their places.
+    points = contact().points.double().numpy()
+    marks = points[[0, 1, STRUCK, 5]] - (points.min(0) + points.max(0)) / 2
+    for axes, side in zip(figure.axes, ALL_SIDES * 2, strict=False):
+        if abs(side[1]) == 75.0:
+            assert np.allclose(axes.collections[1].get_offsets(), (marks @ view_from(side).T)[:, :2])
+            assert [to_hex(each) for each in axes.collections[1].get_edgecolors()] == [*["#ffffff"] * 2, FIRST, SECOND]
     assert "red: " not in draw_contact(contact(), title="hit.wav", sides=((0.0, 25.0),)).get_suptitle()
     save_picture(figure, tmp_path / "hit.png")
     assert (tmp_path / "hit.png").read_bytes().startswith(b"\x89PNG")

@@ -72,6 +72,19 @@ def name_axes(axes: Axes, view: Float[np.ndarray, "3 3"]) -> None:
             axes.annotate(name, (0.06, 0.06), (across, along), arrowprops=arrow, color=FIRST, **systems)
 
 
+_BEHIND = 0.04
+"""Depth over the object's size by which a point in front hides a mark."""
+
+
+def in_front(seen: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """Return which marks no point hides, both in a side's own frame."""
+    size = float(np.linalg.norm(np.ptp(seen, axis=0)))
+    apart = np.linalg.norm(seen[None, :, :2] - marks[:, None, :2], axis=2)
+    nearer = seen[None, :, 2] - marks[:, None, 2] > _BEHIND * size
+    visible: np.ndarray = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
+    return visible
+
+
 _INCHES = 3.0
 """Width of an object in its picture."""
 

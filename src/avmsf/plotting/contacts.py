@@ -2,30 +2,26 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
 from avmsf.localization.contact_map import ContactPosterior
-from avmsf.plotting.clouds import ALL_SIDES, Side, draw_cloud
+from avmsf.plotting.clouds import ALL_SIDES, Side, draw_cloud, in_front, view_from
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 
 _DECADES = 3.0
 """Powers of ten below the likeliest that colors tell apart."""
-_FOUND, _OTHER, _TRUTH = to_rgb(FIRST), (0.95, 0.95, 0.95), to_rgb(SECOND)
-"""Blue and red, the paper's colors of the found and the true contact."""
-_MARK = 0.018
-"""Radius of a mark over the object's diagonal."""
-_Mark: TypeAlias = tuple[Tensor, tuple[float, float, float]]
+_LEGEND = {FIRST: "blue: most probable", "white": "white: equivalent", SECOND: "red: true contact"}
+"""Colors of marks; blue and red are the paper's of the found and the true contact."""
 _DRAWN = 6000
 """Points in a picture, about."""
 
@@ -47,22 +43,24 @@ def draw_contact(
     # The likeliest point and its neighborhood must not fall between those that are drawn.
     rows = torch.arange(0, len(points), max(1, len(points) // _DRAWN))
     rows = torch.unique(torch.cat([rows, torch.topk(contact.probability, min(64, len(points))).indices]))
-    marks: list[_Mark] = [] if others is None else [(each, _OTHER) for each in others]
-    marks.append((contact.position, _FOUND))
-    if truth is not None:
-        marks.append((truth, _TRUTH))
+    marks = [] if others is None else [("white", each) for each in others]
+    marks += [(FIRST, contact.position), *([] if truth is None else [(SECOND, truth)])]
     low, high = float(contact.distance.min()), float(contact.distance.max())
     high = max(high, low + 1e-6)
     colors = {
-        "probability": contact_colors(contact),
-        "cosine distance": _heat(1.0 - (contact.distance.double() - low) / (high - low)),
+        "probability": contact_colors(contact)[rows],
+        "cosine distance": _heat(1.0 - (contact.distance.double() - low) / (high - low))[rows],
     }
-    painted = {name: _marked(points, each, marks)[rows] for name, each in colors.items()}
-    used = {color for _, color in marks}
-    named = ((_FOUND, "blue: most probable"), (_OTHER, "white: equivalent"), (_TRUTH, "red: true contact"))
-    legend = ", ".join(words for color, words in named if color in used)
-    figure = draw_cloud(points[rows], painted, title=f"{title}\n{legend}", sides=sides)
+    legend = ", ".join(words for color, words in _LEGEND.items() if color in dict(marks))
+    figure = draw_cloud(points[rows], colors, title=f"{title}\n{legend}", sides=sides)
     panels = np.array(figure.axes).reshape(len(colors), -1)
+    drawn, places = points[rows].double().numpy(), np.stack([each.double().numpy() for _, each in marks])
+    middle, edges = (drawn.min(0) + drawn.max(0)) / 2, np.array([color for color, _ in marks])
+    for axes, side in zip(panels.flat, [*sides] * len(colors), strict=True):
+        frame = view_from(side).T
+        visible = in_front(drawn @ frame, places @ frame)
+        spots = (places[visible] - middle) @ frame
+        axes.scatter(spots[:, 0], spots[:, 1], s=80, facecolors="none", edgecolors=edges[visible], linewidths=2)
     likely = ScalarMappable(Normalize(-_DECADES, 0.0), SEQUENTIAL)
     figure.colorbar(likely, ax=list(panels[0]), shrink=0.75, label="log10 of probability / maximum")
     distant = ScalarMappable(Normalize(low, high), f"{SEQUENTIAL}_r")
@@ -98,20 +96,3 @@ def write_contact_cloud(contact: ContactPosterior, path: Path) -> None:
 
 def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:
     return torch.from_numpy(colormaps[SEQUENTIAL](level.clamp(0.0, 1.0).numpy())[:, :3]).float()
-
-
-def _marked(
-    points: Float[Tensor, "points 3"],
-    colors: Float[Tensor, "points 3"],
-    marks: Sequence[_Mark],
-) -> Float[Tensor, "points 3"]:
-    """Return the colors with those of the points about each mark replaced by the mark's."""
-    painted = colors.clone()
-    diagonal = float((points.amax(0) - points.amin(0)).norm())
-    for place, color in marks:
-        apart = (points.double() - place.double()).norm(dim=1)
-        near = (apart <= max(_MARK * diagonal, float(apart.min()))).nonzero().flatten()
-        ring = near[apart[near] >= 0.5 * _MARK * diagonal]
-        # A ring leaves the heat in its middle visible; where points are sparse, the nearest one alone is painted.
-        painted[ring if len(ring) >= 6 else near] = torch.tensor(color)
-    return painted

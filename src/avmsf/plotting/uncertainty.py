@@ -1,6 +1,5 @@
 """Pictures of predictive uncertainty: over the object from several sides, with contacts, and of a spectrum."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -9,13 +8,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.field.posterior import SpectrumBand
-from avmsf.plotting.clouds import ALL_SIDES, name_axes, plane_of, view_from
+from avmsf.plotting.clouds import ALL_SIDES, in_front, name_axes, plane_of, view_from
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, scatter_surface, styled, titled_figure
 
 _RANGE_DB = 100.0
 """What a spectrum shows below its highest level."""
-_BEHIND = 0.04
-"""Depth over the object's size by which a point in front hides a mark."""
 
 
 @styled
@@ -47,7 +44,7 @@ def draw_uncertainty(
         axes.set_axis_off()
         name_axes(axes, frame.T)
         if crosses is not None:
-            visible = (crosses @ frame)[_in_front(places @ frame, crosses @ frame)]
+            visible = (crosses @ frame)[in_front(places @ frame, crosses @ frame)]
             for color, size, width in (("white", 45, 3.5), ("black", 35, 1.5)):
                 axes.scatter(visible[:, 0], visible[:, 1], c=color, marker="x", s=size, linewidths=width)
     hidden = False
@@ -79,21 +76,12 @@ def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     return figure
 
 
-def _in_front(seen: np.ndarray, marks: np.ndarray) -> np.ndarray:
-    """Return which marks no point hides, both in a side's own frame."""
-    size = float(np.linalg.norm(np.ptp(seen, axis=0)))
-    apart = np.linalg.norm(seen[None, :, :2] - marks[:, None, :2], axis=2)
-    nearer = seen[None, :, 2] - marks[:, None, 2] > _BEHIND * size
-    visible: np.ndarray = ~np.any((apart < size / math.sqrt(len(seen))) & nearer, axis=1)
-    return visible
-
-
 def _number(
     grid: np.ndarray, frames: list[np.ndarray], places: np.ndarray, marks: np.ndarray, away: np.ndarray | None
 ) -> bool:
     """Draw each mark's number on all sides that show it, or on one of those that do not; return if there are such."""
     faces = np.stack([np.zeros(len(marks)) if away is None else -(away @ frame)[:, 2] for frame in frames])
-    shown = np.stack([_in_front(places @ frame, marks @ frame) for frame in frames])
+    shown = np.stack([in_front(places @ frame, marks @ frame) for frame in frames])
     if away is not None:
         shown &= faces > 0
     hidden = np.logical_not(shown.any(axis=0))
