@@ -41,7 +41,7 @@ def test_held_out_views_of_a_ball_are_predicted_and_its_gaussians_lie_on_it() ->
     outwards = torch.nn.functional.normalize(cloud.centers - torch.tensor(MIDDLE), dim=1)
     assert float((axes * outwards).sum(1).abs().median()) > 0.9
     assert cloud.degree == 2
-    assert not any(getattr(cloud, name).requires_grad for name in NAMES)
+    assert not any(getattr(cloud, each.name).requires_grad for each in fields(cloud))
 
 
 @pytest.mark.parametrize("background", ["found", "random"])
