@@ -1,9 +1,11 @@
 """DiffSound: its objectives, what it recovers of bodies that sound as it assumes, and its gains and weights."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,14 +22,14 @@ from avmsf.baselines.diffsound.material_fit import (
 )
 from avmsf.baselines.diffsound.renderer import DiffSound, leveled
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError, LocationError, SimulationError
+from avmsf.errors import AvmsfError, EvaluationError, LocationError, SimulationError
 from avmsf.fem.isotropic import isotropic_modes
 from avmsf.fem.material import GLASS
-from avmsf.mesh.surface import Surface
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
+from factories.made_sheet import sheet_over
 from oracles.block import block
 
 RATE, SAMPLES = 48_000.0, 24_000
@@ -138,14 +140,9 @@ def test_it_recovers_the_material_of_a_body_that_sounds_as_it_assumes():
 
 @pytest.mark.slow
 def test_it_recovers_the_thickness_of_a_wall_that_lies_between_those_computed():
-    across, along = torch.meshgrid(torch.linspace(0, 0.2, 9), torch.linspace(0, 0.14, 7), indexing="ij")
     # A little bent, so that stretching takes part: thickness and stiffness of a flat sheet cannot be told apart.
-    points = torch.stack([across, along, 2.0 * across**2], dim=-1).reshape(-1, 3)
-    rows = torch.arange(63).reshape(9, 7)
-    a, b, c, d = (each.flatten() for each in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
-    walls = body_family(
-        Surface(points, torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])), count=8, dofs=2000
-    )
+    sheet = sheet_over(np.linspace(0, 0.2, 9), np.linspace(0, 0.14, 7), lambda x, y: 2.0 * x**2)
+    walls = body_family(sheet, count=8, dofs=2000)
     thickness = 1.2 * walls.thickness[1]
     frequency = walls.at(thickness).modes(replace(GLASS, young=1.3 * GLASS.young, poisson=POISSON)).frequency
     damping = 8.0 + 2e-8 * (2.0 * math.pi * frequency).square()
@@ -165,18 +162,15 @@ def test_twice_the_signal_renders_twice_as_loud():
     torch.testing.assert_close(twice.render(CONTACTS), 2.0 * rendered(True).render(CONTACTS), rtol=1e-3, atol=1e-6)
 
 
-def test_an_impact_from_the_other_side_has_opposite_gains():
+def test_gains_are_those_of_the_mode_shapes_over_frequencies_and_opposite_from_the_other_side():
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(4, 3)
     gains = rendered().gains(CONTACTS, directions=down)
     torch.testing.assert_close(rendered().gains(CONTACTS, directions=-down), -gains)
     # From above that is straight into the surface.
     torch.testing.assert_close(rendered().gains(CONTACTS), gains)
-
-
-def test_gains_are_those_of_the_mode_shapes_over_frequencies():
     modes = known_fit().modes()
     along = modes.at(CONTACTS)[:, :, 2]
-    level = rendered().gains(CONTACTS) / (along / rendered().bank.frequency)
+    level = gains / (along / rendered().bank.frequency)
     torch.testing.assert_close(level, level[0, 0].expand_as(level), rtol=1e-9, atol=0.0)
 
 
@@ -213,36 +207,38 @@ def test_a_rendered_sound_is_located_where_it_was_struck():
         rendered().distance(gains, torch.zeros(SAMPLES))
 
 
-def test_a_material_that_the_table_lacks_is_refused():
-    with pytest.raises(SimulationError):
-        DiffSoundConfig(material="unobtainium")
-
-
-def test_silent_recordings_are_refused():
-    with pytest.raises(EvaluationError):
-        clip_spectra(struck(torch.zeros(1, 12)))
-    with pytest.raises(EvaluationError):
-        leveled(known_fit(), curve(), struck(torch.zeros(1, 12)), SILENT, weighted=True)
-
-
 def test_a_silent_recording_among_others_counts_for_nothing():
     amplitudes = torch.ones(2, 12)
     amplitudes[1] = 0.0
     assert len(clip_spectra(struck(amplitudes)).clips) == 1
 
 
-@pytest.mark.parametrize("scale", [1000.0, 1e-4])
-def test_a_body_in_the_wrong_unit_is_refused(scale):
+def of_scale(scale: float) -> BodyFamily:
     solid = block((0.19 * scale, 0.11 * scale, 0.013 * scale), (6, 4, 1))
-    other = BodyFamily((isotropic_modes(solid, count=12),), ())
-    with pytest.raises(EvaluationError):
-        fit_material(clip_spectra(struck(torch.ones(1, 12))), curve(), other)
+    return BodyFamily((isotropic_modes(solid, count=12),), ())
 
 
-def test_recordings_that_are_too_dull_are_refused():
-    frequency, _ = true_modes()
-    with pytest.raises(EvaluationError):
-        DampingCurve.of(ModalBank(frequency, torch.full_like(frequency, 2000.0)))
+REFUSED: dict[str, tuple[type[AvmsfError], Callable[[], object]]] = {
+    "an unknown material": (SimulationError, lambda: DiffSoundConfig(material="unobtainium")),
+    "silence": (EvaluationError, lambda: clip_spectra(struck(torch.zeros(1, 12)))),
+    "silence to level": (
+        EvaluationError,
+        lambda: leveled(known_fit(), curve(), struck(torch.zeros(1, 12)), SILENT, weighted=True),
+    ),
+    "dull sounds": (
+        EvaluationError,
+        lambda: DampingCurve.of(ModalBank(true_modes()[0], torch.full((12,), 2e3).double())),
+    ),
+    "a body in millimeters": (EvaluationError, lambda: fit_material(clip_spectra(simulated()), curve(), of_scale(1e3))),
+    "a tiny body": (EvaluationError, lambda: fit_material(clip_spectra(simulated()), curve(), of_scale(1e-4))),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_be_fitted_is_refused(what):
+    error, call = REFUSED[what]
+    with pytest.raises(error):
+        call()
 
 
 def test_a_search_may_start_on_its_bounds_and_finds_the_least():

@@ -48,11 +48,9 @@ def tuned(level: float = 1.0, seed: int = 0) -> TunedRenderer:
 
 
 def test_straight_paths_arrive_exactly_whatever_the_steps():
-    generator = torch.Generator().manual_seed(0)
-    data, noise = torch.randn(2, 3, 5, 4, generator=generator, dtype=torch.float64)
-    for steps in (1, 7, 50):
-        found = integrate(lambda state, times: noise - data, noise, steps=steps)
-        torch.testing.assert_close(found, data)
+    data, noise = torch.randn(2, 3, 5, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for steps in (1, 7):
+        torch.testing.assert_close(integrate(lambda state, times: noise - data, noise, steps=steps), data)
 
 
 def test_gaussian_data_are_reached_to_first_order_in_the_step():
@@ -241,7 +239,7 @@ def lively_network() -> SmallSonicGauss:
     return network
 
 
-def test_the_contact_and_the_object_change_the_velocity():
+def test_the_contact_and_the_object_change_the_velocity_and_the_order_of_tokens_does_not():
     network = lively_network()
     latents, times = torch.randn(1, PATCHES, LATENTS), torch.tensor([0.5])
     features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
@@ -249,25 +247,12 @@ def test_the_contact_and_the_object_change_the_velocity():
     for other in (network.condition(features, place + 0.2), network.condition(features + 0.5, place)):
         difference = network(latents, times, other) - base
         assert float(difference.abs().max()) > 1e-3 * float(base.abs().max())
+    turned = network(latents, times, network.condition(features[:, [2, 0, 3, 1]], place))
+    torch.testing.assert_close(turned, base, rtol=0, atol=1e-4 * float(base.abs().max()))
 
 
-def test_the_order_of_gaussian_tokens_changes_nothing():
-    network = lively_network()
-    latents, times = torch.randn(1, PATCHES, LATENTS), torch.tensor([0.5])
-    features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
-    one, other = (
-        network(latents, times, network.condition(each, place)) for each in (features, features[:, [2, 0, 3, 1]])
-    )
-    torch.testing.assert_close(one, other, rtol=0, atol=1e-4 * float(one.abs().max()))
-
-
-@pytest.fixture
-def _few_iterations(monkeypatch):
+def test_a_sound_depends_on_its_contact_the_seed_and_the_level_alone(monkeypatch):
     monkeypatch.setattr(small, "_ITERATIONS", 1)
-
-
-@pytest.mark.usefixtures("_few_iterations")
-def test_a_sound_depends_on_its_contact_alone_and_on_the_seed():
     renderer = tuned()
     contacts = impacts(2, seed=3).contacts
     together = renderer.render(contacts)
@@ -277,13 +262,8 @@ def test_a_sound_depends_on_its_contact_alone_and_on_the_seed():
     assert torch.equal(tuned().render(contacts), together)
     assert not torch.equal(tuned(seed=1).render(contacts), together)
     assert renderer.render(contacts[:0]).shape == (0, together.shape[1])
-
-
-@pytest.mark.usefixtures("_few_iterations")
-def test_levels_follow_those_of_the_recordings():
-    contacts = impacts(2, seed=3).contacts
-    soft, loud = tuned().render(contacts), tuned(level=1000.0).render(contacts)
-    torch.testing.assert_close(loud, 1000.0 * soft, rtol=0, atol=1e-2 * float(loud.abs().max()))
+    loud = tuned(level=1000.0).render(contacts)
+    torch.testing.assert_close(loud, 1000.0 * together, rtol=0, atol=1e-2 * float(loud.abs().max()))
 
 
 def test_silence_is_refused():

@@ -130,12 +130,11 @@ def test_missing_tensors_other_shapes_and_other_models_are_refused_by_name(folde
 
 
 def test_missing_and_damaged_files_are_refused_by_name(folder):
-    (folder / "model_3.safetensors").write_bytes(b"no weights")
-    with raises(EvaluationError, file=folder / "model_3.safetensors"):
-        PublishedSonicGauss.load(folder, TINY)
-    (folder / "model_3.safetensors").unlink()
-    with raises(EvaluationError, file=folder / "model_3.safetensors"):
-        PublishedSonicGauss.load(folder, TINY)
+    path = folder / "model_3.safetensors"
+    for damage in (lambda: path.write_bytes(b"no weights"), path.unlink):
+        damage()
+        with raises(EvaluationError, file=path):
+            PublishedSonicGauss.load(folder, TINY)
 
 
 def grid(side: int) -> torch.Tensor:
