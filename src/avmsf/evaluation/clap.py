@@ -57,41 +57,30 @@ class Clap:
         Raises EvaluationError where transformers is missing, where the weights are neither here nor to be downloaded,
         and for a folder that holds another model or a part of one.
         """
-        what = f"a folder with a CLAP model, or a name such as {DEFAULT}"
+        name, what = str(source), f"a folder with a CLAP model, or a name such as {DEFAULT}"
         folder = model_folder(source, what, raising=EvaluationError)
         try:
             from transformers import ClapModel, ClapProcessor
         except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-            advice = "pip install 'avmsf[eval]'"
-            raise EvaluationError.expected(
-                "an installed package", got=str(error), name="transformers", advice=advice
-            ) from error
-        place = folder or str(source)
+            got, advice = str(error), "pip install 'avmsf[eval]'"
+            raise EvaluationError.expected("a package", got=got, name="transformers", advice=advice) from error
+        download = f"hf download {DEFAULT if folder else name} --local-dir FOLDER"
+        advice = f"on a computer with a network run {download}, copy FOLDER here, and give its path"
         try:
-            loaded: Any = ClapModel.from_pretrained(place, output_loading_info=True)
-            (model, report), processor = loaded, ClapProcessor.from_pretrained(place)
+            loaded: Any = ClapModel.from_pretrained(folder or name, output_loading_info=True)
+            (model, report), processor = loaded, ClapProcessor.from_pretrained(folder or name)
         except Exception as error:  # transformers, safetensors and the hub's client have their own errors
+            got = f"none ({download_failure(error)})"
             raise EvaluationError.expected(
-                "a CLAP model",
-                str(source),
-                got=f"none ({download_failure(error)})",
-                file=folder,
-                name="source",
-                advice=_how_to_download(DEFAULT if folder else str(source)),
+                "a CLAP model", name, got=got, file=folder, name="source", advice=advice
             ) from error
         # Any weight that is not there would be left random.
-        missing = tuple(sorted(name for name in report["missing_keys"] if not name.endswith("position_ids")))
+        missing = tuple(sorted(each for each in report["missing_keys"] if not each.endswith("position_ids")))
         if missing:
-            raise EvaluationError.expected(
-                "all weights of a CLAP model",
-                missing,
-                got=f"{len(missing)} missing such as {missing[0]}",
-                file=place,
-                name="weights",
-                advice=_how_to_download(DEFAULT),
-            )
+            wanted, got = "all weights of a CLAP model", f"{len(missing)} missing such as {missing[0]}"
+            raise EvaluationError.expected(wanted, missing, got=got, file=folder or name, name="weights", advice=advice)
         model.eval().requires_grad_(False)
-        return cls(model, processor, str(source), _digest_of(model, processor))
+        return cls(model, processor, name, _digest_of(model, processor))
 
     @property
     def sample_rate(self) -> float:
@@ -161,12 +150,6 @@ def _digest_of(model: Any, processor: Any) -> str:
     return digest.hexdigest()
 
 
-def _how_to_download(name: str) -> str:
-    return (
-        f"on a computer with a network run hf download {name} --local-dir FOLDER, copy FOLDER here, and give its path"
-    )
-
-
 class ClapCurve:
     """The CLAP score of a field's sound at one contact over the steps of an edit; step 0 is the unedited field."""
 
@@ -203,8 +186,7 @@ class ClapCurve:
 def _read_scores(path: Path, clap: Clap) -> dict[int, float]:
     try:
         read = read_json(path)
-        scores = {int(step): float(score) for step, score in read["scores"]}
-        digest = read["digest"]
+        scores, digest = {int(step): float(score) for step, score in read["scores"]}, read["digest"]
     except (OSError, ValueError, TypeError, KeyError) as error:
         advice = "delete the file to continue"
         raise EditError.expected("CLAP scores", got=str(error), file=path, advice=advice) from error

@@ -273,8 +273,7 @@ class _Report:
         dataset, name = self.experiment
         about = f"{PROTOCOLS[name].title} " if name in PROTOCOLS else ""
         cases = [case for record in self.records for case in record.cases if case.label == self.label]
-        several = f" ({self.label})" if len(self.tables) > 1 else ""
-        settings = self.identity["metrics"], self.identity["modes"]
+        several, settings = f" ({self.label})" if len(self.tables) > 1 else "", ("metrics", "modes")
         return Section(
             f"{name} on {dataset}",
             (
@@ -291,7 +290,7 @@ class _Report:
                 "unit and level. With the level full-scale, an object's sounds are multiplied by one factor that "
                 "brings its loudest recording to a peak of one.",
                 WARNING,
-                "Settings of metrics: {}. Of modes: {}.".format(*map(_listed, settings)),
+                "Settings of metrics: {}. Of modes: {}.".format(*(_listed(self.identity[each]) for each in settings)),
             ),
         )
 
@@ -359,7 +358,7 @@ class _Report:
         for method in self.identity["methods"]:
             found = [each["methods"][method] for each in times if method in each["methods"]]
             if found:
-                rows.append(_row(method, {step: fmean(each[step] for each in found) for step in steps}, steps))
+                rows.append((method, *(format_number(fmean(each[step] for each in found)) for step in steps)))
         if times:
             rows.append(("shared: modes and features", format_number(fmean(each["shared"] for each in times)), _DASH))
         text = "Seconds on one thread, mean over objects, sum over a protocol's cases, without computing metrics."
@@ -369,11 +368,9 @@ class _Report:
         return Section("Time per object", (text,), ("method", "fit", "render the test contacts"), tuple(rows))
 
     def failures(self) -> Section:
-        failures, columns = failures_of(self.records), ("object", "case", "method", "failure")
-        if not failures:
-            return Section("Failures", ("None.",))
-        rows = tuple(tuple(each[column] or "all" for column in columns) for each in failures)
-        return Section("Failures", (), (*columns[:-1], "reason"), rows)
+        rows = tuple(tuple(value or "all" for value in each.values()) for each in failures_of(self.records))
+        columns = ("object", "case", "method", "reason") if rows else ()
+        return Section("Failures", () if rows else ("None.",), columns, rows)
 
     def _best(self, found: Mapping[str, Mapping[str, Mean]]) -> frozenset[tuple[int, int]]:
         """Return the best cells of each metric's column, among the methods that have it of all objects that have it."""

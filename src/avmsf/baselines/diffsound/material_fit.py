@@ -116,10 +116,7 @@ class DampingCurve:
     @classmethod
     def of(cls, bank: ModalBank) -> "DampingCurve":
         """Return the curve of extracted modes. Raises EvaluationError where all die away in a few milliseconds."""
-        frequency, damping = (
-            bank.frequency.detach().cpu().double().numpy(),
-            bank.damping.detach().cpu().double().numpy(),
-        )
+        frequency, damping = (each.detach().cpu().double().numpy() for each in (bank.frequency, bank.damping))
         slow = (damping > 0.0) & (damping < _FASTEST_DECAY) & (frequency > BAND[0]) & (frequency < _CURVE_END)
         if not slow.any():
             wanted, got = f"a mode below {_FASTEST_DECAY:g} 1/s for DiffSound", f"none of {len(bank)}"
@@ -191,22 +188,12 @@ def fit_material(
         lowest = float(family.bodies[0].modes(starts[0]).frequency[0])
         wanted, got = f"modes from {BAND[0]:g} to {BAND[1]:g} Hz", f"a lowest mode at {lowest:.3g} Hz"
         raise EvaluationError.expected(wanted, lowest, got=got, name="frequency", advice="give the mesh's unit")
-    count, steps = len(spectra.clips), config.transport_steps
-    best, _ = problem.descended(
-        best,
-        lambda point, step: spectra.transport(*problem.sound(point), row=step % count),
-        steps,
-        rate=_TRANSPORT_RATE * _PUBLISHED_STEPS[0] / max(steps, 1),
-        decay=_TRANSPORT_DECAY ** (10.0 / max(steps, 1)),
-    )
-    steps = config.difference_steps
-    _, best = problem.descended(
-        best,
-        lambda point, step: spectra.difference(problem.sound(point)[0]),
-        steps,
-        rate=min(_DIFFERENCE_RATE * _PUBLISHED_STEPS[1] / max(steps, 1), _MAX_RATE),
-        decay=_DIFFERENCE_DECAY ** (20.0 / max(steps, 1)),
-    )
+    steps = max(config.transport_steps, 1)
+    rate, decay = _TRANSPORT_RATE * _PUBLISHED_STEPS[0] / steps, _TRANSPORT_DECAY ** (10.0 / steps)
+    best, _ = problem.descended(best, problem.transport, config.transport_steps, rate=rate, decay=decay)
+    steps = max(config.difference_steps, 1)
+    rate, decay = min(_DIFFERENCE_RATE * _PUBLISHED_STEPS[1] / steps, _MAX_RATE), _DIFFERENCE_DECAY ** (20.0 / steps)
+    _, best = problem.descended(best, problem.difference, config.difference_steps, rate=rate, decay=decay)
     if config.search:
         best = minimize_within(problem.bounds, problem.loss, best, generations=config.search)
         for _ in range(_ROUNDS if family.walled else 0):
@@ -238,6 +225,10 @@ def _around(point: Float64[Tensor, "3"], bounds: Float64[Tensor, "2 3"]) -> Floa
     return torch.stack([torch.maximum(point - reach, bounds[0]), torch.minimum(point + reach, bounds[1])])
 
 
+_Loss = Callable[[Float64[Tensor, "3"], int], Float[Tensor, ""]]
+"""Of a point, at a step."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """Clips, dampings and bodies. A point is log(E / rho), Poisson's ratio and log(thickness)."""
@@ -256,18 +247,18 @@ class _Problem:
         """Return the mean difference of spectra; infinite where nothing is heard."""
         with torch.no_grad():
             try:
-                return float(self.spectra.difference(self.sound(point)[0]))
+                return float(self.difference(point, 0))
             except EvaluationError:
                 return math.inf
 
+    def transport(self, point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
+        return self.spectra.transport(*self.sound(point), row=step % len(self.spectra.clips))
+
+    def difference(self, point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
+        return self.spectra.difference(self.sound(point)[0])
+
     def descended(
-        self,
-        start: Float64[Tensor, "3"],
-        loss: Callable[[Float64[Tensor, "3"], int], Float[Tensor, ""]],
-        steps: int,
-        *,
-        rate: float,
-        decay: float,
+        self, start: Float64[Tensor, "3"], loss: _Loss, steps: int, *, rate: float, decay: float
     ) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
         """Return where Adam ends on the loss of a point at a step, and the place on the way where it was least."""
         point = start.clone().requires_grad_()
