@@ -46,7 +46,7 @@ def _cost(settings: Settings) -> Iterator[Record]:
         for name, wall in (("unknown", None), ("filled", 0.0)):
             cache = Path(temporary) / name
             for kept in ("", ".cached"):
-                taken = apart(fit_cost, folder, cache, wall, 3000 if settings.quick else 40_000)
+                taken = apart(fit_cost, folder, cache, wall, 5000 if settings.quick else 40_000)
                 yield from records(taken, group=name + kept)
 
 
@@ -101,7 +101,7 @@ def _frequencies(settings: Settings) -> Iterator[Record]:
     rows = []
     for name, recipe in settings.some(list(SIM20.items())):
         true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, log=lambda message: None)
-        dofs, messages = 3000 if settings.quick else 40_000, list[str]()
+        dofs, messages = 5000 if settings.quick else 40_000, list[str]()
         begun = processor_seconds()
         made = SurfaceBodies(true.surface, thicknesses=[None], count=COMPARED, dofs=dofs, log=messages.append)
         modes = made.bodies[0].elastic
