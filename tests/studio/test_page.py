@@ -1,6 +1,5 @@
 """The page in a browser: what is clicked is struck, what is painted is true, and nothing is lost or overwritten."""
 
-import base64
 import io
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +8,7 @@ import pytest
 import soundfile
 import torch
 
-from plate_page import LIVE, SIDES, Open, answer, on_screen, plate_shapes, plate_table, wav, words_on
+from plate_page import LIVE, SIDES, Open, answer, on_screen, plate_shapes, plate_table, words_on
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Request, Route
@@ -23,10 +22,6 @@ SPACING = SIDES[0] / 30
 def last_place(page: "Page") -> torch.Tensor:
     """Return where the last blow fell, meters."""
     return torch.tensor(page.evaluate("avmsf.studio.contacts.position(avmsf.studio.last.row)"))
-
-
-def packed(values: torch.Tensor) -> str:
-    return base64.b64encode(values.float().numpy().astype("<f4").tobytes()).decode()
 
 
 @pytest.mark.parametrize("kind", ["mesh", "gaussians", "points"])
@@ -128,54 +123,6 @@ def test_the_table_tells_pitch_decay_and_level_at_the_contact(plain: "Page") -> 
     page.click("th[data-column='level'] button")
     first = page.locator("tbody tr").first.get_attribute("data-mode")
     assert first == str(int(table.gains[row].abs().argmax()))
-
-
-def test_a_dropped_recording_is_located_and_painted(visit: Open) -> None:
-    sent: list[bytes] = []
-    table = plate_table()
-    probability = torch.exp(-((table.points - table.points[77]).norm(dim=1) ** 2) / 0.0004)
-    probability /= probability.sum()
-    blow = {
-        "position": table.points[77].tolist(),
-        "row": 77,
-        "probability": packed(probability),
-        "distance": packed(1 - probability),
-        "credible_region": {"probability": 0.9, "radius": 0.012, "surface_fraction": 0.031},
-        "explained_energy": 0.97,
-        "multimodal": True,
-        "equivalent_points": [{"position": table.points[300].tolist(), "probability": 0.2, "message": "mirrored"}],
-        "notes": ["Quiet: the answer is less sure."],
-    }
-
-    def locate(route: "Route", request: "Request") -> None:
-        sent.append(request.post_data_buffer or b"")
-        answer(route, {"impacts": [blow]})
-
-    page = visit(live=LIVE, before=lambda page: page.route("**/locate", locate))
-    page.evaluate(
-        """(text) => {
-             const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-             const dataTransfer = new DataTransfer();
-             dataTransfer.items.add(new File([bytes], "blow.wav", { type: "audio/wav" }));
-             window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
-           }""",
-        base64.b64encode(wav()).decode(),
-    )
-    page.wait_for_selector("#sheet-find dl")
-    assert sent == [wav()]
-    values = torch.tensor(page.evaluate("[...avmsf.painted().values]"))
-    expected = 1 + (probability / probability.max()).clamp(min=1e-4).log10() / 4
-    torch.testing.assert_close(values, expected, atol=1e-5, rtol=0)
-    text = page.inner_text("#sheet-find")
-    for words in ("12.0 mm", "3.1 % of the surface", "97 %", "20 %: mirrored", "Quiet: the answer is less sure."):
-        assert words in text
-    # Labels are put in their places when the next picture is drawn.
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    box = page.locator(".mark .label", has_text="equivalent").bounding_box()
-    x, y = on_screen(page, table.points[300])
-    assert box is not None
-    assert abs(box["y"] + box["height"] / 2 - y) < 3
-    assert 0 < box["x"] - x < 30
 
 
 def test_the_microphone_records_what_is_heard(visit: Open) -> None:

@@ -1,5 +1,6 @@
 """The page and its studio together, the page without a network, and what the page may run."""
 
+import base64
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -15,11 +16,11 @@ from avmsf.studio.guard import policy_of
 from avmsf.studio.opening import open_target
 from avmsf.studio.routes import PAGE
 from opened_plate import open_plate, plate_field, wav
-from plate_page import plate_object, plate_table, upload, words_on
+from plate_page import on_screen, plate_object, plate_table, words_on
 from served import wait_until
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Route
 
 pytestmark = pytest.mark.page
 WATCH = "window.refused = []; addEventListener('securitypolicyviolation', (e) => refused.push(e.violatedDirective));"
@@ -43,17 +44,54 @@ def test_pictures_that_show_nothing_are_said_to_and_can_be_tried_again(
     assert page.evaluate("avmsf.studio.live.job") is not None
 
 
-def test_a_field_is_struck_and_the_recording_of_it_located(serving: Any, visit_studio: Any, tmp_path: Path) -> None:
-    page = visit_studio(serving(open_plate(tmp_path / "home")))
+def test_a_field_is_struck_and_a_dropped_recording_of_it_located(
+    serving: Any, visit_studio: Any, tmp_path: Path
+) -> None:
+    server = serving(open_plate(tmp_path / "home", "elastic"))
+    page = visit_studio(server)
     row = page.evaluate("avmsf.strike(60, { force: 2 })")
     place = torch.tensor(page.evaluate(f"avmsf.studio.contacts.position({row})"))
     sound = torch.tensor(page.evaluate(f"avmsf.renderOffline([{{ row: {row} }}]).then((sound) => [...sound])"))
-    expected = plate_field().render(place[None])[0]
+    expected = plate_field("elastic").render(place[None])[0]
     assert (sound - expected).abs().max() < 1e-4 * expected.abs().max()
-    page.click("#tab-find")
-    page.set_input_files("#sheet-find input[type=file]", upload(content=wav(expected.numpy())))
+    recording, other = wav(expected.numpy()), plate_field().gain_field.points[100].tolist()
+
+    def ambiguous(route: "Route") -> None:
+        answer = route.fetch().json()
+        point = {"position": other, "probability": 0.2, "message": "mirrored"}
+        answer["impacts"][0] |= {"equivalent_points": [point], "notes": ["Quiet: less certain."]}
+        route.fulfill(json=answer)
+
+    page.route("**/locate", ambiguous)
+    page.evaluate(
+        """(text) => {
+             const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+             const dataTransfer = new DataTransfer();
+             dataTransfer.items.add(new File([bytes], "impact.wav", { type: "audio/wav" }));
+             window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
+           }""",
+        base64.b64encode(recording).decode(),
+    )
     page.wait_for_selector("#sheet-find dl")
-    assert page.evaluate("[...avmsf.painted().values]").index(1.0) == row
+    [found] = server.ask("POST", "locate", recording).words["impacts"]
+    probability = np.frombuffer(base64.b64decode(found["probability"]), "<f4")
+    expected_paint = 1 + np.log10(np.maximum(probability / probability.max(), 1e-4)) / 4
+    np.testing.assert_allclose(page.evaluate("[...avmsf.painted().values]"), expected_paint, atol=1e-5)
+    text = page.inner_text("#sheet-find")
+    for words in (
+        f"{1000 * found['credible_region']['radius']:.1f} mm radius",
+        "20 %: mirrored",
+        "Quiet: less certain.",
+    ):
+        assert words in text
+    # Labels are put in their places when the next picture is drawn.
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    for label, position in (("estimate", found["position"]), ("equivalent", other)):
+        box = page.locator(".mark .label", has_text=label).bounding_box()
+        x, y = on_screen(page, position)
+        assert box is not None
+        assert abs(box["y"] + box["height"] / 2 - y) < 3
+        assert 0 < box["x"] - x < 30
 
 
 def test_the_page_needs_no_more_than_it_is_allowed(serving: Any, browser: "Browser", tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -56,7 +55,6 @@ class Showcase:
         self.opened, self.editor = opened, editor
         self.meters = 1.0 if opened.object is not None else opened.settings.surface_meters
         self._shown: OrderedDict[int, Shown] = OrderedDict()
-        self._lock = Lock()
 
     @property
     def current(self) -> Shown:
@@ -69,27 +67,24 @@ class Showcase:
 
     def show(self, revision: Revision) -> None:
         """Make a revision's files. Raises the errors of `make_bundle`, and StudioError without geometry."""
-        with self._lock:
-            sampled, mute = self._sampled(revision), revision.field is None
-            if self._is_other_field(revision):
-                strikes, remarks = self._strikes(revision.field)
-                shown, surface = find_object(self.opened), self._surface(revision.field)
-                bundle = make_bundle(
-                    sampled, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute
-                )
-                manifest, files, remarks = {**bundle.manifest}, bundle.files, remarks + bundle.remarks
-            else:
-                before, bundle = self.current, make_bundle(sampled, mute=mute)
-                kept = {part: before.manifest[part] for part in ("object", "surface", "strikes")}
-                manifest, files = {**bundle.manifest, **kept}, {**before.files, **bundle.files}
-                remarks = before.remarks
-            manifest["name"] = revision.name or manifest["name"] or self.opened.name
-            # By revision, so that a page never reads one's manifest with another's numbers.
-            file = {"file": f"revisions/{revision.number}/field.bin"}
-            manifest["tensors"] = {name: {**tensor, **file} for name, tensor in manifest["tensors"].items()}
-            self._shown[revision.number] = Shown(manifest, files, sampled, revision, remarks)
-            while len(self._shown) > _CACHED_REVISIONS:
-                self._shown.popitem(last=False)
+        sampled, mute = self._sampled(revision), revision.field is None
+        if self._is_other_field(revision):
+            strikes, remarks = self._strikes(revision.field)
+            shown, surface = find_object(self.opened), self._surface(revision.field)
+            bundle = make_bundle(sampled, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute)
+            manifest, files, remarks = {**bundle.manifest}, bundle.files, remarks + bundle.remarks
+        else:
+            before, bundle = self.current, make_bundle(sampled, mute=mute)
+            kept = {part: before.manifest[part] for part in ("object", "surface", "strikes")}
+            manifest, files = {**bundle.manifest, **kept}, {**before.files, **bundle.files}
+            remarks = before.remarks
+        manifest["name"] = revision.name or manifest["name"] or self.opened.name
+        # By revision, so that a page never reads one's manifest with another's numbers.
+        file = {"file": f"revisions/{revision.number}/field.bin"}
+        manifest["tensors"] = {name: {**tensor, **file} for name, tensor in manifest["tensors"].items()}
+        self._shown[revision.number] = Shown(manifest, files, sampled, revision, remarks)
+        while len(self._shown) > _CACHED_REVISIONS:
+            self._shown.popitem(last=False)
 
     def _surface(self, field: SoundField | None) -> Path | Surface | None:
         """Return the surface to show in place of Gaussians or points: the field's body, or the reconstructed surface.
