@@ -6,7 +6,9 @@ from typing import Literal
 from avmsf.errors import ArrayError, ExtractionError
 
 ExtractionMethod = Literal["high-resolution", "short-time"]
-"""high-resolution: ESPRIT in subbands. short-time: the paper's, bin by bin of a short-time spectrum."""
+"""high-resolution: ESPRIT in subbands. short-time: the paper's, bin by bin of a short-time spectrum.
+
+A class for each is in `avmsf.modal.extraction.finders.FINDERS`."""
 PulseShape = Literal["half-sine", "hertz"]
 """How a hammer's force rises and falls: a mass on a linear spring, or on a Hertzian contact."""
 

@@ -30,7 +30,10 @@ _MIN_PERIODS = 50
 
 @dataclass(frozen=True)
 class ModeFinder(ABC):
-    """Finds the modes that all recordings share."""
+    """Finds the modes that all recordings share.
+
+    A subclass is a frozen dataclass of its settings: modes are found again where its repr has changed.
+    """
 
     modes: int = 128
     """Maximum number of modes, the strongest as the method has it."""
@@ -40,7 +43,10 @@ class ModeFinder(ABC):
 
     @abstractmethod
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
-        """Return the modes, at most `modes` of them, by frequency; an empty bank when there are none."""
+        """Return the modes, at most `modes` of them, by frequency; an empty bank when there are none.
+
+        The sounds start with the impact, all at one time, and are finite; the rate is in Hz.
+        """
 
 
 @dataclass(frozen=True)
@@ -133,9 +139,13 @@ class ShortTime(ModeFinder):
         )
 
 
+FINDERS: dict[ExtractionMethod, type[ModeFinder]] = {"high-resolution": HighResolution, "short-time": ShortTime}
+"""By the names that `--extraction` and `PipelineConfig.extraction` take."""
+
+
 def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
     """Return the finder of that name, of at most so many modes."""
-    return HighResolution(modes=modes) if method == "high-resolution" else ShortTime(modes=modes)
+    return FINDERS[method](modes=modes)
 
 
 def lowest_frequency(samples: int, sample_rate: float) -> float:
