@@ -6,6 +6,10 @@ and length, from the impact on and per newton where forces are known; or a `Capt
 and the simulator enter one step later, with pairs of an `Impact` and its `Recording`. Every step tells `Issues`, which
 raise the first error for `read_capture` and collect all for `check`.
 
+Onsets are found here in each recording alone, to a few samples. The recordings come to one time zero later, by the
+phases of their modes (`avmsf.modal.extraction.alignment`); for it `Impacts.before` and `after` keep 20 ms on either
+side of each sound.
+
     table -> audio -> prepare (onset, highpass, force) -> preprocess -> Impacts
     table, surface -> checks (placement) -> what is wrong
 

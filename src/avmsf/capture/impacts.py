@@ -45,7 +45,7 @@ class Impacts:
     """Peak force of each impact that `sounds` was divided by, newtons, where it is known."""
     before: Float[Tensor, "contacts lead"] | None = None
     """What each file holds just before `sounds`, in the same unit; NaN where it holds nothing. None where the sounds
-    are final: aligned already, or given without their files."""
+    are final: aligned with one another already (`avmsf.modal.extraction.alignment`), or given without their files."""
     after: Float[Tensor, "contacts tail"] | None = None
     """What each file holds just after `sounds`, likewise; None together with `before`."""
 

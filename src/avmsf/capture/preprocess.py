@@ -1,6 +1,7 @@
 """From the recordings of one object to impacts of one rate and length, with a report of what is wrong with them.
 
-Where the sounds start in their files is decided for all recordings of a capture together.
+Whether files start with their impact, and so are used whole, is decided for all recordings of a capture together. Where
+they do not, each is cut at its own onset; `avmsf.modal.extraction.alignment` aligns them with one another later.
 """
 
 import hashlib
