@@ -1,4 +1,4 @@
-"""Rasterizers: numba kernels over tiles of 8 x 8 pixels for processors, and gsplat for graphics cards."""
+"""Rasterizers: numba kernels over tiles of 8 x 8 pixels for CPUs, and gsplat for GPUs."""
 
 import importlib
 from typing import Any
@@ -94,7 +94,7 @@ class GsplatRasterizer:
         """
         centers = cloud.centers
         for name, tensor in (("cloud", centers), ("background", background)):
-            if not _lies_on_card(tensor):
+            if not _is_on_gpu(tensor):
                 advice = "move it, or use the rasterizer of `choose_rasterizer` for that device"
                 raise SceneError.expected("a CUDA device", str(tensor.device), name=name, advice=advice)
         painted, covered, found = self._gsplat.rasterization(
@@ -118,18 +118,18 @@ class GsplatRasterizer:
             color=painted[0, ..., :3],
             alpha=covered[0, ..., 0],
             depth=painted[0, ..., 3],
-            screen=_tapped(found["means2d"]),
+            screen=_with_gradient(found["means2d"]),
             # One for each axis of the image since gsplat 1.5.
             radii=(radii.amax(-1) if radii.ndim == 2 else radii).to(centers.dtype),
         )
 
 
-def _lies_on_card(tensor: Tensor) -> bool:
+def _is_on_gpu(tensor: Tensor) -> bool:
     return tensor.device.type == "cuda"
 
 
-def _tapped(places: Float[Tensor, "cameras points 2"]) -> Float[Tensor, "points 2"]:
-    """Return the one camera's places as a tensor whose `grad` is filled when theirs is reckoned.
+def _with_gradient(places: Float[Tensor, "cameras points 2"]) -> Float[Tensor, "points 2"]:
+    """Return the one camera's places as a tensor whose `grad` is filled when theirs is computed.
 
     A slice of `places` would get no gradient, for the image does not come from the slice.
     """

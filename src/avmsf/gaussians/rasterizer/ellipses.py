@@ -1,9 +1,9 @@
 """The ellipse that a Gaussian becomes in an image.
 
-Its covariance R S S R^T becomes J W R S S R^T W^T J^T + 0.3 I, W the camera's rotation and J the slope of the
-perspective at its center (Zwicker et al. 2002, "EWA Splatting"; 3DGS adds the 0.3 square pixels, so that nothing falls
-between the pixels). All is reckoned in float64, for the determinants of long
-thin ellipses cancel, and handed over in float32.
+Its covariance R S S R^T becomes J W R S S R^T W^T J^T + 0.3 I, W the camera's rotation and J the Jacobian of the
+perspective projection at its center (Zwicker et al. 2002, "EWA Splatting"; 3DGS adds the 0.3 square pixels, so that
+nothing falls between the pixels). Computed in float64, since the determinants of long thin ellipses cancel; the results
+are float32.
 
 All that a kernel calls, and every constant it holds, stands in its own file: numba keeps what it compiled until that
 file changes, and looks at no other.
@@ -42,17 +42,17 @@ def _rotate(rotation, turn):
 
 @compiled()
 @no_type_check
-def _unrotate(rotation, length, slope, result):
-    """Write the derivatives by a quaternion of length `length` into `result`, given those by its matrix."""
+def _rotate_back(rotation, length, by, result):
+    """Write the derivatives by a quaternion of length `length` into `result`, given those by its matrix, `by`."""
     w, x, y, z = rotation[0] / length, rotation[1] / length, rotation[2] / length, rotation[3] / length
-    by_w = 2 * (x * (slope[2, 1] - slope[1, 2]) + y * (slope[0, 2] - slope[2, 0]) + z * (slope[1, 0] - slope[0, 1]))
-    by_x = 2 * (y * (slope[0, 1] + slope[1, 0]) + z * (slope[0, 2] + slope[2, 0]) + w * (slope[2, 1] - slope[1, 2]))
-    by_y = 2 * (x * (slope[0, 1] + slope[1, 0]) + z * (slope[1, 2] + slope[2, 1]) + w * (slope[0, 2] - slope[2, 0]))
-    by_z = 2 * (x * (slope[0, 2] + slope[2, 0]) + y * (slope[1, 2] + slope[2, 1]) + w * (slope[1, 0] - slope[0, 1]))
-    by_x -= 4 * x * (slope[1, 1] + slope[2, 2])
-    by_y -= 4 * y * (slope[0, 0] + slope[2, 2])
-    by_z -= 4 * z * (slope[0, 0] + slope[1, 1])
-    # The length of the quaternion is of no effect: what points along it has no slope.
+    by_w = 2 * (x * (by[2, 1] - by[1, 2]) + y * (by[0, 2] - by[2, 0]) + z * (by[1, 0] - by[0, 1]))
+    by_x = 2 * (y * (by[0, 1] + by[1, 0]) + z * (by[0, 2] + by[2, 0]) + w * (by[2, 1] - by[1, 2]))
+    by_y = 2 * (x * (by[0, 1] + by[1, 0]) + z * (by[1, 2] + by[2, 1]) + w * (by[0, 2] - by[2, 0]))
+    by_z = 2 * (x * (by[0, 2] + by[2, 0]) + y * (by[1, 2] + by[2, 1]) + w * (by[1, 0] - by[0, 1]))
+    by_x -= 4 * x * (by[1, 1] + by[2, 2])
+    by_y -= 4 * y * (by[0, 0] + by[2, 2])
+    by_z -= 4 * z * (by[0, 0] + by[1, 1])
+    # The length of the quaternion is of no effect: the derivative along it is zero.
     along = w * by_w + x * by_x + y * by_y + z * by_z
     result[0], result[1] = (by_w - along * w) / length, (by_x - along * x) / length
     result[2], result[3] = (by_y - along * y) / length, (by_z - along * z) / length
@@ -72,15 +72,15 @@ def _inside(center, pose):
 
 @compiled()
 @no_type_check
-def _axes(turn, scales, pose, x, y, z, lens, slope, axes):
-    """Write J W into `slope` [2, 3] and J W R S into `axes` [2, 3]; return the tangents at which J is taken."""
+def _axes(turn, scales, pose, x, y, z, lens, jacobian, axes):
+    """Write J W into `jacobian` [2, 3] and J W R S into `axes` [2, 3]; return the tangents at which J is taken."""
     across, down = min(max(x / z, lens[6]), lens[7]), min(max(y / z, lens[8]), lens[9])
     for j in range(3):
-        slope[0, j] = lens[0] / z * (pose[0, j] - across * pose[2, j])
-        slope[1, j] = lens[1] / z * (pose[1, j] - down * pose[2, j])
+        jacobian[0, j] = lens[0] / z * (pose[0, j] - across * pose[2, j])
+        jacobian[1, j] = lens[1] / z * (pose[1, j] - down * pose[2, j])
     for row in range(2):
         for j in range(3):
-            dot = slope[row, 0] * turn[0, j] + slope[row, 1] * turn[1, j] + slope[row, 2] * turn[2, j]
+            dot = jacobian[row, 0] * turn[0, j] + jacobian[row, 1] * turn[1, j] + jacobian[row, 2] * turn[2, j]
             axes[row, j] = dot * scales[j]
     return across, down
 
@@ -125,7 +125,7 @@ def project_points(lane, lanes, cloud, pose, lens, scratch, results):
     centers, rotations, log_scales, logits, harmonics = cloud
     screen, ellipses, opacities, depths, radii, remainders = results
     points = len(centers)
-    turn, slope, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
+    turn, jacobian, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
     for i in range(lane * points // lanes, (lane + 1) * points // lanes):
         if not _usable(centers[i], rotations[i], log_scales[i], logits[i], harmonics[i]):
             radii[i, 0] = np.nan
@@ -137,7 +137,7 @@ def project_points(lane, lanes, cloud, pose, lens, scratch, results):
         for j in range(3):
             scales[j] = math.exp(float(log_scales[i, j]))
         _rotate(rotations[i], turn)
-        _axes(turn, scales, pose, x, y, z, lens, slope, axes)
+        _axes(turn, scales, pose, x, y, z, lens, jacobian, axes)
         xx, xy, yy, determinant = _variances(axes)
         # Also false for what is not a number.
         if not xx + yy < _MAX_VARIANCE:
@@ -158,7 +158,7 @@ def project_points(lane, lanes, cloud, pose, lens, scratch, results):
 
 @compiled(inline="always")
 @no_type_check
-def _axes_slope(by_ellipse, axes, by_axes):
+def _axes_back(by_ellipse, axes, by_axes):
     """Write the derivatives by J W R S into `by_axes`, given those by p = D^(-1/2), r = -p xy / yy, s = yy^(-1/2).
 
     D = xx - xy^2 / yy is what is left of the variance along x where y is known.
@@ -176,22 +176,22 @@ def _axes_slope(by_ellipse, axes, by_axes):
 
 @compiled(inline="always")
 @no_type_check
-def _factor_slopes(by_axes, turn, scales, slope, axes, by_log_scale, by_turn, by_slope):
+def _factors_back(by_axes, turn, scales, jacobian, axes, by_log_scale, by_turn, by_jacobian):
     """Write the derivatives by the logarithms of S, by R and by J W, given those by their product J W R S."""
     for j in range(3):
         by_log_scale[j] = by_axes[0, j] * axes[0, j] + by_axes[1, j] * axes[1, j]
         for k in range(3):
-            by_turn[k, j] = (slope[0, k] * by_axes[0, j] + slope[1, k] * by_axes[1, j]) * scales[j]
+            by_turn[k, j] = (jacobian[0, k] * by_axes[0, j] + jacobian[1, k] * by_axes[1, j]) * scales[j]
     for row in range(2):
         for k in range(3):
-            by_slope[row, k] = 0.0
+            by_jacobian[row, k] = 0.0
             for j in range(3):
-                by_slope[row, k] += by_axes[row, j] * turn[k, j] * scales[j]
+                by_jacobian[row, k] += by_axes[row, j] * turn[k, j] * scales[j]
 
 
 @compiled(inline="always")
 @no_type_check
-def _center_slope(by_place, by_depth, by_slope, x, y, z, across, down, pose, lens, inner):
+def _center_back(by_place, by_depth, by_jacobian, x, y, z, across, down, pose, lens, inner):
     """Write the derivatives by a center in the camera's frame into `inner` [3].
 
     They come through its place in the image, and through J, whose first row is focal / z (1, 0, -x / z).
@@ -204,8 +204,8 @@ def _center_slope(by_place, by_depth, by_slope, x, y, z, across, down, pose, len
         tangent, place, clear = (across, x, across == x / z) if row == 0 else (down, y, down == y / z)
         along, ahead = 0.0, 0.0
         for k in range(3):
-            along += by_slope[row, k] * pose[row, k]
-            ahead += by_slope[row, k] * pose[2, k]
+            along += by_jacobian[row, k] * pose[row, k]
+            ahead += by_jacobian[row, k] * pose[2, k]
         inner[2] -= focal / z * (along - tangent * ahead)
         if clear:
             inner[row] -= focal / z * ahead
@@ -225,8 +225,8 @@ def project_points_back(lane, lanes, cloud, radii, slopes, pose, lens, scratch, 
     by_centers, by_rotations, by_log_scales, by_logits = results
     # Inlined, for views of rows that a call hands over cost more than these steps.
     points = len(centers)
-    turn, slope, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
-    by_turn, by_slope, by_axes = scratch[lane, 8:11], scratch[lane, 11:13], scratch[lane, 13:15]
+    turn, jacobian, axes, scales = scratch[lane, :3], scratch[lane, 3:5], scratch[lane, 5:7], scratch[lane, 7]
+    by_turn, by_jacobian, by_axes = scratch[lane, 8:11], scratch[lane, 11:13], scratch[lane, 13:15]
     inner = scratch[lane, 15]
     for i in range(lane * points // lanes, (lane + 1) * points // lanes):
         if not radii[i, 0] > 0.0:
@@ -235,11 +235,11 @@ def project_points_back(lane, lanes, cloud, radii, slopes, pose, lens, scratch, 
         for j in range(3):
             scales[j] = math.exp(float(log_scales[i, j]))
         length = _rotate(rotations[i], turn)
-        across, down = _axes(turn, scales, pose, x, y, z, lens, slope, axes)
-        _axes_slope(by_ellipses[i], axes, by_axes)
-        _factor_slopes(by_axes, turn, scales, slope, axes, by_log_scales[i], by_turn, by_slope)
-        _unrotate(rotations[i], length, by_turn, by_rotations[i])
-        _center_slope(by_screen[i], by_depths[i, 0], by_slope, x, y, z, across, down, pose, lens, inner)
+        across, down = _axes(turn, scales, pose, x, y, z, lens, jacobian, axes)
+        _axes_back(by_ellipses[i], axes, by_axes)
+        _factors_back(by_axes, turn, scales, jacobian, axes, by_log_scales[i], by_turn, by_jacobian)
+        _rotate_back(rotations[i], length, by_turn, by_rotations[i])
+        _center_back(by_screen[i], by_depths[i, 0], by_jacobian, x, y, z, across, down, pose, lens, inner)
         opacity = 1.0 / (1.0 + math.exp(-float(logits[i])))
         by_logits[i] = float(by_opacities[i, 0]) * opacity * (1.0 - opacity)
         for j in range(3):

@@ -1,4 +1,14 @@
-"""The innermost loops: one Gaussian on the 64 pixels of one tile, forwards and backwards.
+"""The innermost loops: one Gaussian on the 64 pixels of one tile, forward and backward.
+
+Gaussian k covers alpha_k of a pixel, of whose light T_k = prod_{j<k} (1 - alpha_j) is left in front of it:
+
+    color = sum_k T_k alpha_k color_k + T_end background.
+
+With the loss L and g_k = dL/dcolor . color_k (depth is one more channel), the derivative that `blend_back` computes is
+
+    dL/dalpha_k = T_k g_k - B_k / (1 - alpha_k),  B_k = sum_{j>k} T_j alpha_j g_j + T_end dL/dT_end,
+
+from back to front, so that B_k is a running sum and T_k = T_{k+1} / (1 - alpha_k).
 
 They are written so that the compiler turns them into vectors of pixels: no branches, no views of arrays, a polynomial
 for the exponential, and only those pairs of rows that the ellipse reaches.
@@ -152,10 +162,12 @@ def blend(lane, lanes, places, packed, starts, rows, bounds, paint, min_level, n
 @compiled(error_model="numpy", fastmath=_FAST)
 @no_type_check
 def _uncover(scratch, packed, row, middle, center, first, last, number, min_level, parts, slot):
-    """Take one Gaussian off a tile's pixels again and write its sums of derivatives into `part` [10].
+    """Take one Gaussian off a tile's pixels again and write ten sums over these pixels into `parts[slot]`.
 
-    `scratch` goes on with what this Gaussian left, the derivative by what it left times that, the loss's derivatives by
-    red, green, blue and the sum of depths, and the number of the last that was drawn.
+    With h = alpha dL/dalpha, the pixel's offset (x, y) from the center and the same in standard deviations (u, w), they
+    are those of h, h u, h w, h u x, h u y, h w y, and the derivatives by red, green, blue and depth. `scratch` goes on
+    with T, B, the loss's derivatives by red, green, blue and the sum of depths, and the number of the last that was
+    drawn.
     """
     p_x, r_y, s_y, peak = packed[row, 0], packed[row, 1], packed[row, 2], packed[row, 3]
     red, green, blue, away = packed[row, 4], packed[row, 5], packed[row, 6], packed[row, 7]

@@ -18,7 +18,8 @@ from avmsf.gaussians.rasterizer.harmonics import shade, shade_back
 from avmsf.photographs.cameras import Camera
 
 _SLOPE_MARGIN = 0.3
-"""The perspective's slope is taken no further off axis than the image's edge and this part of half its width (3DGS)."""
+"""The Jacobian of the perspective projection is taken no further off axis than the image's edge and this part of half
+its width (3DGS)."""
 
 
 class Projection(torch.autograd.Function):
@@ -82,7 +83,7 @@ def project(cloud: GaussianCloud, camera: Camera) -> tuple[Tensor, ...]:
 
 
 def _lens(camera: Camera) -> Float64[np.ndarray, "10"]:
-    """Return focal lengths, principal point, size, and the tangents left, right, up and down where the slope ends."""
+    """Return focal lengths, principal point, size, and the tangents left, right, up and down up to which J is taken."""
     (across, down), (middle, center) = camera.focal, camera.principal
     sides, ends = _SLOPE_MARGIN * 0.5 * camera.width / across, _SLOPE_MARGIN * 0.5 * camera.height / down
     left, right = -middle / across - sides, (camera.width - middle) / across + sides
