@@ -20,8 +20,9 @@ from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import groups_of
 from avmsf.symmetry.symmetries import MirrorSymmetry, Symmetries
-from factories.made_fields import POSITIONAL, SIZE, draw, impacts, plate
+from factories.made_fields import SIZE, draw, impacts, plate
 
+POSITIONAL = list(kernels.POSITIONAL.values())
 KINDS = [*POSITIONAL, Elastic, Symmetric, Visual]
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 every_kind = pytest.mark.parametrize("kind", KINDS)
