@@ -9,7 +9,6 @@ import re
 import resource
 import shutil
 import signal
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -32,15 +31,13 @@ REQUESTS = 3000
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one input: read, refused, or one of `FAULTS`."""
+    """What became of one input: read, refused, or one of `FAULTS`; processor time, and memory above an idle process."""
 
     family: str
     name: str
     result: str
     seconds: float
-    """Processor time."""
     megabytes: float
-    """Memory above that of the process that reads nothing."""
     message: str
 
 
@@ -51,14 +48,7 @@ def _files(settings: Settings) -> Iterator[Record]:
     more than 60 s of processor time or 4096 MB above an idle process.
     """
     with tempfile.TemporaryDirectory(prefix="avmsf-robustness-") as name:
-        seeds, folder = Path(name) / "seeds", Path(name) / "input"
-        write_seeds(seeds)
-        for family, each in FAMILIES.items():
-            # What a verb imports is not what an input costs.
-            _copied(seeds, folder)
-            result, message = outcome_of(partial(each.read, folder, folder / each.seeds[0]))
-            if result != "read":
-                raise RuntimeError(f"{family}: the undamaged file is {result}: {message}")
+        seeds, folder = _seeds(Path(name))
         inputs = damaged_inputs(seeds, folder, count=2 if settings.quick else 60)
         yield from _counted([_run_apart(*each) for each in inputs])
 
@@ -66,8 +56,7 @@ def _files(settings: Settings) -> Iterator[Record]:
 def _bombs(settings: Settings) -> Iterator[Record]:
     """Small files that claim or unfold to be large, likewise."""
     with tempfile.TemporaryDirectory(prefix="avmsf-robustness-") as name:
-        seeds, folder = Path(name) / "seeds", Path(name) / "input"
-        write_seeds(seeds)
+        seeds, folder = _seeds(Path(name))
         outcomes = []
         for title, bomb in BOMBS.items():
             _copied(seeds, folder)
@@ -76,6 +65,18 @@ def _bombs(settings: Settings) -> Iterator[Record]:
             values = {"seconds": outcomes[-1].seconds, "megabytes": outcomes[-1].megabytes}
             yield from records(values, object=title, note=outcomes[-1].result)
         yield from _counted(outcomes)
+
+
+def _seeds(place: Path) -> tuple[Path, Path]:
+    """Write valid files, and read them: what a verb imports is not what an input costs."""
+    seeds, folder = place / "seeds", place / "input"
+    write_seeds(seeds)
+    for family, each in FAMILIES.items():
+        _copied(seeds, folder)
+        result, message = outcome_of(partial(each.read, folder, folder / each.seeds[0]))
+        if result != "read":
+            raise RuntimeError(f"{family}: the undamaged file is {result}: {message}")
+    return seeds, folder
 
 
 def _copied(seeds: Path, folder: Path) -> None:
@@ -139,7 +140,6 @@ def _limit() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     # A reader may wait for ever without using the processor, as for a pipe.
     signal.alarm(10 * MAX_CPU_SECONDS)
-    sys.stdout.flush()
 
 
 def _megabytes(key: str, process: int | str = "self") -> float:
