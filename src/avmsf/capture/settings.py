@@ -56,6 +56,8 @@ class CaptureSettings:
     """Cutoff in Hz, as recorded, of a highpass against rumble: 20 leaves all audible frequencies. 0 filters nothing,
     since a large structure may vibrate that low. The hammer's force is never filtered. `check` proposes a value where
     rumble dominates the noise before the impacts."""
+    held: tuple[tuple[float, float, float], ...] = ()
+    """Points at which the object was held or stood, such as its feet, in `unit`; for elastic mode shapes."""
     align: bool = True
     """Find where the impact begins in each file, and align the recordings with one another. Recordings that all start
     with the impact, as impulse responses do, are detected and not cut. False uses every file from its first sample:
@@ -80,6 +82,7 @@ class CaptureSettings:
             ("force_channel", force is None or force >= 1, channel),
             ("force_channel", force is None or force != response, "another channel than response_channel"),
             ("time_zero", self.time_zero in TIME_ZEROS, f"one of {', '.join(TIME_ZEROS)}"),
+            ("held", all(len(each) == 3 and all(map(math.isfinite, each)) for each in self.held), "points [x, y, z]"),
             ("normalize", self.normalize in NORMALIZATIONS, f"one of {', '.join(NORMALIZATIONS)}"),
             ("force_channel", self.normalize != "deconvolve" or force, 'the hammer\'s, for normalize = "deconvolve"'),
         ):
@@ -109,6 +112,11 @@ class CaptureSettings:
     def meters(self) -> float:
         """Meters in one unit of the contacts' coordinates."""
         return METRES[self.unit]
+
+    @property
+    def held_at(self) -> list[tuple[float, float, float]]:
+        """The points at which the object was held, meters."""
+        return [(x * self.meters, y * self.meters, z * self.meters) for x, y, z in self.held]
 
     @property
     def surface_meters(self) -> float:
@@ -152,6 +160,8 @@ def _typed(key: str, value: Any, known: Mapping[str, tuple[object, ...]]) -> Any
         advice = "" if similar is None else f"did you mean {similar}?"
         wanted, got = f"keys among {', '.join(known)}", "another one"
         raise CaptureError.expected(wanted, similar, got=got, name=key, advice=advice)
+    if key == "held":
+        return _points(value)
     if float in known[key] and type(value) is int and abs(value) <= sys.float_info.max:
         return float(value)
     if type(value) not in known[key]:
@@ -159,6 +169,15 @@ def _typed(key: str, value: Any, known: Mapping[str, tuple[object, ...]]) -> Any
         expected = " or ".join(name for kind, name in names.items() if kind in known[key])
         raise CaptureError.expected(expected, value, name=key)
     return value
+
+
+def _points(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Return lists of numbers as points. Raises CaptureError for anything else."""
+    listed = isinstance(value, list | tuple) and all(isinstance(each, list | tuple) for each in value)
+    if not listed or any(type(number) not in (int, float) for each in value for number in each):
+        advice = "such as [[0, 0, 0], [0.3, 0, 0]]"
+        raise CaptureError.expected("a list of points [x, y, z]", value, name="held", advice=advice)
+    return tuple(tuple(float(number) for number in each) for each in value)
 
 
 def unit_named(meters: float) -> str | None:

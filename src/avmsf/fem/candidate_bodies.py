@@ -37,7 +37,7 @@ from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.material import MAX_FREQUENCY_ERROR, NOMINAL, Material
 from avmsf.fem.meshing import CheckedSurface, checked, millimeters
 from avmsf.fem.solid import Solid
-from avmsf.fem.supports import Support
+from avmsf.fem.supports import Place, Support, patches_about
 from avmsf.mesh.surface import Surface
 
 Supports = Literal["auto", "free", "try"]
@@ -99,6 +99,8 @@ class CandidateBodies:
     refused: Mapping[float | None, str]
     """Reasons why others could not be had, by the others' thickness: names of two may be alike."""
     supports: Supports = "free"
+    held_at: Sequence[Place] = ()
+    """Points in meters at which the object was held, all of them, as a user says."""
     searches_thickness: bool = False
     """Whether the thickness of the wall is not known, so that `with_thickness` is asked."""
     dofs: int = 0
@@ -121,7 +123,7 @@ class CandidateBodies:
 
     def digest(self) -> str:
         """Return a digest of the bodies."""
-        digest = hashlib.sha256(f"{self.searches_thickness} {self.supports} {self.dofs}".encode())
+        digest = hashlib.sha256(f"{self.searches_thickness} {self.supports} {self.held_at} {self.dofs}".encode())
         for body in self.bodies:
             digest.update(body.name.encode())
             for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):
@@ -151,6 +153,7 @@ class SurfaceBodies(CandidateBodies):
         *,
         thicknesses: Sequence[float | None] | None = None,
         supports: Supports = "free",
+        held_at: Sequence[Place] = (),
         count: int = 80,
         dofs: int = 40_000,
         material: Material = NOMINAL,
@@ -168,7 +171,7 @@ class SurfaceBodies(CandidateBodies):
                 raise SimulationError.expected(wanted, each, row=row, name="thicknesses")
         self.shape = None if isinstance(surface, Surface) else surface
         """The shape, where it is no surface."""
-        self.supports, self.dofs = supports, dofs
+        self.supports, self.held_at, self.dofs = supports, held_at, dofs
         self._surface, self._digest, self._log = surface, surface.digest(), log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)
@@ -236,8 +239,10 @@ class SurfaceBodies(CandidateBodies):
         Of tetrahedra that are few enough to choose by; `refined` makes the chosen body fine, without a check of its
         convergence. `log` is called with the reason for None.
         """
+        patches = patches_about(self.held_at) or None
         try:
-            return HeldModes(self.solid(body.thickness, self._coarse_dofs), self._material, count=self._count)
+            solid = self.solid(body.thickness, self._coarse_dofs)
+            return HeldModes(solid, self._material, count=self._count, patches=patches)
         except (SimulationError, MemoryError) as error:
             self._log(f"{body.name}: no supports tested: {error}")
             return None

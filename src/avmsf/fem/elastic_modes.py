@@ -17,7 +17,7 @@ from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
 from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.fem.solid import Solid
-from avmsf.fem.supports import Support, SupportBasis, patches_of
+from avmsf.fem.supports import Patch, Support, SupportBasis, patches_of
 from avmsf.mesh.closest_point import Closest, ClosestPoints
 from avmsf.mesh.surface import Surface, surface_points
 
@@ -166,8 +166,10 @@ def elastic_modes(
 class HeldModes:
     """The modes of a body on any support, of one computation of its free ones."""
 
-    def __init__(self, solid: Solid, material: Material, *, count: int = 64) -> None:
-        """Compute the free modes and the responses to forces on `patches_of` the body.
+    def __init__(
+        self, solid: Solid, material: Material, *, count: int = 64, patches: Sequence[Patch] | None = None
+    ) -> None:
+        """Compute the free modes and the responses to forces on the patches, by default `patches_of` the body.
 
         Raises SimulationError as `elastic_modes`, and for a body without a small part that it could be held at.
         """
@@ -177,7 +179,7 @@ class HeldModes:
         free = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=False)
         self._mesh, self._material, self._mass = mesh, material, float(solid.volumes.sum()) * material.density
         self.free = _modes(mesh, free.squares, _at_surface(mesh, free.shapes), material, self._mass)
-        self.basis = SupportBasis(mesh, forces, weights, free, rigid, patches_of(mesh))
+        self.basis = SupportBasis(mesh, forces, weights, free, rigid, patches_of(mesh) if patches is None else patches)
 
     def on(self, support: Support) -> ElasticModes:
         """Return the lowest modes on a support of some of the basis' patches."""

@@ -25,6 +25,7 @@ from avmsf.fem.eigen import PENDULUM, Vibrations, factorize, orthonormal
 from avmsf.fem.elements import SecondOrder
 from avmsf.gaussians.points import farthest_points
 
+Place = tuple[float, float, float]
 FREE = "free"
 FREE_PRIOR = 0.7
 """Probability that an object is free; recordings are meant to be made so. The supports share the rest."""
@@ -38,6 +39,7 @@ class Tolerances:
     """What a patch and its cells are; lengths are over the body's size."""
 
     held_distance: float = 0.01  # from the extreme plane, within which nodes belong to a patch
+    held_radius: float = 0.03  # about a point at which a user says that the object was held: a finger, a foot, a clamp
     max_held_ratio: float = 0.3  # part of the surface's nodes that a patch may hold: what is left would not ring
     cell_extent: float = 0.08  # of a cell: a long patch moves as several rigid ones
     max_cells: int = 8  # of a patch
@@ -54,14 +56,22 @@ class Patch:
 
     name: str
     """In words, such as "its lowest part"."""
-    direction: tuple[float, float, float]
-    """Unit vector; the patch is what lies farthest along it."""
+    direction: Place
+    """Unit vector; the patch is what lies farthest along it. Of a patch about a point, the point, meters."""
+    about: bool = False
+    """Whether it is the patch about a point."""
 
     def nodes(self, mesh: SecondOrder) -> Int[np.ndarray, " nodes"]:
-        """Return the rows of the surface's nodes within 1 % of the body's size of the extreme one."""
-        outer = mesh.surface[0]
-        along = mesh.nodes[outer] @ np.array(self.direction)
-        return outer[along >= along.max() - TOLERANCES.held_distance * mesh.solid.size]
+        """Return the rows of the surface's nodes within 1 % of the body's size of the extreme or the nearest one.
+
+        About a point within `held_radius` of it.
+        """
+        outer, size = mesh.surface[0], mesh.solid.size
+        if not self.about:
+            along = mesh.nodes[outer] @ np.array(self.direction)
+            return outer[along >= along.max() - TOLERANCES.held_distance * size]
+        away = np.linalg.norm(mesh.nodes[outer] - np.array(self.direction), axis=1)
+        return outer[away <= max(TOLERANCES.held_radius * size, away.min() + TOLERANCES.held_distance * size)]
 
     def loads(self, mesh: SecondOrder) -> scipy.sparse.csc_array:
         """Return the rigid motions of its cells [3 nodes, loads], as the head of this module scales them."""
@@ -92,7 +102,7 @@ class Support:
     @property
     def name(self) -> str:
         """Where the body is held, for people."""
-        return f"held at {' and '.join(patch.name for patch in self.patches)}"
+        return f"held at {' and '.join(patch.name.removeprefix('at ') for patch in self.patches)}"
 
     def springs(self, mesh: SecondOrder) -> scipy.sparse.csr_array:
         """Return what it adds to a body's stiffness matrix, N/m."""
@@ -124,6 +134,12 @@ def patches_of(mesh: SecondOrder) -> list[Patch]:
         found.append(Patch(name, patch.direction))
         seen.append(nodes)
     return found
+
+
+def patches_about(points: Sequence[Place]) -> list[Patch]:
+    """Return the patches about points on or near the surface, meters."""
+    names = ("at ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1000.0 * each + 0.0 for each in point)) for point in points)
+    return [Patch(name, point, about=True) for name, point in zip(names, points, strict=True)]
 
 
 class SupportBasis:

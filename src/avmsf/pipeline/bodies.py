@@ -1,6 +1,6 @@
 """Bodies that an object's surface may enclose, and the field of one of a known material, without any recording."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material, material_named
 from avmsf.fem.radiation import radiated_pressure
+from avmsf.fem.supports import Place
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
@@ -35,6 +36,8 @@ SAMPLE_RATE = 44_100.0
 """Hz: that of most recordings."""
 _HIGHEST = 0.499
 """Highest frequency of a mode over the sample rate."""
+_MAX_HELD_DISTANCE = 0.1
+"""Distance from the surface, over its diagonal, of a point at which the object is held: within a finger's width."""
 _BINS = 1025
 """Of the residual, which is zero: as many as that of a fit has."""
 
@@ -44,24 +47,27 @@ def candidate_bodies(
     config: BodyConfig | None = None,
     *,
     impacts: Impacts | None = None,
+    held_at: Sequence[Place] = (),
     material: Material = NOMINAL,
     cache: Path | None = None,
     log: Callable[[str], None] | None = None,
 ) -> SurfaceBodies:
     """Return the bodies that a surface may enclose; their mode shapes are cached by content in `cache`.
 
-    Raises SimulationError where no body can be computed, with the name `wall` where `config` states one, and FitError,
-    before any is, where the contacts of the `impacts` that they are meant for do not lie on the surface.
+    `held_at` are points in meters at which the object was held. Raises SimulationError where no body can be computed,
+    with the name `wall` where `config` states one, and FitError, before any is, where the contacts of the `impacts`
+    that they are meant for, or `held_at`, do not lie on the surface.
     """
     config = BodyConfig() if config is None else config
     seen = surface if isinstance(surface, Surface) else surface.as_seen()
     if impacts is not None:
         expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
+    _expect_on(seen, held_at)
     wall = config.wall
     try:
         bodies = SurfaceBodies(
             surface, thicknesses=None if wall is None else [wall or None], supports=config.supports,
-            count=config.shapes, dofs=config.dofs, material=material, cache=cache, log=log,
+            held_at=held_at, count=config.shapes, dofs=config.dofs, material=material, cache=cache, log=log,
         )  # fmt: skip
         # What cannot be had shows now.
         _ = bodies.bodies
@@ -77,6 +83,21 @@ def candidate_bodies(
         got = f"{wall:g} m ({reasons})"
         raise SimulationError.expected(f"{wanted}, as body.wall", wall, got=got, name="wall", advice=advice) from error
     return bodies
+
+
+def _expect_on(surface: Surface, places: Sequence[Place]) -> None:
+    """Raise FitError for a place that is far from the surface: in another unit, or in the air."""
+    if not places:
+        return
+    vertices, points = surface.vertices.double(), surface_points(surface).double()
+    size = float((vertices.amax(0) - vertices.amin(0)).norm())
+    away = torch.cdist(torch.tensor(places, dtype=torch.float64), points).amin(1)
+    row = int(away.argmax())
+    if float(away[row]) > _MAX_HELD_DISTANCE * size:
+        got = f"{places[row]}, {1000 * float(away[row]):.0f} mm away from it"
+        advice = "give held in capture.toml in the unit and frame of the contacts"
+        wanted = "a point on the object, in meters,"
+        raise FitError.expected(wanted, float(away[row]), got=got, row=row, name="held", advice=advice)
 
 
 def guess_field(

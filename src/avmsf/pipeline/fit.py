@@ -162,7 +162,10 @@ def _fit_shape(
     def bodies() -> CandidateBodies:
         listener.log("bodies: finite-element models of the object")
         cache = pipeline.folder.path(BODIES)
-        return candidate_bodies(shape.surface(), config.body, impacts=train, cache=cache, log=listener.log)
+        return candidate_bodies(
+            shape.surface(), config.body, impacts=train, held_at=capture.settings.held_at, cache=cache,
+            log=listener.log,
+        )  # fmt: skip
 
     estimator = once(
         lambda: estimator_for(

@@ -7,7 +7,7 @@ import pytest
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.elastic_modes import HeldModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
-from avmsf.fem.supports import Patch, Support
+from avmsf.fem.supports import Patch, Place, Support, patches_about
 from avmsf.field.gains.estimator import MixtureEstimator
 from oracles.block import block
 from oracles.known_gains import known_gains
@@ -20,16 +20,17 @@ class Plate(CandidateBodies):
 
     supports = "try"
 
-    def __init__(self) -> None:
-        super().__init__([CandidateBody(None, held_modes().free)])
+    def __init__(self, held_at: tuple[Place, ...] = ()) -> None:
+        super().__init__([CandidateBody(None, held_modes(held_at).free)])
+        self.held_at = held_at
 
     def held(self, body: CandidateBody) -> HeldModes:
-        return held_modes()
+        return held_modes(tuple(self.held_at))
 
 
 @cache
-def held_modes() -> HeldModes:
-    return HeldModes(block(SIDES, (9, 6, 1)), NOMINAL, count=16)
+def held_modes(held_at: tuple[Place, ...]) -> HeldModes:
+    return HeldModes(block(SIDES, (9, 6, 1)), NOMINAL, count=16, patches=patches_about(held_at) or None)
 
 
 LEFT, RIGHT = Patch("left", (-1.0, 0.0, 0.0)), Patch("right", (1.0, 0.0, 0.0))
@@ -48,6 +49,16 @@ def test_the_support_of_a_plate_is_found(sides: tuple[Patch, ...], stiffness: fl
     assert set(found["support"].removeprefix("held at ").split(" and ")) == ({AT[each] for each in sides} or {"free"})
     # In the unit of the nominal material, whose plate is not the true one.
     assert found["support_stiffness"] is None or found["support_stiffness"] > 0.1 * min(stiffness, 1e6)
+
+
+def test_a_plate_is_held_where_its_user_says():
+    feet = ((0.04, 0.0267, 0.0), (0.2, 0.08, 0.0))
+    support = Support(tuple(patches_about(feet)), 1e10)
+    true = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12, support=support)
+    found = MixtureEstimator(bodies=Plate(feet)).solve(known_gains(true)[0])[0].report["bodies"][0]
+    assert found["support"] == "held at (40, 27, 0) mm and (200, 80, 0) mm"
+    assert found["support_stiffness"] > 1e6
+    assert found["frequency_factor"] == pytest.approx(1.0, abs=0.05)
 
 
 def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypatch: pytest.MonkeyPatch):

@@ -125,7 +125,8 @@ class MixtureEstimator(GainEstimator):
         tried = found.best is not None and self._may_be_held(judgment)
         if tried and found.best is not None and self.bodies is not None:
             modes = self.bodies.held(found.best)
-            held = None if modes is None else fit.held(others(fit.sites, judgment.rows), found.best, modes)
+            rows, stated = others(fit.sites, judgment.rows), bool(self.bodies.held_at)
+            held = None if modes is None else fit.held(rows, found.best, modes, stated=stated)
             if held is not None:
                 # All modes have the support in common, so free bodies are no hypotheses any more.
                 found = self._refined(fit, [held])
@@ -183,9 +184,10 @@ class MixtureEstimator(GainEstimator):
         return list(self.bodies.bodies), {body_name(each): reason for each, reason in self.bodies.refused.items()}
 
     def _may_be_held(self, judgment: Judgment) -> bool:
-        """Return whether supports are tried: where they are asked for, or the free body predicts little."""
+        """Return whether supports are tried: where they are asked for or stated, or the free body predicts little."""
         tried, found = "free" if self.bodies is None else self.bodies.supports, judgment.credibility
-        return tried == "try" or (tried == "auto" and found is not None and found.gained < _PREDICTS)
+        stated = self.bodies is not None and bool(self.bodies.held_at)
+        return tried == "try" or stated or (tried == "auto" and found is not None and found.gained < _PREDICTS)
 
 
 def estimator_for(

@@ -132,8 +132,12 @@ class Regression:
         elastic = (WeighedFamily.of(self.elastic(rows, body.elastic), measured) for body in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
 
-    def held(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody | None:
+    def held(
+        self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes, *, stated: bool = False
+    ) -> CandidateBody | None:
         """Return a body on its most probable support, by the evidence of all modes; None where it is free.
+
+        Where patches are `stated` all of them hold it, and evidence decides on the stiffness alone.
 
         All patches and all pairs of them are tried at one stiffness, then the best with one patch more for as long as
         that is more probable, then other stiffnesses. Where both bodies are far from the object, evidence between them
@@ -153,6 +157,8 @@ class Regression:
             row = max(range(len(bodies)), key=logs.__getitem__)
             return logs[row], supports[row], bodies[row]
 
+        if stated:
+            return most_probable([patches], *STIFFNESS_RATIOS)[2]
         best = most_probable([each for count in (1, 2) for each in combinations(patches, count)], typical)
         while len(best[1].patches) < len(patches):
             chosen = best[1].patches
