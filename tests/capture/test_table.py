@@ -100,8 +100,10 @@ def test_keys_are_read_and_whole_numbers_serve_as_numbers(tmp_path: Path) -> Non
     for text, settings in (
         ("", CaptureSettings()),
         (
-            'unit = "mm"\nseconds = 2\nforce_channel = 1\nresponse_channel = 2\nalign = false\n',
-            CaptureSettings(unit="mm", seconds=2.0, force_channel=1, response_channel=2, align=False),
+            'unit = "mm"\nseconds = 2\nforce_channel = 1\nresponse_channel = 2\nalign = false\nheld = [[0, 1.5, 2]]\n',
+            CaptureSettings(
+                unit="mm", seconds=2.0, force_channel=1, response_channel=2, align=False, held=((0.0, 1.5, 2.0),)
+            ),
         ),
     ):
         path.write_text(text)

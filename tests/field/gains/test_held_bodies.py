@@ -58,7 +58,7 @@ def test_a_plate_is_held_where_its_user_says():
     found = MixtureEstimator(bodies=Plate(feet)).solve(known_gains(true)[0])[0].report["bodies"][0]
     assert found["support"] == "held at (40, 27, 0) mm and (200, 80, 0) mm"
     assert found["support_stiffness"] > 1e6
-    assert found["frequency_factor"] == pytest.approx(1.0, abs=0.05)
+    assert found["frequency_factor"] == pytest.approx(1.0, abs=0.1)
 
 
 def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypatch: pytest.MonkeyPatch):
