@@ -179,6 +179,15 @@ def test_an_edit_out_of_bounds_is_refused(plate: Served, words: dict[str, Any]) 
     assert plate.manifest()["live"]["revision"] == 1
 
 
+@pytest.mark.parametrize("words", [{"prompt": "w" * 500_000}, {"prompt": " "}, {"prompt": "wood", "pitch": 2.0}])
+def test_a_prompt_is_short_and_alone(plate: Served, words: dict[str, Any]) -> None:
+    plate.studio.model = "a model"
+    try:
+        refused(plate.ask("POST", "edit", {"base": 1, **words}), 400)
+    finally:
+        plate.studio.model = None
+
+
 def test_the_body_of_an_edit_is_bounded(plate: Served) -> None:
     refused(plate.ask("POST", "edit", {"base": 1, "law": "w" * (1 << 20)}), 413)
 

@@ -1,7 +1,6 @@
 /** The contacts of a field, points on the object's surface: which of them is nearest, and how far apart they lie. */
 
-/** On a thin wall contacts of its other side may be nearer than those of its own: these may be this many spacings
- * farther away. */
+/** On a thin wall contacts of the other side may be nearer than those of the own side, by at most this much. */
 const WALL_SPACINGS = 3;
 
 export class Contacts {

@@ -53,16 +53,13 @@ export function reconstructGroup(studio) {
   const enable = () => {
     go.disabled = !ready || progress.job !== null;
   };
-  const go = button(
-    "Reconstruct the field",
-    async () => {
-      go.disabled = true;
-      const started = await attempt(() => server.reconstruct(), "job");
-      if (started) await follow(started.job);
-      enable();
-    },
-    { className: "main" },
-  );
+  const start = async () => {
+    go.disabled = true;
+    const started = await attempt(() => server.reconstruct(), "job");
+    if (started) await follow(started.job);
+    enable();
+  };
+  const go = button("Reconstruct the field", start, { className: "main" });
   const follow = async (job) => {
     const followed = progress.follow(job);
     enable();

@@ -43,10 +43,7 @@ export class Modes {
     return amplitudes.map((value) => decibels(value / loudest));
   }
 
-  /** A mode's gain at every contact over its greatest, from -1 to 1: opposite signs swing against each other.
-   *
-   * Gains have a sine and a cosine part; the sign is told along the phase that most of the mode's power has.
-   */
+  /** A mode's gain at every contact over its greatest, from -1 to 1, along the phase that most of its power has. */
   shape(mode) {
     const { sine, cosine } = this.tensors;
     let [difference, product] = [0, 0];
@@ -68,12 +65,9 @@ export class Modes {
 
   /** The contact at which an impact is loudest. */
   get loudestRow() {
-    let [best, loudest] = [0, -1];
-    for (let row = 0; row < this.contacts.count; row++) {
-      let power = 0;
-      for (let mode = 0; mode < this.count; mode++) power += this.amplitude(mode, row) ** 2;
-      if (power > loudest) [best, loudest] = [row, power];
-    }
-    return best;
+    const powers = new Float64Array(this.contacts.count);
+    for (let row = 0; row < powers.length; row++)
+      for (let mode = 0; mode < this.count; mode++) powers[row] += this.amplitude(mode, row) ** 2;
+    return Math.max(0, powers.indexOf(powers.reduce((most, power) => Math.max(most, power), 0)));
   }
 }

@@ -15,6 +15,8 @@ const SHADING = 0.35;
 /** Edges of a painted mesh have at least this part of its diagonal, which gives at most some 200,000 triangles. */
 const MIN_EDGE_SHARE = 1 / 200;
 const MAX_HALVINGS = 30;
+/** Of the angle between the normal of a corner and that of its face, 40 degrees, from which on an edge is sharp. */
+const MIN_CREASE_COSINE = 0.77;
 
 /** Contacts as round dots. */
 export class PointLayer {
@@ -37,10 +39,6 @@ export class PointLayer {
     if (colors) this.colors.array.set(colors);
     else this.colors.array.fill(150);
     this.colors.needsUpdate = true;
-  }
-
-  dispose() {
-    dispose(this.object);
   }
 }
 
@@ -90,6 +88,7 @@ export class MeshLayer {
       parts.push((bare.index ? bare.toNonIndexed() : bare).applyMatrix4(part.matrixWorld));
     });
     this.geometry = mergeGeometries(parts);
+    sharpen(this.geometry);
     this.tree = new MeshBVH(this.geometry, { indirect: true });
   }
 
@@ -111,7 +110,8 @@ export class MeshLayer {
   #finerCopy() {
     const { spacing, diagonal } = this.contacts;
     const longest = Math.max(1.5 * spacing, MIN_EDGE_SHARE * diagonal);
-    const geometry = mergeVertices(new TessellateModifier(longest, MAX_HALVINGS).modify(this.geometry));
+    const finer = new TessellateModifier(longest, MAX_HALVINGS).modify(this.geometry);
+    const geometry = mergeVertices(finer, 1e-6 * diagonal);
     const { position, normal } = geometry.attributes;
     geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(position.array.length), 3));
     this.paints = new Paint(this.contacts, position.array, normal.array);
@@ -120,17 +120,25 @@ export class MeshLayer {
     this.object.add(copy);
     return copy;
   }
+}
 
-  dispose() {
-    this.geometry.dispose();
-    dispose(this.object);
+/** Give corners whose normals are far from that of their face the face's: a sharp edge is no round one. */
+function sharpen({ attributes: { position, normal } }) {
+  const [triangle, face, own] = [new THREE.Triangle(), new THREE.Vector3(), new THREE.Vector3()];
+  for (let corner = 0; corner < position.count; corner++) {
+    const first = corner - (corner % 3);
+    triangle.setFromAttributeAndIndices(position, first, first + 1, first + 2).getNormal(face);
+    const cosine = face.dot(own.fromBufferAttribute(normal, corner));
+    if (Math.abs(cosine) < MIN_CREASE_COSINE) normal.setXYZ(corner, ...face.multiplyScalar(Math.sign(cosine) || 1));
   }
 }
 
-function dispose(object) {
-  object.traverse(({ geometry, material }) => {
+/** Free what a layer holds of the graphics processor. */
+export function dispose(layer) {
+  layer.object.traverse(({ geometry, material }) => {
     for (const each of [geometry, material, ...Object.values(material ?? {})]) each?.dispose?.();
   });
+  layer.dispose?.();
 }
 
 /** A byte of the screen's red, green or blue as an amount of light from 0 to 1, as three wants it. */

@@ -3,7 +3,7 @@
 import * as THREE from "three";
 
 import { element } from "./dom.js";
-import { MeshLayer, PointLayer, SplatLayer } from "./objectlayers.js";
+import { dispose, MeshLayer, PointLayer, SplatLayer } from "./objectlayers.js";
 import { Viewpoint } from "./viewpoint.js";
 
 export class ObjectView {
@@ -50,7 +50,7 @@ export class ObjectView {
     await layers.object;
     if (this.layer) {
       this.scene.remove(this.layer.object);
-      for (const each of Object.values(this.layers)) (await each).dispose();
+      for (const each of Object.values(this.layers)) dispose(await each);
       // A new layer bears no paint, and a legend without paint would tell nothing.
       this.layer = this.painted = null;
       document.getElementById("legend").hidden = true;
