@@ -4,7 +4,7 @@ Autograd through a short-time transform with a hop of 64 samples keeps every fra
 is piecewise linear in the magnitudes, so its gradient is at hand as soon as a chunk of frames is: transform, take the
 sign, transform back, overlap-add, forget. One autograd function does all of it in the forward pass. Torch takes a dozen
 passes through memory for the comparison, which is most of what a fit does; on processors compiled loops compare and
-overlap-add. On graphics cards each call of torch costs more than its arithmetic: there one chunk holds a resolution.
+overlap-add. On GPUs each call of torch costs more than its arithmetic: there one chunk holds a resolution.
 """
 
 import math

@@ -169,7 +169,7 @@ class _Run:
     def train_step(self) -> tuple[Float[Tensor, ""], Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Take one step; return the loss before it, the image rendered, and the one that it was compared with.
 
-        Raises `SceneError` where the loss is no finite number, on a graphics card some steps later.
+        Raises `SceneError` where the loss is no finite number, on a GPU some steps later.
         """
         config, done = self.config, self.step + 1
         view = self._next_view()

@@ -52,7 +52,7 @@ def psnr(
 def convolved_ssim(
     image: Float[Tensor, "height width 3"], target: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, ""]:
-    """Return the same as `ssim` by convolutions, which graphics cards do best; differentiable by both images."""
+    """Return the same as `ssim` by convolutions, which GPUs do best; differentiable by both images."""
     window = torch.from_numpy(np.outer(_WINDOW, _WINDOW)).to(image, non_blocking=True)
     maps = torch.stack([image, target, image * image, target * target, image * target]).permute(0, 3, 1, 2)
     kernel = window.expand(3, 1, *window.shape)
