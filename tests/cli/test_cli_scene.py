@@ -89,24 +89,6 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
-@pytest.mark.slow
-def test_a_changed_picture_makes_everything_anew(capture: Path, kept: Path, tmp_path: Path, capsys: Streams) -> None:
-    cache, changed = tmp_path / "cache", tmp_path / "slab"
-    shutil.copytree(kept, cache)
-    shutil.copytree(capture, changed)
-    pictures = sorted((changed / "images").iterdir())
-    # One picture in another's place: names stay, contents do not.
-    first, second = pictures[0].read_bytes(), pictures[1].read_bytes()
-    pictures[0].write_bytes(second)
-    pictures[1].write_bytes(first)
-    assert main(["fit", str(changed), "--until", "features", "--cache", str(cache), *SMALL_SPLAT, *LIFT, "--json"]) == 0
-    capsys.readouterr()
-    assert (cache / "views" / "images" / pictures[0].name).read_bytes() != (
-        kept / "views" / "images" / pictures[0].name
-    ).read_bytes()
-    assert (cache / "cloud.ply").read_bytes() != (kept / "cloud.ply").read_bytes()
-
-
 def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
     capture: Path, kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:

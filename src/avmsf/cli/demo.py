@@ -11,7 +11,7 @@ import tyro
 
 from avmsf._utils.files import way_out
 from avmsf.cli.options import Common
-from avmsf.cli.output import say, show
+from avmsf.cli.output import show
 from avmsf.cli.paths import New, OutputError
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 
@@ -67,7 +67,8 @@ def run(options: Options) -> int:
     common = [f"--{name}" for name in ("quiet", "verbose", "json") if getattr(options, name)]
     for command in COMMANDS:
         words = shlex.split(command.format(shlex.quote(str(folder))))
-        say(f"\n$ avmsf {shlex.join(words)}")
+        if not options.quiet:
+            show(f"\n$ avmsf {shlex.join(words)}")
         code = main([*words, *common])
         if code:
             return code
