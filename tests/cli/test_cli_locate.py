@@ -161,6 +161,7 @@ def test_recordings_without_an_impact_on_the_object_have_no_place(
         assert (values["status"], values["position"]) == ("not located", None)
         assert reason in values["reason"]
         assert f"{path}: not located: " in err
+    assert "next: " not in err
     assert not list(tmp_path.iterdir())
 
 

@@ -1,7 +1,6 @@
 """`avmsf suggest`: from a field file to a table, a list and a picture."""
 
 import csv
-import json
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ from avmsf.errors import FitError
 from avmsf.field.store import save
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.raising import raises
-from factories.verbs import run_verb
+from factories.verbs import results_of, run_verb
 
 Streams = pytest.CaptureFixture[str]
 
@@ -25,9 +24,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, capsys: Streams) -> None:
-    assert run_verb("suggest", str(field), "--count", "3", "--output", str(tmp_path / "next"), "--json") == 0
-    out, err = capsys.readouterr()
-    printed = json.loads(out)
+    printed, err = results_of(capsys, "suggest", field, "--count", "3", "--plots", tmp_path / "next")
     assert "uncertainty of the gains" in err
     with open(tmp_path / "next" / "suggested.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -35,6 +32,9 @@ def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, cap
     for row, known in zip(rows, printed["suggestions"], strict=True):
         for name in ("x", "y", "z", "nx", "ny", "nz", "error_after"):
             assert float(row[name]) == pytest.approx(known[name], rel=1e-5, abs=1e-9)
+    below = [str(row["order"]) for row in printed["suggestions"] if row["nz"] > 0.5]
+    assert ("from below" in err) == bool(below)
+    assert not below or f"z is up: {', '.join(below)};" in err
     errors = [printed["error_before"], *(each["error_after"] for each in printed["suggestions"])]
     assert errors == sorted(errors, reverse=True)
     assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")

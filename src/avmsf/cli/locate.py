@@ -115,9 +115,10 @@ def run(options: Options) -> int:
         show(_summary_line(summary, options.probability))
     results = {"impacts": found, "summary": summary, "failures": failures}
     print_json({"field": str(options.field), "quality": verdict, **results})
-    if found and field.gain_field.contacts is not None and not field.origin.report.get(EDITS):
+    located = [each["position"] is not None for each in found]
+    if any(located) and field.gain_field.contacts is not None and not field.origin.report.get(EDITS):
         next_command("avmsf suggest", options.field)
-    return UNLOCATED if failures or any(each["position"] is None for each in found) else 0
+    return UNLOCATED if failures or not all(located) else 0
 
 
 def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_Answer]]":
