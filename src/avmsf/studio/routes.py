@@ -40,7 +40,7 @@ def make_app(studio: Studio, announce: Callable[[], None] = lambda: None) -> Sta
         finally:
             await studio.close()
 
-    calls = Calls(studio)
+    calls = _Calls(studio)
     routes = [
         _route("GET", "/", lambda request: HTMLResponse(html, headers=policy)),
         _route("GET", "/page/{path:path}", lambda request: _file(PAGE, request)),
@@ -70,7 +70,7 @@ def make_app(studio: Studio, announce: Callable[[], None] = lambda: None) -> Sta
     return app
 
 
-class Calls:
+class _Calls:
     """The requests whose values are in their address or their headers."""
 
     def __init__(self, studio: Studio) -> None:
@@ -86,31 +86,25 @@ class Calls:
         return Response(files[path], media_type=MEDIA_TYPES[Path(path).suffix])
 
     async def lead(self, request: Request) -> Any:
-        """Optimize the sound towards a recording."""
         base = request.query_params.get("base", "")
         return await self.studio.lead({"base": _as_number(base)}, await request.body())
 
     async def check_recording(self, request: Request) -> Any:
-        """The report on a recording, which is not saved."""
         content = await request.body()
         return await self.studio.with_editor(lambda editor: editor.check(content))
 
     async def add_impact(self, request: Request) -> Any:
-        """Add an impact to the capture."""
         impact, content = read_contact(request.query_params), await request.body()
         return await self.studio.with_editor(lambda editor: editor.add(content, impact))
 
     def send_recording(self, request: Request) -> Response:
-        """Send one of the capture's recordings."""
         return _file(self.studio.require_editor().folder, request, only=_SOUNDS)
 
     async def redo_impact(self, request: Request) -> Any:
-        """Replace one of the capture's recordings."""
         name, match, content = request.path_params["path"], _expected(request), await request.body()
         return await self.studio.with_editor(lambda editor: editor.redo(name, content, match=match))
 
     async def remove_impact(self, request: Request) -> Any:
-        """Remove an impact from the capture."""
         name, match = request.path_params["path"], _expected(request)
         await self.studio.with_editor(lambda editor: editor.remove(name, match=match))
         return {"removed": name}
@@ -152,10 +146,7 @@ def _route(
     read: Callable[[Request], Awaitable[Any]] | None = None,
     status: int = 200,
 ) -> Route:
-    """Return a route that calls `act` with the request, or with what `read` makes of it.
-
-    It answers with the response of `act`, or with JSON of its plain values.
-    """
+    """Return a route of `act`, called with the request or what `read` makes of it; plain values become JSON."""
 
     async def answer(request: Request) -> Response:
         done = act(request if read is None else await read(request))

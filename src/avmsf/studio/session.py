@@ -4,7 +4,6 @@ Every change names the revision that it is based on; if another tab was faster, 
 message. Revision numbers only increase; the number of an undone revision is not used again.
 """
 
-import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -143,7 +142,7 @@ class Session:
 def _write_new(field: SoundField, path: Path) -> None:
     """Write a field to a new file. Raises RequestError (409) if the file exists, and StudioError."""
     try:
-        os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        path.touch(exist_ok=False)
     except FileExistsError as error:
         message = f"{path.name}: expected a new name, got an existing file; choose another name"
         raise RequestError(409, message, file=path) from error

@@ -1,3 +1,4 @@
+/*! With three-mesh-bvh, Copyright (c) 2018 Garrett Johnson, MIT License */
 export * from "three";
 export { OrbitControls } from "three/addons/controls/OrbitControls.js";
 export { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
