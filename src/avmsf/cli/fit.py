@@ -4,7 +4,7 @@ import shlex
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -34,6 +34,8 @@ from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset, TimeZe
 
 if TYPE_CHECKING:
     from avmsf.evaluation.scores import Scores
+    from avmsf.field.sound_field import SoundField
+    from avmsf.pipeline.fit import StagedFit
     from avmsf.pipeline.stages import StageFolder
 
 _STAGES = {"field.safetensors": "fit", "points.safetensors": "features"}
@@ -237,33 +239,32 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     show("\n".join(lines))
     if options.plots is not None:
         draw_field(fitted, options.plots, recorded=None if test is None else made.modes.aligned(test))
-    print_json(
-        {
-            "field": str(path),
-            "capture": fitted.origin.capture,
-            "modes": int(fitted.is_mode.sum()),
-            "supporting_poles": int((~fitted.is_mode).sum()),
-            "report": fitted.origin.report,
-            "body": None if fitted.body is None else fitted.body.record(),
-            "quality": None if fitted.quality is None else fitted.quality.level,
-            "surface": None if made.surface is None else str(made.surface),
-            "preset": options.preset,
-            "config": asdict(config.fit),
-            "features_report": made.report,
-            "stages": [
-                {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
-                for name, each in made.stages.items()
-            ],
-            "sample_rate": fitted.sample_rate,
-            "trained_on": list(train.names),
-            "tested_on": [] if test is None else list(test.names),
-            "scores": {method: each.mean() for method, each in scores.items()},
-        }
-    )
+    values = {"preset": options.preset, "config": asdict(config.fit), "trained_on": list(train.names)}
+    values |= {"tested_on": [] if test is None else list(test.names), "field": str(path)}
+    print_json({**values, **_values(fitted, made), "scores": {name: each.mean() for name, each in scores.items()}})
     if test is None:
         next_command("avmsf render", path, _RENDER)
     else:
         next_step("the same command without --train-fraction and --train-count fits all recordings")
+
+
+def _values(fitted: "SoundField", made: "StagedFit") -> dict[str, Any]:
+    """Return what a field is and which stages made it, as plain values."""
+    return {
+        "capture": fitted.origin.capture,
+        "modes": int(fitted.is_mode.sum()),
+        "supporting_poles": int((~fitted.is_mode).sum()),
+        "report": fitted.origin.report,
+        "body": None if fitted.body is None else fitted.body.record(),
+        "quality": None if fitted.quality is None else fitted.quality.level,
+        "surface": None if made.surface is None else str(made.surface),
+        "features_report": made.report,
+        "stages": [
+            {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
+            for name, each in made.stages.items()
+        ],
+        "sample_rate": fitted.sample_rate,
+    }
 
 
 def _guess(options: Options, material: str, settings: CaptureSettings) -> None:

@@ -2,8 +2,10 @@
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -12,6 +14,10 @@ from avmsf.cli.options import Common, Flag, expect_capture, read_settings
 from avmsf.cli.output import doing, next_step, print_json, say, show, table
 from avmsf.cli.paths import FieldFile, OtherCapture, PictureFolder, SettingsFile
 from avmsf.errors import FitError
+
+if TYPE_CHECKING:
+    from avmsf.field.next_contacts import Suggestions
+    from avmsf.field.sound_field import SoundField
 
 TABLE, PICTURE = "suggested.csv", "suggested.png"
 """What the folder of results holds."""
@@ -59,13 +65,9 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Suggest, print and draw."""
-    from avmsf._utils.files import write_whole
     from avmsf.capture import read_capture
     from avmsf.field.next_contacts import suggest
-    from avmsf.field.posterior import relative_gain_std
     from avmsf.field.store import load
-    from avmsf.plotting.pictures import save_picture
-    from avmsf.plotting.uncertainty import draw_uncertainty
 
     field = load(options.field)
     names: tuple[str, ...] | None = None
@@ -102,24 +104,33 @@ def run(options: Options) -> int:
             lines.append(f"from below, where z is up: {', '.join(below)}; turn the object, or leave these out")
     show("\n".join(lines))
     if options.output is not None:
-        words = io.StringIO()
-        writer = csv.writer(words, lineterminator="\n")
-        digits = [[f"{each:.6g}" if isinstance(each, float) else each for each in row] for row in rows]
-        writer.writerows([list(columns), *digits])
-        write_whole(options.output / TABLE, words.getvalue())
-        points = field.gain_field.points[:: max(1, len(field.gain_field.points) // _DRAWN_POINTS)]
-        picture = draw_uncertainty(
-            points,
-            relative_gain_std(field, points),
-            title=f"{field.origin.capture or 'field'}: uncertainty, and where to record next",
-            contacts=field.gain_field.contacts,
-            suggested=found.contacts,
-            directions=found.directions,
-        )
-        save_picture(picture, options.output / PICTURE)
-        say(f"wrote {TABLE} and {PICTURE} in {options.output}")
+        _write(options.output, field, found, [list(columns), *rows])
     next_step("record these, then avmsf fit CAPTURE -o NEW.safetensors")
     suggestions = [dict(zip(columns, row, strict=True)) for row in rows]
     results = {"error_before": found.before, "unreachable": found.unreachable, "suggestions": suggestions}
     print_json({"capture": field.origin.capture, **results})
     return 0
+
+
+def _write(folder: Path, field: "SoundField", found: "Suggestions", rows: Sequence[Sequence[Any]]) -> None:
+    """Write the list of contacts, and draw them on the object with the uncertainty of its gains."""
+    from avmsf._utils.files import write_whole
+    from avmsf.field.posterior import relative_gain_std
+    from avmsf.plotting.pictures import save_picture
+    from avmsf.plotting.uncertainty import draw_uncertainty
+
+    words = io.StringIO()
+    digits = [[f"{each:.6g}" if isinstance(each, float) else each for each in row] for row in rows]
+    csv.writer(words, lineterminator="\n").writerows(digits)
+    write_whole(folder / TABLE, words.getvalue())
+    points = field.gain_field.points[:: max(1, len(field.gain_field.points) // _DRAWN_POINTS)]
+    picture = draw_uncertainty(
+        points,
+        relative_gain_std(field, points),
+        title=f"{field.origin.capture or 'field'}: uncertainty, and where to record next",
+        contacts=field.gain_field.contacts,
+        suggested=found.contacts,
+        directions=found.directions,
+    )
+    save_picture(picture, folder / PICTURE)
+    say(f"wrote {TABLE} and {PICTURE} in {folder}")
