@@ -239,9 +239,15 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     show("\n".join(lines))
     if options.plots is not None:
         draw_field(fitted, options.plots, recorded=None if test is None else made.modes.aligned(test))
-    values = {"preset": options.preset, "config": asdict(config.fit), "trained_on": list(train.names)}
-    values |= {"tested_on": [] if test is None else list(test.names), "field": str(path)}
-    print_json({**values, **_values(fitted, made), "scores": {name: each.mean() for name, each in scores.items()}})
+    values = {
+        "field": str(path),
+        "preset": options.preset,
+        "config": asdict(config.fit),
+        "trained_on": list(train.names),
+        "tested_on": [] if test is None else list(test.names),
+        "scores": {name: each.mean() for name, each in scores.items()},
+    }
+    print_json({**_values(fitted, made), **values})
     if test is None:
         next_command("avmsf render", path, _RENDER)
     else:
