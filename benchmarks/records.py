@@ -31,7 +31,7 @@ KINDS: dict[str, tuple[str, Better]] = {
     **dict.fromkeys(("ssim", "precision", "recall", "found", "right", "voices", "speed", "coherence"), ("", "higher")),
     **dict.fromkeys(("clap", "accuracy", "read", "refused", "agreement"), ("", "higher")),
     **dict.fromkeys(("coverage", "modes", "poles", "dofs", "count", "gaussians", "inputs", "steps", "axes"), ("", "")),
-    **dict.fromkeys(("planes", "triangles", "true", "known", "uncertainty", "named"), ("", "")),
+    **dict.fromkeys(("coverage90", "planes", "triangles", "true", "known", "uncertainty", "named"), ("", "")),
 }
 """Unit, and which way is better, by a word of a value's name; of a name without any: no unit, the lower the better."""
 _Item = TypeVar("_Item")
