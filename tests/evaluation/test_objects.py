@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset, VisualSource
-from avmsf.errors import EvaluationError, SceneError
+from avmsf.errors import EvaluationError, FitError, SceneError
 from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
@@ -37,12 +38,13 @@ class OneObject(Dataset):
 
     name = "one"
 
-    def __init__(self, seen: Path | None, surface: Surface | None = None) -> None:
-        self.seen, self.surface = seen, surface
+    def __init__(self, seen: Path | None, surface: Surface | None = None, **settings: Any) -> None:
+        self.seen, self.surface, self.settings = seen, surface, CaptureSettings(**settings)
 
     def capture(self, identifier: str) -> Capture:
         contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
-        return Capture("slab", Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c")), self.surface)
+        impacts = Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c"))
+        return Capture("slab", impacts, self.surface, self.settings)
 
     def visual_source(self, identifier: str) -> VisualSource | None:
         return None if self.seen is None else VisualSource(self.seen)
@@ -131,6 +133,13 @@ def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Pat
     found = ObjectInputs(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3).features("slab", "surface")
     assert torch.equal(found.points, FeatureField.from_mesh(slab(), seed=3).points)
     assert not (tmp_path / "cache").exists()
+
+
+def test_bodies_are_held_at_points_of_the_object_that_its_user_states(tmp_path: Path) -> None:
+    # Centimeters, of which the slab has fewer than a hundred.
+    dataset = OneObject(None, slab(), held=((0.0, 0.0, 0.0), (100.0, 0.0, 0.0)), unit="cm")
+    with raises(FitError, name="held", row=1):
+        ObjectInputs(dataset, tmp_path, CONFIG).bodies("slab")
 
 
 @pytest.mark.slow

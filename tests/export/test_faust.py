@@ -84,6 +84,14 @@ def test_another_sample_rate_changes_neither_pitch_nor_decay(tmp_path):
 
 
 @compiled
+def test_nothing_sounds_before_the_first_impact(tmp_path):
+    write_faust(table(noisy=True), tmp_path / "thing.dsp")
+    heard = sounded(tmp_path / "thing.dsp", (1, 1.0, 0.0, 3 * BLOCK))
+    assert not heard[: 3 * BLOCK].any()
+    assert heard[3 * BLOCK :].any()
+
+
+@compiled
 def test_the_library_holds_the_same_sound_without_controls(tmp_path):
     field = table(phased=True)
     write_faust(field, tmp_path / "thing.lib")

@@ -7,6 +7,7 @@ import torch
 
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
+from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import calibrate_tempering
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -63,3 +64,13 @@ def test_fields_with_too_few_contacts_are_trusted_as_fields_are_on_the_whole() -
 def test_a_contact_in_the_same_place_as_another_is_left_out_with_it() -> None:
     # Predicted from itself, an impact would be found to a hair's breadth.
     assert calibrate_tempering(plate_field(12, again=2)) == pytest.approx(calibrate_tempering(plate_field(12)), rel=0.3)
+
+
+def test_regions_are_the_wider_the_less_a_mode_counts() -> None:
+    field = plate_field(40)
+    sound, sizes = field.render(field.gain_field.points[200:201])[0], []
+    for factor in (1.0, 0.1, 0.01):
+        locator = Locator.of(field)
+        vars(locator)["tempering_factor"] = factor
+        sizes.append(int(locator.locate(sound).region().sum()))
+    assert sizes[0] < sizes[1] < sizes[2]

@@ -13,7 +13,7 @@ TRAINABLE = ("cpu", "cuda")
 
 
 def steps_between_losses(device: torch.device) -> int:
-    """Return after how many steps a loss is read: reading one from a graphics card waits for all that it was given."""
+    """Return after how many steps a loss is read: reading one from a GPU waits for all that it was given."""
     return 1 if device.type == "cpu" else 50
 
 

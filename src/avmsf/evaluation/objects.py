@@ -99,7 +99,8 @@ class ObjectInputs:
 
     def bodies(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
-        return candidate_bodies(self._surface(identifier), self.body, cache=self.cache / identifier / "bodies")
+        held_at, cache = self.dataset.capture(identifier).settings.held_at, self.cache / identifier / "bodies"
+        return candidate_bodies(self._surface(identifier), self.body, held_at=held_at, cache=cache)
 
     def family(self, identifier: str) -> BodyFamily:
         """Return an object's bodies for DiffSound. Raises SceneError and SimulationError likewise."""

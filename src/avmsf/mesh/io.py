@@ -35,7 +35,7 @@ and more to place, texture and render."""
 MAX_COORDINATE = 1e9
 """Largest coordinate, in the file's unit: a kilometer in micrometers. Its cube is an ordinary number in float32."""
 MAX_TEXTURE_PIXELS = 3 * 8192**2
-"""Pixels of all textures: three pictures of 8192 x 8192, the largest that graphics cards of all makes take. 0.6 GB."""
+"""Pixels of all textures: three pictures of 8192 x 8192, the largest that GPUs of all makes take. 0.6 GB."""
 _COMMAS = re.compile(rb"^\s*(v|vertex)\s+-?[0-9]+,[0-9]", re.MULTILINE)
 _UNUSUAL = re.compile(rb"\A\xef\xbb\xbf|^[ \t]+[vf]|^[vf][^\n]*\t|^f[^\n]*[ /]-", re.MULTILINE)
 """A byte-order mark, tabs or spaces where one space is usual, and negative indices."""

@@ -37,7 +37,8 @@ SAMPLE_RATE = 44_100.0
 _HIGHEST = 0.499
 """Highest frequency of a mode over the sample rate."""
 _MAX_HELD_DISTANCE = 0.1
-"""Distance from the surface, over its diagonal, of a point at which the object is held: within a finger's width."""
+"""Distance from the surface, over the object's diagonal, up to which a point at which it is held is meant to be on it:
+coordinates of another unit or frame are farther away."""
 _BINS = 1025
 """Of the residual, which is zero: as many as that of a fit has."""
 
