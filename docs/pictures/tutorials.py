@@ -15,11 +15,11 @@ FIELD, CAPTURE = "mug.safetensors", "capture"
 HELD_OUT = f"{CAPTURE}/012.wav"
 """One of the recordings that the demo's field is not fitted to."""
 COMMANDS = {
-    "modes": ("modes", CAPTURE, "--picture", "{}/modes.png"),
+    "modes": ("modes", CAPTURE, "--plots", "{}"),
     "info": ("info", FIELD, "--capture", CAPTURE, "--plots", "{}"),
     "suggest": ("suggest", FIELD, "--output", "{}"),
     "locate": ("locate", FIELD, HELD_OUT, "--output", "{}"),
-    "edit": ("edit", FIELD, "--material", "wood", "--output", "{}/wooden.safetensors", "--plots", "{}"),
+    "edit": ("edit", FIELD, "--to", "wood", "--output", "{}/wooden.safetensors", "--plots", "{}"),
 }
 """Their arguments, with {} for the folder that each writes to."""
 DRAWN = {
