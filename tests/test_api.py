@@ -82,6 +82,16 @@ def test_a_split_trains_on_a_part_of_the_positions_or_on_their_number(size, posi
     assert len(set(names)) > 1
 
 
+def test_fit_says_what_it_does_unless_that_is_turned_off(capfd):
+    config = PipelineConfig(modes=2, fit=FitConfig(steps=0))
+    avmsf.fit(capture(), config=config, progress=False)
+    assert capfd.readouterr() == ("", "")
+    avmsf.fit(capture(), config=config)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "modes" in err
+
+
 def test_fit_makes_the_field_that_the_command_makes(tmp_path):
     folder, output = fill_plate(tmp_path / "plate", surface=False), tmp_path / "field.safetensors"
     assert main(["fit", str(folder), "--output", str(output), "--modes", "6", "--set", "fit.steps=5"]) == 0

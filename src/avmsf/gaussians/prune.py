@@ -20,33 +20,30 @@ _MAX_DISTANCE_RATIO = 6.0
 """Largest mean distance to the neighbors, in medians of that distance, beyond which a Gaussian is an outlier."""
 _MAX_SCALE_RATIO = 0.15
 """Largest scale, in diagonals of the box around the middle 98 % of the centers."""
+_MIN_OPACITY = 0.1
+_MAX_WRONG_MASKS_RATIO = 0.1
+"""Views whose mask leaves a center out, over those that have it in their image."""
+_MIN_WEIGHT_PIXELS = 0.5
+"""What a Gaussian colors of a view, as a sum over its pixels, in the view where it is the most."""
 _MASK_MARGIN_PIXELS = 2
 """Pixels that a center may lie outside of a mask, whose edge is not known better."""
 
 
-def keep_object(
-    cloud: GaussianCloud,
-    views: Sequence[View],
-    *,
-    rasterizer: Rasterizer | None = None,
-    least_opacity: float = 0.1,
-    wrong_fraction: float = 0.1,
-    least_weight: float = 0.5,
-) -> GaussianCloud:
+def keep_object(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: Rasterizer | None = None) -> GaussianCloud:
     """Return the Gaussians that lie on the object.
 
-    Those go whose opacity is less than `least_opacity`; whose center is outside of the masks in more than
-    `wrong_fraction` of the views that have it in their image; whose scale is that of the object; whose neighbors are
-    far away; and, with a `rasterizer`, those that in no view color as much as `least_weight` pixels in sum, because
-    others hide them. Raises `SceneError` where nothing remains.
+    Those go whose opacity is less than .1; whose center is outside of the masks in more than a tenth of the views that
+    have it in their image; whose scale is that of the object; whose neighbors are far away; and, with a `rasterizer`,
+    those that in no view color as much as half a pixel in sum, because others hide them. Raises `SceneError` where
+    nothing remains.
     """
     tests: list[Callable[[GaussianCloud], Bool[Tensor, " points"]]] = [
-        lambda cloud: cloud.opacities >= least_opacity,
-        lambda cloud: _masks_agree(cloud.centers, views, wrong_fraction=wrong_fraction),
+        lambda cloud: cloud.opacities >= _MIN_OPACITY,
+        lambda cloud: _masks_agree(cloud.centers, views),
         _is_smaller_than_object,
     ]
     if rasterizer is not None:
-        tests.append(lambda cloud: blended_weight(cloud, views, rasterizer=rasterizer) >= least_weight)
+        tests.append(lambda cloud: blended_weight(cloud, views, rasterizer=rasterizer) >= _MIN_WEIGHT_PIXELS)
     tests.append(_is_near_others)
     kept = cloud.detach()
     for test in tests:
@@ -58,10 +55,8 @@ def keep_object(
     return kept
 
 
-def _masks_agree(
-    points: Float[Tensor, "points 3"], views: Sequence[View], *, wrong_fraction: float
-) -> Bool[Tensor, " points"]:
-    """Return which points at most `wrong_fraction` of the views with them in their image see outside of their mask."""
+def _masks_agree(points: Float[Tensor, "points 3"], views: Sequence[View]) -> Bool[Tensor, " points"]:
+    """Return which points few of the views with them in their image see outside of their mask."""
     device, points = points.device, points.cpu()
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _MASK_MARGIN_PIXELS + 1,) * 2)
     seen, against, voters = torch.zeros(len(points)), torch.zeros(len(points)), 0
@@ -77,7 +72,7 @@ def _masks_agree(
         against[inside] += (~mask[pixels[:, 1], pixels[:, 0]]).float()
     if not voters:
         return torch.ones(len(points), dtype=torch.bool, device=device)
-    return ((seen > 0) & (against <= wrong_fraction * seen)).to(device)
+    return ((seen > 0) & (against <= _MAX_WRONG_MASKS_RATIO * seen)).to(device)
 
 
 def blended_weight(cloud: GaussianCloud, views: Sequence[View], *, rasterizer: Rasterizer) -> Float[Tensor, " points"]:

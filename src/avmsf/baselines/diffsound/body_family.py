@@ -19,7 +19,7 @@ from avmsf.fem.solid import Solid
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 
-DEFAULT_SOLID_DOFS = 40_000
+_SOLID_DOFS = 40_000
 """Degrees of freedom of a solid body, about: tetrahedra lock where they fill thin parts."""
 _MAX_DEFECT_LIDS = 0.01
 """Part of a closed surface that lids over holes make up, below which the holes are defects of a scan. The mouth of a
@@ -94,12 +94,11 @@ def body_family(
     *,
     count: int,
     dofs: int = COARSE_WALL_DOFS,
-    solid_dofs: int = DEFAULT_SOLID_DOFS,
     log: Callable[[str], None] | None = None,
 ) -> BodyFamily:
     """Return the bodies of a surface, with their lowest `count` modes.
 
-    Walls have about `dofs` degrees of freedom, a solid body `solid_dofs`: prisms along walls of a pot and a tube are
+    Walls have about `dofs` degrees of freedom, a solid body 40,000: prisms along walls of a pot and a tube are
     1 % too stiff in frequency. A closed mesh that shows both sides of one wall has walls of `_WALL_RATIOS` times its
     thickness behind its larger side; another closed mesh is solid. An open mesh has walls of `THICKNESS_RATIOS` times
     its size. A shape from photographs has walls all over its range of thickness, or is solid where it has no cavity.
@@ -110,7 +109,7 @@ def body_family(
     candidates = SurfaceBodies(surface, log=report)
     thicknesses, make = _walls(candidates, dofs)
     if make is None:
-        return BodyFamily((isotropic_modes(candidates.solid(None, solid_dofs), count=count),), ())
+        return BodyFamily((isotropic_modes(candidates.solid(None, _SOLID_DOFS), count=count),), ())
     made, reasons = {}, []
     for thickness in thicknesses:
         report(f"elastic modes of a wall of {1000 * thickness:.2g} mm")
