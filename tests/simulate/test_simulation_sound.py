@@ -15,7 +15,7 @@ from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.material import CERAMIC, STEEL
 from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
-from avmsf.simulate.imperfections import damping_matrix, smooth_field, stream, support_places
+from avmsf.simulate.imperfections import damping_matrix, frequency_factors, smooth_field, stream, support_places
 from avmsf.simulate.recipe import Hammer, Imperfections
 from avmsf.simulate.simulation import SoundingBody, room_noise
 from factories.made_modes import breathing_sphere, sliding_plate
@@ -269,3 +269,16 @@ def test_an_object_stands_on_three_low_places_around_its_middle():
 def test_impossible_hammers_and_imperfections_are_refused(kind, name, value):
     with raises(SimulationError, name=f"{kind.__name__.lower()}.{name}", value=pytest.approx(value, nan_ok=True)):
         kind(**{name: value})
+
+
+def test_a_roving_mass_shifts_frequencies_as_it_does_in_the_equations_of_motion():
+    plate = sliding_plate()
+    places = torch.tensor([[0.11, 0.03, 0.002], [-0.05, 0.07, 0.002]], dtype=torch.float64)
+    vibration = damped(plate.frequency, 1e-3 * torch.eye(len(plate), dtype=torch.float64), highest=20000.0)
+    share = 1e-4
+    found = frequency_factors(plate, vibration, places, replace(Imperfections.none(), sensor=share, warming=0.01))
+    for place, factor, warm in zip(places, found, (1.0, 0.99), strict=True):
+        shape = plate.gains(place[None], torch.tensor([[0.0, 0.0, 1.0]]))[0].numpy()
+        mass = np.eye(len(shape)) + share * plate.mass * np.outer(shape, shape)
+        squares = scipy.linalg.eigh(np.diag(plate.frequency.numpy() ** 2), mass, eigvals_only=True)
+        np.testing.assert_allclose(factor.numpy(), warm * np.sqrt(squares) / plate.frequency.numpy(), rtol=1e-6)

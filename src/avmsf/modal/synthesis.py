@@ -20,8 +20,8 @@ fastest from about 256 on."""
 
 def synthesize(
     gains: Inexact[Tensor, "contacts modes"],
-    frequency: Float64[Tensor, " modes"],
-    damping: Float64[Tensor, "*contacts modes"],
+    frequency: Float64[Tensor, "*#contacts modes"],
+    damping: Float64[Tensor, "*#contacts modes"],
     phase: Float64[Tensor, " modes"] | None = None,
     *,
     samples: int,
@@ -29,10 +29,10 @@ def synthesize(
 ) -> Float[Tensor, "contacts samples"]:
     """Return the sum over modes of Im(c exp((-d + 2 pi i f) t)): of real gains c sines, as in the paper's eq. 3.
 
-    `frequency` in Hz, `damping` in 1/s, shared by all contacts or with one row a contact; sines are ahead by `phase`,
-    radians, zero without it; differentiable in all of them. Modes at or above half the sample rate would alias: the
-    caller leaves them out. The output has the precision of `gains`: in float32 its error is about 1e-7 of the loudest
-    sample, in float64 it is exact.
+    `frequency` in Hz and `damping` in 1/s, each shared by all contacts or with one row a contact; sines are ahead by
+    `phase`, radians, zero without it; differentiable in all of them. Modes at or above half the sample rate would
+    alias: the caller leaves them out. The output has the precision of `gains`: in float32 its error is about 1e-7 of
+    the loudest sample, in float64 it is exact.
     """
     # As the real part of a exp(i x), since products of complex tables are few calls.
     amplitudes = torch.complex(gains.imag if gains.is_complex() else torch.zeros_like(gains), -gains.real)
@@ -43,10 +43,10 @@ def synthesize(
     # Those of a block's samples turn backwards, for Re(a b) = Re a Re conj(b) + Im a Im conj(b): a real product.
     counts = torch.arange(0, blocks * _BLOCK, _BLOCK, **options), torch.arange(0, -_BLOCK, -1, **options)
     times = torch.cat(counts)[:, None] / sample_rate
-    decay, angle = torch.exp(damping[..., None, :] * -times.abs()), 2 * math.pi * frequency * times
+    decay, angle = torch.exp(damping[..., None, :] * -times.abs()), 2 * math.pi * frequency[..., None, :] * times
     # Processors take five times as long for torch.polar in float64.
     powers = torch.complex(decay * torch.cos(angle), decay * torch.sin(angle)).to(amplitudes.dtype)
     starts, steps = torch.tensor_split(powers, [blocks], dim=-2)
     left, right = (torch.view_as_real(each).flatten(-2) for each in (amplitudes[:, None, :] * starts, steps))
-    sounds = left.flatten(0, 1) @ right.mT if damping.ndim == 1 else left @ right.mT
+    sounds = left.flatten(0, 1) @ right.mT if powers.ndim == 2 else left @ right.mT
     return sounds.reshape(len(amplitudes), blocks * _BLOCK)[:, :samples]

@@ -30,7 +30,7 @@ _KIND = FileKind(
 )
 _MODES, _TABLES = ("frequency", "damping"), ("gains", "quadrature")
 """Tensors of a file: the real and the imaginary part of the gains are two."""
-_OPTIONAL = ("contacts", "starts")
+_OPTIONAL = ("contacts", "starts", "shifts")
 _RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}
 """Settings of recipes in files of earlier versions, and their names now."""
 
@@ -58,6 +58,8 @@ class Truth:
     starts: Float64[Tensor, " contacts"] | None = None
     """Sample of its file, counted from 0 and between samples too, at which t = 0 of each recording lies: sample n of
     recording i is at t = (n - starts[i]) / sample_rate. None where all files start with the impact's sound."""
+    shifts: Float64[Tensor, "contacts modes"] | None = None
+    """Relative shifts of the frequencies, f_ik = f_k (1 + shifts[i, k]); None where all recordings have the same."""
 
     @property
     def amplitudes(self) -> Complex128[Tensor, "contacts modes"]:
@@ -69,7 +71,8 @@ class Truth:
 
         Each mode's amplitude is multiplied by exp(pole * seconds). `starts` still name the impacts.
         """
-        poles = torch.complex(-self.damping, 2 * math.pi * self.frequency)
+        factors = 1.0 if self.shifts is None else 1.0 + self.shifts
+        poles = torch.complex(-self.damping.expand_as(self.gains.real), 2 * math.pi * self.frequency * factors)
         return replace(self, gains=self.gains * torch.exp(poles * seconds))
 
 
@@ -116,6 +119,7 @@ def _expect(tensors: dict[str, Tensor], record: dict[str, Any], path: Path) -> N
     contacts = len(record["names"])
     modes = tensors["frequency"].numel() if "frequency" in tensors else 0
     sizes: dict[str, tuple[int, ...]] = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
-    sizes |= {name: size for name, size in (("contacts", (contacts, 3)), ("starts", (contacts,))) if name in tensors}
+    optional = {"contacts": (contacts, 3), "starts": (contacts,), "shifts": (contacts, modes)}
+    sizes |= {name: size for name, size in optional.items() if name in tensors}
     skeleton = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
     expect_tensors(tensors, skeleton, path, _KIND)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf.fem.damping import rayleigh
+from avmsf.fem.damping import Vibration, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.simulate.recipe import Imperfections
 
@@ -39,6 +39,20 @@ def recording_starts(
     drawn = torch.from_numpy(stream(seed, "recording starts").standard_normal(count))
     before = imperfections.pretrigger + imperfections.propagation * delay
     return sample_rate * (before + imperfections.jitter * drawn)
+
+
+def frequency_factors(
+    modes: ElasticModes, vibration: Vibration, places: Float64[Tensor, "contacts 3"], imperfections: Imperfections
+) -> Float64[Tensor, "contacts modes"]:
+    """Return what multiplies the frequency of each damped mode in the recording of each contact.
+
+    A point mass m lowers the frequency of a mode of mass-normalized shape phi by m |phi|^2 / 2, to first order.
+    """
+    shapes = torch.stack([modes.gains(places, axis.expand_as(places)) for axis in torch.eye(3, dtype=torch.float64)])
+    parts = vibration.pushes.abs().square()
+    loads = shapes.square().sum(0) @ (parts / parts.sum(1, keepdim=True)).T
+    times = torch.linspace(0.0, 1.0, len(places), dtype=torch.float64)[:, None]
+    return (1.0 - 0.5 * imperfections.sensor * modes.mass * loads) * (1.0 - imperfections.warming * times)
 
 
 def smooth_field(

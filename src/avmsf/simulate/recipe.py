@@ -96,6 +96,10 @@ class Imperfections:
     A recorder's clock is not locked to the impact: at 48 kHz the default is 48 samples, so the fraction of a sample at
     which a sound starts is uniformly random.
     """
+    sensor: float = 0.0
+    """Mass of a sensor that is moved with the contact, over the object's: shifts each mode's frequency."""
+    warming: float = 0.0
+    """Relative fall of all frequencies from the first recording to the last, as of a body that gets warmer."""
     propagation: float = 1.0
     """Factor on the delay of the recordings by the travel of sound from the object's nearest point to the microphone,
     0 to 1."""

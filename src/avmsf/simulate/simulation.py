@@ -25,13 +25,13 @@ from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.bodies import Body, make_body, up_of
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
-from avmsf.simulate.imperfections import damping_matrix, recording_starts, stream
+from avmsf.simulate.imperfections import damping_matrix, frequency_factors, recording_starts, stream
 from avmsf.simulate.recipe import Hammer, ObjectRecipe
 from avmsf.simulate.strikes import Strikes, draw_strikes
 
 
 def recorded(
-    poles: Complex128[Tensor, " modes"],
+    poles: Complex128[Tensor, "*#contacts modes"],
     amplitudes: Complex128[Tensor, "contacts modes"],
     starts: Float64[Tensor, " contacts"],
     *,
@@ -46,9 +46,9 @@ def recorded(
     """
     first = starts.ceil().clamp(min=0.0)
     late = (first - starts) / sample_rate
-    moved = amplitudes * torch.exp(poles * late[:, None])
+    moved = 1j * amplitudes * torch.exp(poles * late[:, None])
     frequency, damping = poles.imag / (2 * math.pi), -poles.real
-    sounds = synthesize(1j * moved, frequency, damping, samples=samples, sample_rate=sample_rate)
+    sounds = synthesize(moved, frequency, damping, samples=samples, sample_rate=sample_rate)
     whole = torch.zeros_like(sounds)
     for row, begin in enumerate(first.long().tolist()):
         whole[row, begin:] = sounds[row, : samples - begin]
@@ -212,7 +212,11 @@ def record(
     amplitudes = amplitudes / strikes.force_errors[:, None]
     starts = recording_starts(len(amplitudes), imperfections, delay=body.delay, sample_rate=rate, seed=recipe.seed)
     frames = _kept(recipe) + max(0, math.ceil(starts.max())) + round(imperfections.pretrigger * rate)
-    sounds = recorded(body.vibration.poles, amplitudes, starts, sample_rate=rate, samples=frames)
+    poles, shifts = body.vibration.poles, None
+    if imperfections.sensor or imperfections.warming:
+        factors = frequency_factors(body.elastic, body.vibration, strikes.places, imperfections)
+        poles, shifts = torch.complex(poles.real.expand_as(factors), factors * poles.imag), factors - 1.0
+    sounds = recorded(poles, amplitudes, starts, sample_rate=rate, samples=frames)
     sounds = sounds + _noise(recipe, sounds, written)
     truth = Truth(
         frequency=body.vibration.frequency,
@@ -222,6 +226,7 @@ def record(
         recipe=recipe.values(),
         contacts=strikes.places,
         starts=starts,
+        shifts=shifts,
     )
     return sounds.float(), written.float(), truth
 
