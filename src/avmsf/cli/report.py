@@ -85,6 +85,8 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
         rows += [("warning", field.body.warning)] if field.body.warning else []
     elif report.get("supports_tried"):
         rows.append(("body", "none, free or held, predicts contacts left out better than smooth kernels"))
+    if (shift := report.get("frequency_shift")) is not None:
+        rows.append(("shifts", f"frequencies differ between recordings by {100 * shift:.2g} %, fitted in each"))
     rows += [("quality", words) for words in quality_words(field, path)]
     rows += [("outlier", words) for words in outlier_words(field)]
     rows += [("edited", _edit_words(edit)) for edit in report.get("edits", [])]

@@ -79,6 +79,8 @@ def fit(
     fitted = estimator.fit(data, trainer)
     order = fitted.run.order
     report = {"gain_model": estimator.name, **fitted.report}
+    if modes.shifts is not None:
+        report["frequency_shift"] = modes.shifts.relative
     if supporting is not None:
         report[SUPPORTING] = [row for row, found in enumerate(order.tolist()) if found in supporting]
     field = SoundField(

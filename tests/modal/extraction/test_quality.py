@@ -12,6 +12,7 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.errors import CaptureWarning
 from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_sounds
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.quality import ModeQuality, measure_quality
 from avmsf.modal.modes import ModalBank
@@ -102,7 +103,7 @@ def test_a_frequency_that_differs_between_recordings_shows_in_its_spread_alone()
 
 def test_a_second_pole_for_a_wandering_frequency_is_no_mode() -> None:
     sounds = wandering(1.0)
-    found = extract_sounds(sounds, sample_rate=RATE)
+    found = fitted(sounds, HighResolution().find(sounds, RATE))
     near = (found.bank.frequency - 700.0).abs() < 15.0
     assert int(near.sum()) > 1
     quality = measure_quality(sounds, found, sample_rate=RATE)

@@ -56,7 +56,8 @@ def gain_data(train: Impacts, features: FeatureField, modes: Extraction, config:
     # The alignment comes first, as it recognizes recordings by their samples. Amplitudes are float32 from there on, so
     # that a field is the same whichever its recordings came in.
     train = modes.aligned(train)
-    train = replace(train, sounds=train.sounds.float())
+    sounds = modes.at_common_poles(train.sounds, sample_rate=train.sample_rate)
+    train = replace(train, sounds=sounds.float())
     modes = replace(modes, residual=Residual(modes.residual.magnitude.float()))
     phase = torch.zeros_like(modes.bank.frequency)
     if config.phase == "common":

@@ -26,6 +26,7 @@ from avmsf.errors import ExtractionError, FieldFileError
 from avmsf.modal.extraction.alignment import Alignment, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency
+from avmsf.modal.extraction.frequency_shifts import FrequencyShifts
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, estimate_residual, noise_bins
@@ -48,14 +49,23 @@ class Extraction:
     residual: Residual
     alignment: Alignment | None = None
     """How the recordings were aligned first; None where they were taken as they are."""
+    shifts: FrequencyShifts | None = None
+    """The poles that each recording has of its own, which its gains are of; None where all have those of `bank`."""
 
     def take(self, rows: Sequence[int]) -> "Extraction":
         """Return the gains of some of the recordings, with the same modes."""
-        return replace(self, gains=self.gains[rows])
+        shifts = None if self.shifts is None else self.shifts.take(list(rows))
+        return replace(self, gains=self.gains[rows], shifts=shifts)
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings, these or others of the object, with the starts that the gains are of."""
         return impacts if self.alignment is None else self.alignment.apply(impacts)
+
+    def at_common_poles(
+        self, sounds: Float[Tensor, "contacts samples"], *, sample_rate: float
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the aligned sounds that the gains are of, row for row, without the shifts of their modes' poles."""
+        return sounds if self.shifts is None else self.shifts.removed(sounds, self.gains, sample_rate=sample_rate)
 
 
 def extract_modes(recordings: Capture | Impacts, method: ModeFinder | None = None) -> Extraction:
@@ -95,9 +105,15 @@ def extract_sounds(
     bank = finder.find(sounds, sample_rate)
     if len(bank) == 0:
         raise _no_mode(sounds, sample_rate)
-    gains = fit_gains(sounds, bank, sample_rate=sample_rate)
-    modes = synthesize(gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate)
-    return Extraction(bank, gains, estimate_residual(sounds, modes, bins=noise_bins(sounds.shape[1])))
+    samples = sounds.shape[1]
+    shifts = finder.find_shifts(sounds, bank, sample_rate)
+    if shifts is None:
+        gains = fit_gains(sounds, bank, sample_rate=sample_rate)
+        modes = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=sample_rate)
+    else:
+        bank, gains = shifts.bank, shifts.gains(sounds, sample_rate=sample_rate)
+        modes = shifts.modal_sounds(gains, samples=samples, sample_rate=sample_rate)
+    return Extraction(bank, gains, estimate_residual(sounds, modes, bins=noise_bins(samples)), shifts=shifts)
 
 
 def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ExtractionError:
@@ -148,6 +164,8 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
         "gains": torch.view_as_real(found.gains),
         "residual": found.residual.magnitude,
     }
+    if found.shifts is not None:
+        tensors |= {"poles": torch.view_as_real(found.shifts.poles), "shift": torch.tensor(found.shifts.relative)}
     if found.alignment is not None:
         tensors |= {_ALIGNMENT + name: each for name, each in found.alignment.tensors().items()}
 
@@ -167,11 +185,15 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
         if found != digest:
             return None
         kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
+        bank, shifts = ModalBank(read["frequency"], read["damping"]), None
+        if "poles" in read:
+            shifts = FrequencyShifts(bank, torch.view_as_complex(read["poles"].contiguous()), float(read["shift"]))
         return Extraction(
-            ModalBank(read["frequency"], read["damping"]),
+            bank,
             torch.view_as_complex(read["gains"].contiguous()),
             Residual(read["residual"]),
             Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
+            shifts,
         )
     except (FieldFileError, KeyError):
         return None

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avmsf.modal.config import ExtractionMethod, expect_modes
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
+from avmsf.modal.extraction.frequency_shifts import FrequencyShifts, find_shifts
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Selection, chance_ratio, merge
 from avmsf.modal.extraction.stft import Lines
@@ -48,6 +49,12 @@ class ModeFinder(ABC):
         The sounds start with the impact, all at one time, and are finite; the rate is in Hz.
         """
 
+    def find_shifts(
+        self, sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
+    ) -> FrequencyShifts | None:
+        """Return the poles that each recording has of its own; None, as here, where all have those of `bank`."""
+        return None
+
 
 @dataclass(frozen=True)
 class HighResolution(ModeFinder):
@@ -84,6 +91,13 @@ class HighResolution(ModeFinder):
         toned = math.pi * bank.frequency > self.least_quality * bank.damping
         turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _MIN_TURN_RADIANS * bank.damping
         return bank.take(toned & turning & (bank.damping >= _MIN_FALL_NEPERS * sample_rate / samples))
+
+    def find_shifts(
+        self, sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
+    ) -> FrequencyShifts | None:
+        """Return the poles that each recording has of its own, where modes shift from one to the next."""
+        chance = chance_ratio(len(sounds), trials=sounds.shape[1])
+        return find_shifts(sounds, bank, sample_rate=sample_rate, significance=self.significance * chance)
 
     def _select(self, selection: Selection, found: ModalBank, lowest: float) -> ModalBank:
         """Return those of `found` that the sounds need, refined.

@@ -68,7 +68,7 @@ def measure_quality(
     sounds: Float[Tensor, "contacts samples"], extraction: Extraction, *, sample_rate: float
 ) -> ModeQuality:
     """Return the quality of each pole, from the sounds that an extraction's gains are of (`Extraction.aligned`)."""
-    bank = extraction.bank
+    bank, sounds = extraction.bank, extraction.at_common_poles(sounds, sample_rate=sample_rate)
     level = (sounds - sounds.mean(1, keepdim=True)).square().mean(1).sqrt()
     audible = level > 0
     scaled = ((sounds - sounds.mean(1, keepdim=True))[audible] / level[audible, None]).double()

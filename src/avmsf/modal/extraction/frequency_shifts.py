@@ -1,0 +1,374 @@
+"""Modes whose frequency shifts from recording to recording, as by the mass of a roving sensor or by warming.
+
+A pole that all recordings share then fits none of them: its phase turns away within the sound, so that its gains are
+wrong, and extraction describes one mode by several poles, each for the recordings that have its frequency.
+
+In the band around poles that lie close together, the discrete Fourier transform of a recording is, but for noise,
+
+    X(k) = sum_j c_j D(s_j, k),  D(s, k) = (1 - z^N) / (1 - z e^(-2 pi i k / N)),  z = e^(s / rate),  s = -d + 2 pi i f.
+
+D is analytic in s, so the poles that one recording has of its own follow from complex least squares by variable
+projection (Golub and Pereyra, Inverse Problems 19, 2003): one step moves frequency and damping. Their prior is normal,
+around the mean pole moved by what all modes of the recording shift alike, with one relative standard deviation for all
+modes. How many modes a band has, and whether they shift, is decided by the Bayesian information criterion (Schwarz,
+Annals of Statistics 6, 1978); a shift counts as the part of a parameter that the recording determines and the prior
+does not.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import torch
+from jaxtyping import Complex, Complex128, Float, Float64, Int64
+from torch import Tensor
+
+from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains
+from avmsf.modal.modes import ModalBank
+from avmsf.modal.residual_noise import noise_at, noise_bins, noise_power
+from avmsf.modal.synthesis import synthesize
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Numbers of the search, chosen on simulated objects with sensors of up to .2 % of their mass."""
+
+    shift: float = 0.002
+    """Relative frequency shift between recordings, standard deviation, before any is known; and distance within which
+    poles may be one mode."""
+    near_widths: float = 3.0
+    """Half-power widths within which they may be one as well."""
+    band_widths: float = 6.0
+    """Half-power widths that a band reaches beyond its poles."""
+    band_bins: int = 8
+    """Bins that it reaches at least, of the whole sound's transform."""
+    nepers: float = 7.0
+    """Decay of a band's slowest mode within the part of the sound that is transformed."""
+    modes: int = 8
+    """Most poles in a band: all of their subsets are tried."""
+    pitched: float = 0.1
+    """Largest half-power width of a pole that may shift, over its frequency."""
+    least: float = 0.1
+    """Radians that a mode turns by its shift while it falls to 1/e, standard deviation: with fewer, gains at common
+    poles are as good. Measured captures of a fixed sensor have .04 to .09, and fields there were worse with shifts."""
+
+
+_TOLERANCES = Tolerances()
+_ITERATIONS = 12
+"""Steps of a band's fit."""
+_FREE_ITERATIONS = 2
+"""Steps of them before the prior counts, whose center is not known yet."""
+_MIN_SHIFT = 1e-6
+"""Least relative standard deviation of the prior."""
+_PASSES = 3
+"""Rounds over all bands, each with the shifts of the round before as the prior."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyShifts:
+    """Poles that each recording has of its own."""
+
+    bank: ModalBank
+    """The modes' mean poles."""
+    poles: Complex128[Tensor, "contacts modes"]
+    """-d + 2 pi i f, 1/s."""
+    relative: float
+    """Standard deviation of the relative shifts of frequency, median over modes by energy."""
+
+    def take(self, rows: Tensor | list[int]) -> "FrequencyShifts":
+        """Return those of some of the recordings."""
+        return FrequencyShifts(self.bank, self.poles[rows], self.relative)
+
+    def gains(
+        self, sounds: Float[Tensor, "contacts samples"], *, sample_rate: float
+    ) -> Complex[Tensor, "contacts modes"]:
+        """Return the gains that fit each sound best at its own poles."""
+        found = [
+            NormalEquations.of(sound[None], torch.exp(poles / sample_rate)).solve()
+            for sound, poles in zip(sounds, self.poles, strict=True)
+        ]
+        return torch.complex(*torch.cat(found).to(sounds.dtype).chunk(2, dim=1))
+
+    def modal_sounds(
+        self, gains: Complex[Tensor, "contacts modes"], *, samples: int, sample_rate: float
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the modes of each recording at its own poles."""
+        return _rung(self.poles, gains, samples, sample_rate)
+
+    def removed(
+        self, sounds: Float[Tensor, "contacts samples"], gains: Complex[Tensor, "contacts modes"], *, sample_rate: float
+    ) -> Float[Tensor, "contacts samples"]:
+        """Return the sounds as they would be if each mode had its mean pole in all of them."""
+        samples = sounds.shape[1]
+        own = self.modal_sounds(gains, samples=samples, sample_rate=sample_rate)
+        common = synthesize(gains, self.bank.frequency, self.bank.damping, samples=samples, sample_rate=sample_rate)
+        return sounds + (common - own).to(sounds.dtype)
+
+
+def find_shifts(
+    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float, significance: float
+) -> FrequencyShifts | None:
+    """Return the poles of each recording's own, of modes that several poles of `bank` may be one of.
+
+    Without those that explain less than `significance` times the energy that they would of noise, mean over the
+    sounds. None where most of the energy is in modes whose frequencies shift by little or nothing.
+    """
+    if len(sounds) < 2:
+        return None
+    level = sounds.double().square().mean(1, keepdim=True).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
+    search, shift = _Search(sounds.double() / level, bank, sample_rate), _TOLERANCES.shift
+    drift = torch.zeros(len(sounds), dtype=torch.float64)
+    noise = noise_power(search.sounds, bins=noise_bins(sounds.shape[1]))
+    for _ in range(_PASSES):
+        bands = search.bands(shift, drift)
+        mean = torch.cat([each.mean for each in bands])
+        poles = torch.cat([each.poles.expand(len(sounds), -1) for each in bands], dim=1)
+        energy = torch.cat([each.energy.expand_as(each.mean.real) / len(each.mean) for each in bands])
+        moves = poles.imag / mean.imag - 1.0
+        spread = moves.square().mean(0).sqrt()
+        if float(_median(spread * (mean.imag / -mean.real), energy)) < _TOLERANCES.least:
+            return None
+        drift = torch.stack([_median(each, energy) for each in moves])
+        shift = float(_median((moves - drift[:, None]).square().mean(0).sqrt(), energy).clamp_min(_MIN_SHIFT))
+    order = torch.argsort(mean.imag)
+    found = ModalBank(mean.imag / (2 * math.pi), -mean.real).take(order)
+    kept = _needed(search.sounds, poles[:, order], noise_at(noise, found, sample_rate), significance, sample_rate)
+    return FrequencyShifts(found.take(kept), poles[:, order[kept]], float(_median(spread, energy)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What a band holds."""
+
+    mean: Complex128[Tensor, " modes"]
+    poles: Complex128[Tensor, "*contacts modes"]
+    gains: Complex128[Tensor, "contacts modes"]
+    energy: Float64[Tensor, ""]
+    """Of all of its modes in all recordings, up to a factor that is the same for all bands."""
+
+
+class _Search:
+    """The bands of some recordings, the loudest first, each without what was found in those before it."""
+
+    def __init__(self, sounds: Float64[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float) -> None:
+        self.sounds, self.rate, self.samples = sounds, sample_rate, sounds.shape[1]
+        poles = torch.complex(-bank.damping, 2 * math.pi * bank.frequency)
+        gains = fit_gains(sounds, bank, sample_rate=sample_rate)
+        self.left = sounds - _rung(poles, gains, self.samples, sample_rate)
+        """What the bands' modes, as they are known so far, leave of the sounds."""
+        energy = (gains.abs().square() / bank.damping).sum(0)
+        groups = sorted(_groups(bank), key=lambda rows: -float(energy[rows].sum()))
+        self.known = [_Found(poles[rows], poles[rows], gains[:, rows], energy[rows].sum()) for rows in groups]
+        self.common = [each.mean for each in self.known]
+
+    def bands(self, shift: float, drift: Float64[Tensor, " contacts"]) -> list[_Found]:
+        """Return what each band holds, with a prior of the shifts: standard deviation and center, relative."""
+        for row, common in enumerate(self.common):
+            if float((-common.real / common.imag).max()) > _TOLERANCES.pitched / 2:
+                continue
+            before = self.known[row]
+            sounds = self.left + _rung(before.poles, before.gains, self.samples, self.rate)
+            band = _Band.of(sounds, common, self.rate).without_mirrored(before.poles, before.gains)
+            mean, poles = band.own_poles(common, shift, drift)
+            self.known[row] = found = _Found(mean, poles, band.gains(poles), before.energy)
+            self.left = sounds - _rung(poles, found.gains, self.samples, self.rate)
+        return self.known
+
+
+@dataclass(frozen=True, eq=False)
+class _Band:
+    """The discrete Fourier transforms of the beginnings of some recordings, in one band."""
+
+    spectra: Complex128[Tensor, "contacts bins"]
+    bins: Float64[Tensor, " bins"]
+    samples: int
+    rate: float
+
+    @classmethod
+    def of(
+        cls, sounds: Float64[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], rate: float
+    ) -> "_Band":
+        """Return the band around some poles."""
+        slowest, widest = float(-poles.real.max()), float(-poles.real.min()) / math.pi
+        samples = min(sounds.shape[1], math.ceil(_TOLERANCES.nepers * rate / slowest))
+        lowest, highest = float(poles.imag.min()) / (2 * math.pi), float(poles.imag.max()) / (2 * math.pi)
+        reach = max(
+            _TOLERANCES.band_widths * widest,
+            2 * _TOLERANCES.shift * highest,
+            _TOLERANCES.band_bins * rate / sounds.shape[1],
+        )
+        first = max(1, math.floor((lowest - reach) * samples / rate))
+        last = min(samples // 2 - 1, math.ceil((highest + reach) * samples / rate))
+        spectra = torch.fft.rfft(sounds[:, :samples])[:, first : last + 1]
+        return cls(spectra, torch.arange(first, last + 1, dtype=torch.float64), samples, rate)
+
+    def without_mirrored(
+        self, poles: Complex128[Tensor, "*contacts modes"], gains: Complex128[Tensor, "contacts modes"]
+    ) -> "_Band":
+        """Return the band without what the modes' spectra at negative frequencies, -c* D(s*) / 2i, reach into it."""
+        atoms = self._atoms(poles.conj().expand(len(self.spectra), -1))[0]
+        mirrored = (atoms @ (0.5j * gains.conj())[..., None])[..., 0]
+        return replace(self, spectra=self.spectra - mirrored)
+
+    def gains(self, poles: Complex128[Tensor, "*contacts modes"]) -> Complex128[Tensor, "contacts modes"]:
+        """Return gains c of Im(c exp(s t)), which has the spectrum c D(s) / 2i beside the mirrored one."""
+        atoms = self._atoms(poles.expand(len(self.spectra), -1))[0]
+        return 2j * torch.linalg.lstsq(atoms, self.spectra[..., None]).solution[..., 0]
+
+    def own_poles(
+        self, common: Complex128[Tensor, " poles"], shift: float, drift: Float64[Tensor, " contacts"]
+    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "*contacts modes"]]:
+        """Return the mean poles of the modes in the band and each recording's own, or the common ones for both."""
+        count, contacts = len(common), len(self.spectra)
+        found = common, common
+        best = self._criterion(self._left(common.expand(contacts, -1)), 2 * count * (contacts + 1))
+        for modes in range(1, count + 1):
+            mean, poles, free = self._fit(self._start(common, modes), shift, drift)
+            criterion = self._criterion(self._left(poles), 2 * modes * (contacts + 1) + free)
+            if criterion < best:
+                best, found = criterion, (mean, poles)
+        return found
+
+    def _criterion(self, left: Float64[Tensor, " contacts"], parameters: float) -> float:
+        """Return the Bayesian information criterion of a band of which this energy is left, real parameters counted."""
+        data = 2 * self.spectra.numel()
+        energy = max(float(left.sum()), torch.finfo(torch.float64).tiny)
+        return data * math.log(energy / data) + parameters * math.log(data)
+
+    def _start(self, common: Complex128[Tensor, " poles"], modes: int) -> Complex128[Tensor, "contacts modes"]:
+        """Return for each recording the given number of the common poles that explain it best."""
+        sets = torch.stack([common[list(rows)] for rows in combinations(range(len(common)), modes)])
+        left = torch.stack([self._left(each.expand(len(self.spectra), -1)) for each in sets])
+        return sets[left.argmin(0)]
+
+    def _fit(
+        self, poles: Complex128[Tensor, "contacts modes"], shift: float, drift: Float64[Tensor, " contacts"]
+    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "contacts modes"], float]:
+        """Return the mean poles, those of most posterior probability, and their number of free parameters.
+
+        Gauss-Newton steps for all recordings at once, each damped after Levenberg and Marquardt by itself.
+        """
+        contacts, modes = poles.shape
+        trust = torch.full((contacts,), 1e-2, dtype=torch.float64)
+        variance = (shift * poles.imag.mean(0)).square()
+        information = torch.ones_like(poles.real)
+        center = poles
+        for turn in range(_ITERATIONS):
+            jacobian, left = self._linear(poles)
+            hessian, slope = jacobian.mH @ jacobian, (jacobian.mH @ left[..., None])[..., 0]
+            energy = left.abs().square().sum(1)
+            noise = energy.sum() / max(1, contacts * (len(self.bins) - 2 * modes))
+            noise = noise.clamp_min(torch.finfo(torch.float64).tiny)
+            information = torch.diagonal(hessian, dim1=1, dim2=2).real / noise
+            precision = torch.zeros_like(variance)
+            if turn >= _FREE_ITERATIONS:
+                center, precision = self._center(poles, information, variance, drift), 1.0 / variance
+            penalty = noise * precision
+            slope = slope - penalty * (poles - center)
+            diagonal = noise * information + penalty
+            damped = hessian + torch.diag_embed(
+                (penalty + trust[:, None] * diagonal).clamp_min(torch.finfo(torch.float64).tiny).to(hessian.dtype)
+            )
+            step = torch.linalg.solve(damped, slope[..., None])[..., 0]
+            # No further than a mode's own width, and no damping that vanishes.
+            step = step * (-poles.real / step.abs().clamp_min(torch.finfo(torch.float64).tiny)).clamp_max(1.0)
+            moved = poles + step
+            moved = torch.complex(torch.minimum(moved.real, 0.2 * poles.real), moved.imag)
+            before = energy + (penalty * (poles - center).abs().square()).sum(1)
+            after = self._left(moved) + (penalty * (moved - center).abs().square()).sum(1)
+            better = after < before
+            poles = torch.where(better[:, None], moved, poles)
+            trust = torch.where(better, trust / 5, trust * 10).clamp(1e-6, 1e3)
+        mean = (center - 1j * drift[:, None] * center.imag / (1.0 + drift[:, None])).mean(0)
+        return mean, poles, 2 * float((information / (information + 1.0 / variance)).sum())
+
+    @staticmethod
+    def _center(
+        poles: Complex128[Tensor, "contacts modes"],
+        information: Float64[Tensor, "contacts modes"],
+        variance: Float64[Tensor, " modes"],
+        drift: Float64[Tensor, " contacts"],
+    ) -> Complex128[Tensor, "contacts modes"]:
+        """Return where the prior expects each recording's poles: the mean pole, its frequency moved by the drift."""
+        tiny = torch.finfo(torch.float64).tiny
+        weight = 1.0 / (1.0 / information.clamp_min(tiny) + variance)
+        factor = 1.0 + drift[:, None]
+        mean = (weight * torch.complex(poles.real, poles.imag / factor)).sum(0) / weight.sum(0)
+        return torch.complex(mean.real.expand_as(poles.real), mean.imag * factor)
+
+    def _atoms(
+        self, poles: Complex128[Tensor, "contacts modes"]
+    ) -> tuple[Complex128[Tensor, "contacts bins modes"], Complex128[Tensor, "contacts bins modes"]]:
+        """Return D(s, k) and its derivative by s."""
+        step = torch.exp(poles / self.rate)[:, None, :]
+        last = torch.exp(poles * (self.samples / self.rate))[:, None, :]
+        angle = -2 * math.pi / self.samples * self.bins
+        turned = step * torch.polar(torch.ones_like(angle), angle)[:, None]
+        rest = 1.0 - turned
+        atoms = (1.0 - last) / rest
+        return atoms, (atoms * turned - self.samples * last) / (rest * self.rate)
+
+    def _linear(
+        self, poles: Complex128[Tensor, "contacts modes"]
+    ) -> tuple[Complex128[Tensor, "contacts bins modes"], Complex128[Tensor, "contacts bins"]]:
+        """Return how the spectra's best fit moves with each pole, beyond what gains can follow, and what it leaves."""
+        atoms, slopes = self._atoms(poles)
+        basis, triangle = torch.linalg.qr(atoms)
+        along = basis.mH @ self.spectra[..., None]
+        gains = torch.linalg.solve_triangular(triangle, along, upper=True)
+        moved = slopes * gains.mT
+        return moved - basis @ (basis.mH @ moved), self.spectra - (basis @ along)[..., 0]
+
+    def _left(self, poles: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, " contacts"]:
+        """Return the energy that modes of these poles leave of each spectrum."""
+        basis = torch.linalg.qr(self._atoms(poles)[0])[0]
+        explained = (basis.mH @ self.spectra[..., None])[..., 0]
+        return (self.spectra.abs().square().sum(1) - explained.abs().square().sum(1)).clamp_min(0.0)
+
+
+def _needed(
+    sounds: Float64[Tensor, "contacts samples"],
+    poles: Complex128[Tensor, "contacts modes"],
+    noise: Float64[Tensor, "contacts modes"],
+    significance: float,
+    rate: float,
+) -> Int64[Tensor, " kept"]:
+    """Return rows of the modes without those that the others make up for, the least needed one left out in turn."""
+    equations = [
+        NormalEquations.of(sound[None], torch.exp(own / rate)) for sound, own in zip(sounds, poles, strict=True)
+    ]
+    kept = torch.arange(poles.shape[1])
+    while len(kept):
+        lost = torch.cat([each.take(kept).lost_without()[0] for each in equations])
+        ratio = (lost / noise[:, kept]).mean(0) / 2
+        if float(ratio.min()) >= significance:
+            break
+        kept = kept[torch.arange(len(kept)) != ratio.argmin()]
+    return kept
+
+
+def _groups(bank: ModalBank) -> list[list[int]]:
+    """Return rows of poles that lie close enough together to be one mode, by ascending frequency."""
+    frequency, width = bank.frequency.tolist(), (bank.damping / math.pi).tolist()
+    groups: list[list[int]] = []
+    for row in range(len(bank)):
+        near = row > 0 and frequency[row] - frequency[row - 1] <= max(
+            _TOLERANCES.near_widths * min(width[row], width[row - 1]), _TOLERANCES.shift * frequency[row]
+        )
+        if near and len(groups[-1]) < _TOLERANCES.modes:
+            groups[-1].append(row)
+        else:
+            groups.append([row])
+    return groups
+
+
+def _rung(
+    poles: Complex128[Tensor, "*#contacts modes"], gains: Complex[Tensor, "contacts modes"], samples: int, rate: float
+) -> Float[Tensor, "contacts samples"]:
+    return synthesize(gains, poles.imag / (2 * math.pi), -poles.real, samples=samples, sample_rate=rate)
+
+
+def _median(values: Float64[Tensor, " values"], weights: Float64[Tensor, " values"]) -> Float64[Tensor, ""]:
+    order = torch.argsort(values)
+    share = weights[order].cumsum(0) / weights.sum()
+    return values[order][torch.searchsorted(share, 0.5).clamp_max(len(values) - 1)]
