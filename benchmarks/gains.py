@@ -20,12 +20,13 @@ from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.localization.locator import Locator
 from avmsf.mesh import Surface
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth
-from avmsf.simulate.recipe import SET, SETS
+from avmsf.simulate.recipe import ABLATED, SET, SETS
 from benchmarks import objects
 from benchmarks.ablation import ablation, outliers, supports
 from benchmarks.processes import timed
@@ -40,6 +41,7 @@ SIMPLE = {
 MIXTURE, UNREFINED = "mixture", "mixture, not refined"
 _IMPACTS = (8, 4, 2, 1)
 """Training contacts of the simulated objects."""
+_SHIFTS = {"none": {}, "sensor": {"sensor": 0.0005}, "warming": {"warming": 0.002}}
 _POINTS = 1000
 """Points of the surface among which recordings are located."""
 
@@ -98,7 +100,7 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
     """
     rows = []
     for name in settings.objects or settings.some(tuple(SETS[of])):
-        capture, truth = objects.simulated(name, settings, tidy=condition == "tidy")
+        capture, truth = objects.simulated(name, settings, objects.TIDY if condition == "tidy" else None)
         surface: Surface | ObjectShape = objects.surface_of(capture)
         if condition == "noisy":
             surface = roughened(objects.surface_of(capture), objects.ROUGH, seed=0)
@@ -119,6 +121,36 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
             rows[-1][f"error_{count}"] = each.error(field)
         yield from records(rows[-1], object=name)
     yield from records(means(rows, geometric=("l1", "l1_log", "envelope")), group="mean")
+
+
+def _drift(settings: Settings) -> Iterator[Record]:
+    """Error at held-out contacts of recordings whose modes shift in frequency, 8 training contacts, exact meshes.
+
+    none: all have the same frequencies. sensor: a sensor of .05 % of the object's mass is moved with the contact.
+    warming: frequencies fall by .2 % from the first to the last of 40 recordings. own: of gains by least squares in
+    each held-out recording itself, at the field's frequencies and without noise.
+    """
+    rows = []
+    for name in settings.objects or settings.some(ABLATED):
+        row: dict[str, float] = {}
+        bodies = None
+        for kind, imperfections in _SHIFTS.items():
+            capture, _ = objects.simulated(name, settings, imperfections)
+            bodies = bodies or objects.bodies_of(objects.surface_of(capture), settings)
+            case = objects.SplitCase.of(*split(capture.impacts, 8), capture, bodies)
+            field, test = case.fit(MixtureEstimator(bodies=bodies), quick=settings.quick), case.test
+            own = fit_gains(test.sounds, field.bank, sample_rate=test.sample_rate)
+            made = synthesize(
+                own.to(torch.complex64),
+                field.bank.frequency,
+                field.bank.damping,
+                samples=test.sounds.shape[1],
+                sample_rate=test.sample_rate,
+            )
+            row |= {kind: case.error(field), f"{kind}.own": score(made, test).mean()["relative_stft"]}
+        yield from records(row, object=name)
+        rows.append(row)
+    yield from records(means(rows), group="mean")
 
 
 def _moved(impacts: Impacts) -> Impacts:
@@ -180,6 +212,7 @@ PARTS: dict[str, Measurement] = {
     **{f"sim20-{each}": partial(_simulated, condition=each) for each in ("tidy", "noisy", "photographs", "offset")},
     "held-out": partial(_simulated, of="held-out"),
     "held-out-photographs": partial(_simulated, condition="photographs", of="held-out"),
+    "drift": _drift,
     "ablation": ablation,
     "outliers": outliers,
     "supports": supports,

@@ -1,7 +1,7 @@
 """What is measured on: plates struck here, recordings where they lie, simulated objects, and splits of each."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -60,7 +60,7 @@ _POINTS = 8192
 """Points of an object that the gain field looks contacts up in."""
 _BEFORE_NEXT_SECONDS = 0.002
 """How long before the next push's rise past 15 % of the first a clip is cut."""
-_TIDY = {"speed": 0.15, "contact_time": 0.0, "pretrigger": 0.0, "jitter": 0.0, "propagation": 0.0}
+TIDY = {"speed": 0.15, "contact_time": 0.0, "pretrigger": 0.0, "jitter": 0.0, "propagation": 0.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +150,12 @@ def clips_in_place(name: str, *, highpass: float = 0.0) -> dict[str, tuple[Float
     return clips
 
 
-def simulated(name: str, settings: Settings, *, tidy: bool = False) -> tuple[Capture, Truth]:
-    """Return a simulated object and its truth, from the folder or simulated now.
-
-    A tidy one has recordings that start with their impacts and impacts of nearly one speed.
-    """
-    if settings.sim20 is not None and not tidy:
+def simulated(name: str, settings: Settings, imperfections: Mapping[str, float] | None = None) -> tuple[Capture, Truth]:
+    """Return a simulated object and its truth, from the folder, or simulated now with other imperfections."""
+    if settings.sim20 is not None and imperfections is None:
         return read_capture(settings.sim20 / name), read_truth(settings.sim20 / name)
     recipe = named_recipe(name)
-    if tidy:
-        recipe = replace(recipe, imperfections=replace(recipe.imperfections, **_TIDY))
+    recipe = replace(recipe, imperfections=replace(recipe.imperfections, **imperfections or {}))
     made = simulate_object(recipe, name=name)
     return made.capture, made.truth
 
