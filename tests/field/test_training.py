@@ -1,5 +1,7 @@
 """Training of the network: AdamW beside torch's own class, and each switch to the paper's form."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -43,6 +45,17 @@ def test_steps_are_those_of_torch_also_from_a_state_of_before() -> None:
             optimizer.resume(moments)
     for one, other in zip(ours, theirs, strict=True):
         assert torch.equal(one, other)
+
+
+def test_a_step_brings_no_compiler_in() -> None:
+    """The import of torch's own takes seconds of a fit."""
+    program = (
+        "import sys, torch; from avmsf.field.training import AdamW; "
+        "p = torch.nn.Parameter(torch.ones(2)); p.square().sum().backward(); AdamW([p], 0.1).step(1.0); "
+        "assert float(p[0]) < 0.95; print('torch._dynamo' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"
 
 
 SHORT = replace(QUICK, warmup_steps=2, steps=2)
