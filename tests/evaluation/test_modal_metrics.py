@@ -184,6 +184,13 @@ def test_a_doublet_is_matched_in_order_and_a_mode_once():
     assert match_modes(ModalBank(numbers(1683.0), numbers(9)), true).tolist() == [-1, 0]
 
 
+def test_the_truth_of_some_recordings_has_their_own_frequencies():
+    shifts = 1e-3 * torch.randn(COUNT, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    shifted, rows = replace(TRUTH, shifts=shifts), [7, 0, 3]
+    some = truth_at(shifted, tuple(TRUTH.names[row] for row in rows)).after(0.01)
+    assert torch.equal(some.gains, shifted.after(0.01).gains[rows])
+
+
 def test_what_cannot_be_compared_is_refused():
     bank, broken = ModalBank(TRUTH.frequency, TRUTH.damping), AMPLITUDES.clone()
     broken[3, 2] = math.nan

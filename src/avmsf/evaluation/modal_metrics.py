@@ -62,7 +62,7 @@ def truth_at(truth: Truth, names: tuple[str, ...]) -> Truth:
             wanted, tuple(unknown), got=got, name="names", advice="simulate the object again"
         )
     taken = [rows[name] for name in names]
-    tables: dict[str, Any] = {name: getattr(truth, name) for name in ("gains", "contacts", "starts")}
+    tables: dict[str, Any] = {name: getattr(truth, name) for name in ("gains", "contacts", "starts", "shifts")}
     tables = {name: None if each is None else each[taken] for name, each in tables.items()}
     return replace(truth, names=names, **tables)
 

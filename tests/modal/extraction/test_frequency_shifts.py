@@ -1,11 +1,13 @@
 """Poles of a recording's own, against recordings whose poles are known."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
-from avmsf.modal.extraction.extract import extract_sounds
+from avmsf.capture.impacts import Impacts
+from avmsf.modal.extraction.extract import extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.synthesis import synthesize
 
@@ -43,6 +45,15 @@ def test_each_recording_has_the_frequencies_it_was_made_with(alike: bool):
     common = synthesize(gains, found.bank.frequency, found.bank.damping, samples=SAMPLES, sample_rate=RATE)
     assert float((sounds - common).square().mean().sqrt()) > 100 * NOISE
     assert float((found.at_common_poles(sounds, sample_rate=RATE) - common).square().mean().sqrt()) < 1.1 * NOISE
+
+
+def test_shifts_are_kept_to_the_last_bit(tmp_path: Path):
+    names = tuple(f"{row}.wav" for row in range(CONTACTS))
+    train = Impacts(torch.zeros(CONTACTS, 3, dtype=torch.float64), draw(5e-4)[0], RATE, names)
+    found, kept = (extract_once(train, HighResolution(), tmp_path / "modes.safetensors") for _ in range(2))
+    assert kept.shifts.relative == found.shifts.relative
+    assert torch.equal(kept.shifts.poles, found.shifts.poles)
+    assert torch.equal(kept.gains, found.gains)
 
 
 def test_a_doublet_that_all_recordings_share_does_not_shift():

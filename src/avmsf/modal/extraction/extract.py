@@ -165,7 +165,8 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
         "residual": found.residual.magnitude,
     }
     if found.shifts is not None:
-        tensors |= {"poles": torch.view_as_real(found.shifts.poles), "shift": torch.tensor(found.shifts.relative)}
+        shift = torch.tensor(found.shifts.relative, dtype=torch.float64)
+        tensors |= {"poles": torch.view_as_real(found.shifts.poles), "shift": shift}
     if found.alignment is not None:
         tensors |= {_ALIGNMENT + name: each for name, each in found.alignment.tensors().items()}
 
