@@ -125,6 +125,11 @@ def test_recordings_are_not_passed_over(tmp_path: Path):
     (tmp_path / "impacts.csv").write_text("file,x,y,z\n1.wav,0,0,0\n")
     with raises(FitError, file=tmp_path / "impacts.csv", name="--material"):
         avmsf.fit(tmp_path, material="steel", progress=False)
+    (tmp_path / "impacts.csv").unlink()
+    # How stiffly it is held only recordings tell.
+    (tmp_path / "capture.toml").write_text("held = [[0, 0, 0]]\n")
+    with raises(FitError, name="held"):
+        avmsf.fit(tmp_path, material="steel", progress=False)
 
 
 def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):

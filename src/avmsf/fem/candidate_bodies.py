@@ -171,7 +171,7 @@ class SurfaceBodies(CandidateBodies):
                 raise SimulationError.expected(wanted, each, row=row, name="thicknesses")
         self.shape = None if isinstance(surface, Surface) else surface
         """The shape, where it is no surface."""
-        self.supports, self.held_at, self.dofs = supports, held_at, dofs
+        self.supports, self.held_at, self.dofs = supports, tuple(held_at), dofs
         self._surface, self._digest, self._log = surface, surface.digest(), log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)

@@ -241,6 +241,9 @@ def guess_in_stages(
     SceneError where the size is not known.
     """
     material = material_named(material) if isinstance(material, str) else material
+    if settings.held:
+        advice = "leave held out for the field of a free object, or record impacts"
+        raise FitError.expected("recordings of an object that is held", got="none", name="held", advice=advice)
     with stages.lock("avmsf fit"):
         name, scene = settings.name or "", None
         if isinstance(source, Surface):

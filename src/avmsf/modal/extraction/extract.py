@@ -187,7 +187,7 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
             return None
         kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
         bank, shifts = ModalBank(read["frequency"], read["damping"]), None
-        if "poles" in read:
+        if "poles" in read or "shift" in read:
             shifts = FrequencyShifts(bank, torch.view_as_complex(read["poles"].contiguous()), float(read["shift"]))
         return Extraction(
             bank,
