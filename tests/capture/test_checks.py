@@ -7,10 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+import torch
+import trimesh
 
 from avmsf.capture import CaptureSettings, check, read_capture
+from avmsf.capture.checks import expect_held
 from avmsf.capture.issues import shared_problems
+from avmsf.errors import CaptureError
+from avmsf.mesh.surface import Surface
 from factories.capture_folder import HEADER, RATE, ROWS, fill, ring
+from factories.raising import raises
 
 
 def test_a_good_folder_has_no_problem_and_true_figures(tmp_path: Path) -> None:
@@ -138,3 +144,11 @@ def test_recordings_in_a_subfolder_are_read_once_the_table_names_it(tmp_path: Pa
     assert any("write taps/a.wav" in message for message in messages)
     (folder / "impacts.csv").write_text("\n".join([HEADER, *(f"taps/{row}" for row in ROWS)]))
     assert check(folder).readable
+
+
+def test_a_point_far_from_the_object_does_not_hold_it() -> None:
+    cube = trimesh.creation.box((0.1, 0.1, 0.1))
+    surface = Surface(torch.from_numpy(cube.vertices), torch.from_numpy(cube.faces))
+    expect_held([(0.0, 0.0, 0.05), (0.05, 0.0, 0.06)], surface)
+    with raises(CaptureError, name="held", value=pytest.approx(0.95)):
+        expect_held([(0.0, 0.0, 0.05), (0.0, 0.0, 1.0)], surface)

@@ -14,7 +14,7 @@ from avmsf._utils.text import listed
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.issues import Issues
 from avmsf.capture.placement import Placement, check_placement
-from avmsf.capture.settings import METRES, TABLE, CaptureSettings
+from avmsf.capture.settings import METRES, SETTINGS, TABLE, CaptureSettings
 from avmsf.capture.table import Impact, fitting_units, parse_rows, read_rows
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points
@@ -50,6 +50,25 @@ def check_contacts(impacts: Sequence[Impact], settings: CaptureSettings) -> list
     return remarks
 
 
+MAX_HELD_DISTANCE = 0.1
+"""Distance from the surface, over its diagonal, of a point at which the object is held: a finger on a small object."""
+
+
+def expect_held(held_at: Sequence[tuple[float, float, float]], surface: Surface) -> None:
+    """Raise CaptureError for a point, meters, at which the object is said to be held and which is far from it."""
+    if not held_at:
+        return
+    away = torch.cdist(torch.tensor(held_at, dtype=torch.float64), surface_points(surface).double()).amin(1)
+    size, row = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm()), int(away.argmax())
+    if float(away[row]) > MAX_HELD_DISTANCE * size:
+        place = ", ".join(f"{each:.4g}" for each in held_at[row])
+        got = f"({place}) m, {1000 * float(away[row]):.0f} mm away from it"
+        advice = "give it in the unit and frame of the contacts"
+        raise CaptureError.expected(
+            "points on the object", float(away[row]), got=got, file=SETTINGS, name="held", advice=advice
+        )
+
+
 def check_surface(
     impacts: Sequence[Impact], surface: Surface, *, settings: CaptureSettings
 ) -> tuple[Surface, list[CaptureWarning]]:
@@ -58,6 +77,7 @@ def check_surface(
     `CaptureError` where surface and contacts are in different units, and where a contact lies farther off than the
     surface is large.
     """
+    expect_held(settings.held_at, surface)
     contacts = torch.tensor([impact.contact for impact in impacts], dtype=torch.float64)
     surface, areas = contacted_part(surface, contacts)
     if areas:

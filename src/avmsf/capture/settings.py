@@ -69,6 +69,7 @@ class CaptureSettings:
     def __post_init__(self) -> None:
         units, positive, channel = f"one of {', '.join(METRES)}", "a number above 0", "a channel from 1 on"
         response, force = self.response_channel, self.force_channel
+        _points(self.held)
         for key, valid, expected in (
             ("unit", self.unit in METRES, units),
             ("surface_unit", self.surface_unit in (None, *METRES), units),
@@ -82,7 +83,6 @@ class CaptureSettings:
             ("force_channel", force is None or force >= 1, channel),
             ("force_channel", force is None or force != response, "another channel than response_channel"),
             ("time_zero", self.time_zero in TIME_ZEROS, f"one of {', '.join(TIME_ZEROS)}"),
-            ("held", all(len(each) == 3 and all(map(math.isfinite, each)) for each in self.held), "points [x, y, z]"),
             ("normalize", self.normalize in NORMALIZATIONS, f"one of {', '.join(NORMALIZATIONS)}"),
             ("force_channel", self.normalize != "deconvolve" or force, 'the hammer\'s, for normalize = "deconvolve"'),
         ):
@@ -174,7 +174,10 @@ def _typed(key: str, value: Any, known: Mapping[str, tuple[object, ...]]) -> Any
 def _points(value: Any) -> tuple[tuple[float, ...], ...]:
     """Return lists of numbers as points. Raises CaptureError for anything else."""
     listed = isinstance(value, list | tuple) and all(isinstance(each, list | tuple) for each in value)
-    if not listed or any(type(number) not in (int, float) for each in value for number in each):
+    if not listed or any(
+        len(each) != 3 or any(type(number) not in (int, float) or not math.isfinite(number) for number in each)
+        for each in value
+    ):
         advice = "such as [[0, 0, 0], [0.3, 0, 0]]"
         raise CaptureError.expected("a list of points [x, y, z]", value, name="held", advice=advice)
     return tuple(tuple(float(number) for number in each) for each in value)

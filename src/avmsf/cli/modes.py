@@ -72,8 +72,10 @@ def run(options: Options) -> int:
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
     modes, supporting = mode_rows(extraction.bank, level, quality.is_mode, quality)
     aligned = AlignmentReport.of(extraction, impacts)
+    shifts = None if extraction.shifts is None else extraction.shifts.relative
+    shifted = "" if shifts is None else f"frequencies differ between recordings by {100 * shifts:.2g} %, fitted in each"
     lines = [mode_table(f" of {capture.name}, {count}", modes, len(supporting), every=options.all), _EXPLANATION]
-    show("\n".join([*lines, *([] if aligned is None else aligned.sentences())]))
+    show("\n".join([*lines, *([] if aligned is None else aligned.sentences()), *([shifted] if shifted else [])]))
     if options.plots is not None:
         from avmsf.plotting.pictures import draw_modes, save_picture
 
@@ -90,6 +92,7 @@ def run(options: Options) -> int:
             "seconds": impacts.duration,
             "method": config.extraction,
             "alignment": None if aligned is None else asdict(aligned),
+            "frequency_shift": shifts,
             "modes": modes,
             "supporting_poles": supporting,
         }

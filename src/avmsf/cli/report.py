@@ -83,6 +83,8 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
     if field.body is not None:
         rows.append(("body", f"{field.body} (the most probable one{_gained(report)})"))
         rows += [("warning", field.body.warning)] if field.body.warning else []
+        if (evidence := report.get("support_evidence")) and evidence["held"] < evidence["free"]:
+            rows.append(("warning", "the recordings fit a free body better than one that is held there: check held"))
     elif report.get("supports_tried"):
         rows.append(("body", "none, free or held, predicts contacts left out better than smooth kernels"))
     if (shift := report.get("frequency_shift")) is not None:

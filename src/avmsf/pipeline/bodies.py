@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from avmsf.capture.checks import NARROWEST, WIDEST
+from avmsf.capture.checks import NARROWEST, WIDEST, expect_held
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.placement import expect_placed
 from avmsf.capture.settings import TABLE, CaptureSettings
@@ -36,9 +36,6 @@ SAMPLE_RATE = 44_100.0
 """Hz: that of most recordings."""
 _HIGHEST = 0.499
 """Highest frequency of a mode over the sample rate."""
-_MAX_HELD_DISTANCE = 0.1
-"""Distance from the surface, over the object's diagonal, up to which a point at which it is held is meant to be on it:
-coordinates of another unit or frame are farther away."""
 _BINS = 1025
 """Of the residual, which is zero: as many as that of a fit has."""
 
@@ -56,14 +53,14 @@ def candidate_bodies(
     """Return the bodies that a surface may enclose; their mode shapes are cached by content in `cache`.
 
     `held_at` are points in meters at which the object was held. Raises SimulationError where no body can be computed,
-    with the name `wall` where `config` states one, and FitError, before any is, where the contacts of the `impacts`
-    that they are meant for, or `held_at`, do not lie on the surface.
+    with the name `wall` where `config` states one, and before any is FitError where the contacts of the `impacts` that
+    they are meant for do not lie on the surface, and CaptureError where `held_at` do not.
     """
     config = BodyConfig() if config is None else config
     seen = surface if isinstance(surface, Surface) else surface.as_seen()
     if impacts is not None:
         expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
-    _expect_on(seen, held_at)
+    expect_held(held_at, seen)
     wall = config.wall
     try:
         bodies = SurfaceBodies(
@@ -84,21 +81,6 @@ def candidate_bodies(
         got = f"{wall:g} m ({reasons})"
         raise SimulationError.expected(f"{wanted}, as body.wall", wall, got=got, name="wall", advice=advice) from error
     return bodies
-
-
-def _expect_on(surface: Surface, places: Sequence[Place]) -> None:
-    """Raise FitError for a place that is far from the surface: in another unit, or in the air."""
-    if not places:
-        return
-    vertices, points = surface.vertices.double(), surface_points(surface).double()
-    size = float((vertices.amax(0) - vertices.amin(0)).norm())
-    away = torch.cdist(torch.tensor(places, dtype=torch.float64), points).amin(1)
-    row = int(away.argmax())
-    if float(away[row]) > _MAX_HELD_DISTANCE * size:
-        got = f"{places[row]}, {1000 * float(away[row]):.0f} mm away from it"
-        advice = "give held in capture.toml in the unit and frame of the contacts"
-        wanted = "a point on the object, in meters,"
-        raise FitError.expected(wanted, float(away[row]), got=got, row=row, name="held", advice=advice)
 
 
 def guess_field(

@@ -55,10 +55,19 @@ def test_a_plate_is_held_where_its_user_says():
     feet = ((0.04, 0.0267, 0.0), (0.2, 0.08, 0.0))
     support = Support(tuple(patches_about(feet)), 1e10)
     true = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12, support=support)
-    found = MixtureEstimator(bodies=Plate(feet)).solve(known_gains(true)[0])[0].report["bodies"][0]
+    report = MixtureEstimator(bodies=Plate(feet)).solve(known_gains(true)[0])[0].report
+    assert report["support_evidence"]["held"] > report["support_evidence"]["free"]
+    found = report["bodies"][0]
     assert found["support"] == "held at (40, 27, 0) mm and (200, 80, 0) mm"
     assert found["support_stiffness"] > 1e6
     assert found["frequency_factor"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_free_plate_that_is_said_to_be_held_fits_better_free():
+    free = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12)
+    report = MixtureEstimator(bodies=Plate(((0.12, 0.08, 0.0),))).solve(known_gains(free)[0])[0].report
+    assert report["bodies"][0]["support"] == "held at (120, 80, 0) mm"
+    assert report["support_evidence"]["held"] < report["support_evidence"]["free"]
 
 
 def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypatch: pytest.MonkeyPatch):

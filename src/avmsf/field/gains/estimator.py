@@ -121,13 +121,16 @@ class MixtureEstimator(GainEstimator):
         if searched and self.bodies is not None:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.with_thickness)
         found = self._refined(fit, bodies)
-        judgment = fit.assess(found)
+        judgment, evidence = fit.assess(found), dict[str, float]()
         tried = found.best is not None and self._may_be_held(judgment)
         if tried and found.best is not None and self.bodies is not None:
             modes = self.bodies.held(found.best)
             rows, stated = others(fit.sites, judgment.rows), bool(self.bodies.held_at)
             held = None if modes is None else fit.held(rows, found.best, modes, stated=stated)
-            if held is not None:
+            if held is not None and modes is not None:
+                if stated:
+                    free = replace(held, elastic=modes.free, support=None)
+                    evidence = dict(zip(("held", "free"), fit.evidence(rows, [held, free]), strict=True))
                 # All modes have the support in common, so free bodies are no hypotheses any more.
                 found = self._refined(fit, [held])
                 judgment = fit.assess(found)
@@ -144,6 +147,7 @@ class MixtureEstimator(GainEstimator):
         report = found.report() | {"unavailable": missing} | judgment.report(data.train)
         report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
         report["supports_tried"] = tried
+        report["support_evidence"] = evidence
         report["thickness"] = None if thickness is None else asdict(thickness)
         report["advice"] = None if judgment.informative else fit.advice(found.bodies)
         return replace(found.model, report=report), found.rows
@@ -202,7 +206,8 @@ def estimator_for(
 
     `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError, `auto` has no elastic
     family, which `log` reports, and takes the `symmetries` of the object's shape. With `elastic` the error passes, and
-    always that of a stated wall or number of degrees of freedom that cannot be (with the name `wall` or `dofs`).
+    always that of a stated wall, support or number of degrees of freedom that cannot be (by the name `wall`, `held` or
+    `dofs`).
     """
     if name == NETWORK:
         return Attention(features, NETWORK)
@@ -212,7 +217,7 @@ def estimator_for(
     try:
         return MixtureEstimator(kinds, bodies())
     except AvmsfError as error:
-        if name == Elastic.kind or error.name in ("wall", "dofs"):
+        if name == Elastic.kind or error.name in ("wall", "dofs", "held"):
             raise
         if log is not None:
             log(f"no elastic mode shapes: {error}")

@@ -122,8 +122,8 @@ def level_advice(names: Sequence[str], families: Sequence[KernelFamily], measure
     first, level = best
     return (
         f"the recordings from {names[first]} on are {abs(level):.0f} dB {'louder' if level > 0 else 'weaker'} than "
-        "those before let expect, as if the gain, the microphone's place or the force's scale had changed: bring all "
-        "to one level, or fit each group by itself"
+        "expected from those before, as if the gain, the microphone's place or the force's scale had changed: bring "
+        "all to one level, or fit each group by itself"
     )
 
 
