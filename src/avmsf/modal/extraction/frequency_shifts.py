@@ -229,7 +229,7 @@ class _Band:
                 best, found = criterion, (mean, poles)
         return found
 
-    def _criterion(self, left: Float64[Tensor, " contacts"], parameters: float) -> float:
+    def _criterion(self, left: Float64[Tensor, " contacts"], parameters: float | int) -> float:
         """Return the Bayesian information criterion of a band of which this energy is left, real parameters counted."""
         data = 2 * self.spectra.numel()
         energy = max(float(left.sum()), torch.finfo(torch.float64).tiny)
