@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
@@ -270,7 +271,7 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
 @pytest.fixture(autouse=True)
 def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for no other writer."""
-    monkeypatch.setitem(StageFolder.lock.__kwdefaults__, "wait", 0.0)
+    monkeypatch.setattr(StageFolder, "lock", partialmethod(StageFolder.lock, wait=0.0))
 
 
 @contextmanager
