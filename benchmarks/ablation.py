@@ -11,7 +11,7 @@ from avmsf.evaluation.objects import roughened
 from avmsf.evaluation.splits import split
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, STEEL
-from avmsf.fem.supports import Patch, Support
+from avmsf.fem.supports import EndPatch, Support
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
 from avmsf.field.gains.kernels import Smooth, ThinPlate
@@ -120,8 +120,8 @@ def supports(settings: Settings) -> Iterator[Record]:
     """
     mug = make_shape("mug", size=0.1, wall=0.003)
     cases = (
-        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, Patch("a short side", (-1.0, 0.0, 0.0))),
-        ("mug", mug.solid, CERAMIC, Patch("its base", (0.0, 0.0, -1.0))),
+        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, EndPatch("a short side", (-1.0, 0.0, 0.0))),
+        ("mug", mug.solid, CERAMIC, EndPatch("its base", (0.0, 0.0, -1.0))),
     )
     for kind, solid, material, patch in settings.some(cases):
         along = solid.points[solid.cells].mean(1)[:, 0] / solid.size

@@ -10,6 +10,7 @@ dense eigenproblem of 100 to 400 unknowns.
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -51,27 +52,15 @@ TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True)
-class Patch:
+class Patch(ABC):
     """A part of a body's surface where it may be held, the same on every mesh of it."""
 
     name: str
     """In words, such as "its lowest part"."""
-    direction: Place
-    """Unit vector; the patch is what lies farthest along it. Of a patch about a point, the point, meters."""
-    about: bool = False
-    """Whether it is the patch about a point."""
 
+    @abstractmethod
     def nodes(self, mesh: SecondOrder) -> Int[np.ndarray, " nodes"]:
-        """Return the rows of the surface's nodes within 1 % of the body's size of the extreme or the nearest one.
-
-        About a point within `held_radius` of it.
-        """
-        outer, size = mesh.surface[0], mesh.solid.size
-        if not self.about:
-            along = mesh.nodes[outer] @ np.array(self.direction)
-            return outer[along >= along.max() - TOLERANCES.held_distance * size]
-        away = np.linalg.norm(mesh.nodes[outer] - np.array(self.direction), axis=1)
-        return outer[away <= max(TOLERANCES.held_radius * size, away.min() + TOLERANCES.held_distance * size)]
+        """Return the rows of the surface's nodes that belong to it."""
 
     def loads(self, mesh: SecondOrder) -> scipy.sparse.csc_array:
         """Return the rigid motions of its cells [3 nodes, loads], as the head of this module scales them."""
@@ -92,6 +81,34 @@ class Patch:
 
 
 @dataclass(frozen=True)
+class EndPatch(Patch):
+    """What lies farthest along a direction."""
+
+    direction: Place
+    """Unit vector."""
+
+    def nodes(self, mesh: SecondOrder) -> Int[np.ndarray, " nodes"]:
+        """Return the rows of the surface's nodes within 1 % of the body's size of the extreme one."""
+        outer = mesh.surface[0]
+        along = mesh.nodes[outer] @ np.array(self.direction)
+        return outer[along >= along.max() - TOLERANCES.held_distance * mesh.solid.size]
+
+
+@dataclass(frozen=True)
+class PointPatch(Patch):
+    """What lies about a point on or near the surface."""
+
+    point: Place
+    """Meters."""
+
+    def nodes(self, mesh: SecondOrder) -> Int[np.ndarray, " nodes"]:
+        """Return the rows of the surface's nodes within 3 % of the body's size of it, and 1 % of the nearest one."""
+        outer, size = mesh.surface[0], mesh.solid.size
+        away = np.linalg.norm(mesh.nodes[outer] - np.array(self.point), axis=1)
+        return outer[away <= max(TOLERANCES.held_radius * size, away.min() + TOLERANCES.held_distance * size)]
+
+
+@dataclass(frozen=True)
 class Support:
     """Patches that are held, all by the same stiffness."""
 
@@ -102,7 +119,7 @@ class Support:
     @property
     def name(self) -> str:
         """Where the body is held, for people."""
-        return f"held at {' and '.join(patch.name.removeprefix('at ') for patch in self.patches)}"
+        return f"held at {' and '.join(patch.name for patch in self.patches)}"
 
     def springs(self, mesh: SecondOrder) -> scipy.sparse.csr_array:
         """Return what it adds to a body's stiffness matrix, N/m."""
@@ -124,22 +141,22 @@ def patches_of(mesh: SecondOrder) -> list[Patch]:
     found: list[Patch] = []
     seen: list[set[int]] = []
     for row, direction in enumerate(directions):
-        patch = Patch("", (float(direction[0]), float(direction[1]), float(direction[2])))
+        patch = EndPatch("", (float(direction[0]), float(direction[1]), float(direction[2])))
         nodes = set(patch.nodes(mesh).tolist())
         known = any(2 * len(nodes & other) > len(nodes | other) for other in seen)
         if known or len(nodes) > TOLERANCES.max_held_ratio * len(outer):
             continue
         x, y, z = 1000.0 * mesh.nodes[sorted(nodes)].mean(axis=0) + 0.0
         name = "its lowest part" if row == 0 else f"its end at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
-        found.append(Patch(name, patch.direction))
+        found.append(EndPatch(name, patch.direction))
         seen.append(nodes)
     return found
 
 
 def patches_about(points: Sequence[Place]) -> list[Patch]:
     """Return the patches about points on or near the surface, meters."""
-    names = ("at ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1000.0 * each + 0.0 for each in point)) for point in points)
-    return [Patch(name, point, about=True) for name, point in zip(names, points, strict=True)]
+    names = ("({:.0f}, {:.0f}, {:.0f}) mm".format(*(1000.0 * each + 0.0 for each in point)) for point in points)
+    return [PointPatch(name, point) for name, point in zip(names, points, strict=True)]
 
 
 class SupportBasis:

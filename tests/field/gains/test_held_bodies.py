@@ -7,7 +7,7 @@ import pytest
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.elastic_modes import HeldModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
-from avmsf.fem.supports import Patch, Place, Support, patches_about
+from avmsf.fem.supports import EndPatch, Place, Support, patches_about
 from avmsf.field.gains.estimator import MixtureEstimator
 from oracles.block import block
 from oracles.known_gains import known_gains
@@ -33,12 +33,12 @@ def held_modes(held_at: tuple[Place, ...]) -> HeldModes:
     return HeldModes(block(SIDES, (9, 6, 1)), NOMINAL, count=16, patches=patches_about(held_at) or None)
 
 
-LEFT, RIGHT = Patch("left", (-1.0, 0.0, 0.0)), Patch("right", (1.0, 0.0, 0.0))
+LEFT, RIGHT = EndPatch("left", (-1.0, 0.0, 0.0)), EndPatch("right", (1.0, 0.0, 0.0))
 AT = {LEFT: "its end at (0, 80, 2) mm", RIGHT: "its end at (240, 80, 2) mm"}
 
 
 @pytest.mark.parametrize(("sides", "stiffness"), [((), 0.0), ((LEFT,), 2e5), ((LEFT,), 1e10), ((LEFT, RIGHT), 2e6)])
-def test_the_support_of_a_plate_is_found(sides: tuple[Patch, ...], stiffness: float):
+def test_the_support_of_a_plate_is_found(sides: tuple[EndPatch, ...], stiffness: float):
     solid = block(SIDES, (13, 8, 1))
     uneven = 1.0 + 0.5 * solid.points[solid.cells].mean(1)[:, 0]
     support = Support(sides, stiffness) if sides else None

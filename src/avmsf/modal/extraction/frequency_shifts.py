@@ -25,7 +25,7 @@ from torch import Tensor
 
 from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import noise_at, noise_bins, noise_power
+from avmsf.modal.residual_noise import background_power
 from avmsf.modal.synthesis import synthesize
 
 
@@ -75,7 +75,7 @@ class FrequencyShifts:
     relative: float
     """Standard deviation of the relative shifts of frequency, median over modes by energy."""
 
-    def take(self, rows: Tensor | list[int]) -> "FrequencyShifts":
+    def take(self, rows: list[int]) -> "FrequencyShifts":
         """Return those of some of the recordings."""
         return FrequencyShifts(self.bank, self.poles[rows], self.relative)
 
@@ -118,7 +118,6 @@ def find_shifts(
     level = sounds.double().square().mean(1, keepdim=True).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
     search, shift = _Search(sounds.double() / level, bank, sample_rate), _TOLERANCES.shift
     drift = torch.zeros(len(sounds), dtype=torch.float64)
-    noise = noise_power(search.sounds, bins=noise_bins(sounds.shape[1]))
     for _ in range(_PASSES):
         bands = search.bands(shift, drift)
         mean = torch.cat([each.mean for each in bands])
@@ -132,7 +131,8 @@ def find_shifts(
         shift = float(_median((moves - drift[:, None]).square().mean(0).sqrt(), energy).clamp_min(_MIN_SHIFT))
     order = torch.argsort(mean.imag)
     found = ModalBank(mean.imag / (2 * math.pi), -mean.real).take(order)
-    kept = _needed(search.sounds, poles[:, order], noise_at(noise, found, sample_rate), significance, sample_rate)
+    noise = background_power(search.sounds, found, sample_rate)
+    kept = _needed(search.sounds, poles[:, order], noise, significance, sample_rate)
     return FrequencyShifts(found.take(kept), poles[:, order[kept]], float(_median(spread, energy)))
 
 
@@ -251,8 +251,7 @@ class _Band:
         contacts, modes = poles.shape
         trust = torch.full((contacts,), 1e-2, dtype=torch.float64)
         variance = (shift * poles.imag.mean(0)).square()
-        information = torch.ones_like(poles.real)
-        center = poles
+        information, mean, center = torch.ones_like(poles.real), poles.mean(0), poles
         for turn in range(_ITERATIONS):
             jacobian, left = self._linear(poles)
             hessian, slope = jacobian.mH @ jacobian, (jacobian.mH @ left[..., None])[..., 0]
@@ -262,7 +261,9 @@ class _Band:
             information = torch.diagonal(hessian, dim1=1, dim2=2).real / noise
             precision = torch.zeros_like(variance)
             if turn >= _FREE_ITERATIONS:
-                center, precision = self._center(poles, information, variance, drift), 1.0 / variance
+                mean, precision = _mean_pole(poles, information, variance, drift), 1.0 / variance
+                # Where the prior expects each recording's poles.
+                center = torch.complex(mean.real.expand_as(poles.real), mean.imag * (1.0 + drift[:, None]))
             penalty = noise * precision
             slope = slope - penalty * (poles - center)
             diagonal = noise * information + penalty
@@ -279,22 +280,7 @@ class _Band:
             better = after < before
             poles = torch.where(better[:, None], moved, poles)
             trust = torch.where(better, trust / 5, trust * 10).clamp(1e-6, 1e3)
-        mean = (center - 1j * drift[:, None] * center.imag / (1.0 + drift[:, None])).mean(0)
         return mean, poles, 2 * float((information / (information + 1.0 / variance)).sum())
-
-    @staticmethod
-    def _center(
-        poles: Complex128[Tensor, "contacts modes"],
-        information: Float64[Tensor, "contacts modes"],
-        variance: Float64[Tensor, " modes"],
-        drift: Float64[Tensor, " contacts"],
-    ) -> Complex128[Tensor, "contacts modes"]:
-        """Return where the prior expects each recording's poles: the mean pole, its frequency moved by the drift."""
-        tiny = torch.finfo(torch.float64).tiny
-        weight = 1.0 / (1.0 / information.clamp_min(tiny) + variance)
-        factor = 1.0 + drift[:, None]
-        mean = (weight * torch.complex(poles.real, poles.imag / factor)).sum(0) / weight.sum(0)
-        return torch.complex(mean.real.expand_as(poles.real), mean.imag * factor)
 
     def _atoms(
         self, poles: Complex128[Tensor, "contacts modes"]
@@ -324,6 +310,18 @@ class _Band:
         basis = torch.linalg.qr(self._atoms(poles)[0])[0]
         explained = (basis.mH @ self.spectra[..., None])[..., 0]
         return (self.spectra.abs().square().sum(1) - explained.abs().square().sum(1)).clamp_min(0.0)
+
+
+def _mean_pole(
+    poles: Complex128[Tensor, "contacts modes"],
+    information: Float64[Tensor, "contacts modes"],
+    variance: Float64[Tensor, " modes"],
+    drift: Float64[Tensor, " contacts"],
+) -> Complex128[Tensor, " modes"]:
+    """Return the mean of the recordings' poles without their drift, each weighted by its precision about the mean."""
+    weight = 1.0 / (1.0 / information.clamp_min(torch.finfo(torch.float64).tiny) + variance)
+    settled = torch.complex(poles.real, poles.imag / (1.0 + drift[:, None]))
+    return (weight * settled).sum(0) / weight.sum(0)
 
 
 def _needed(
