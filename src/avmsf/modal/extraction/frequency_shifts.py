@@ -50,7 +50,7 @@ class Tolerances:
     """Largest half-power width of a pole that may shift, over its frequency."""
     least: float = 0.1
     """Radians that a mode turns by its shift while it falls to 1/e, standard deviation: with fewer, gains at common
-    poles are as good. Measured captures of a fixed sensor have .04 to .09, and fields there were worse with shifts."""
+    poles are as good. Most captures of a fixed sensor have .04 to .09, and fields there were worse with shifts."""
 
 
 _TOLERANCES = Tolerances()
@@ -120,20 +120,20 @@ def find_shifts(
     drift = torch.zeros(len(sounds), dtype=torch.float64)
     for _ in range(_PASSES):
         bands = search.bands(shift, drift)
+        if bands is None:
+            return None
         mean = torch.cat([each.mean for each in bands])
         poles = torch.cat([each.poles.expand(len(sounds), -1) for each in bands], dim=1)
         energy = torch.cat([each.energy.expand_as(each.mean.real) / len(each.mean) for each in bands])
         moves = poles.imag / mean.imag - 1.0
-        spread = moves.square().mean(0).sqrt()
-        if float(_median(spread * (mean.imag / -mean.real), energy)) < _TOLERANCES.least:
-            return None
         drift = torch.stack([_median(each, energy) for each in moves])
         shift = float(_median((moves - drift[:, None]).square().mean(0).sqrt(), energy).clamp_min(_MIN_SHIFT))
     order = torch.argsort(mean.imag)
     found = ModalBank(mean.imag / (2 * math.pi), -mean.real).take(order)
     noise = background_power(search.sounds, found, sample_rate)
     kept = _needed(search.sounds, poles[:, order], noise, significance, sample_rate)
-    return FrequencyShifts(found.take(kept), poles[:, order[kept]], float(_median(spread, energy)))
+    relative = float(_median(moves.square().mean(0).sqrt(), energy))
+    return FrequencyShifts(found.take(kept), poles[:, order[kept]], relative)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +145,12 @@ class _Found:
     gains: Complex128[Tensor, "contacts modes"]
     energy: Float64[Tensor, ""]
     """Of all of its modes in all recordings, up to a factor that is the same for all bands."""
+
+    @property
+    def settled(self) -> Float64[Tensor, ""]:
+        """The energy of its modes that hardly turn by their shift while they fall to 1/e."""
+        turn = (self.poles.imag - self.mean.imag).expand_as(self.gains.real).square().mean(0).sqrt() / -self.mean.real
+        return self.energy * (turn < _TOLERANCES.least).double().mean()
 
 
 class _Search:
@@ -161,17 +167,25 @@ class _Search:
         self.known = [_Found(poles[rows], poles[rows], gains[:, rows], energy[rows].sum()) for rows in groups]
         self.common = [each.mean for each in self.known]
 
-    def bands(self, shift: float, drift: Float64[Tensor, " contacts"]) -> list[_Found]:
-        """Return what each band holds, with a prior of the shifts: standard deviation and center, relative."""
+    def bands(self, shift: float, drift: Float64[Tensor, " contacts"]) -> list[_Found] | None:
+        """Return what each band holds, with a prior of the shifts: standard deviation and center, relative.
+
+        None as soon as half of the energy is in modes that hardly shift.
+        """
+        half, settled = 0.5 * sum(float(each.energy) for each in self.known), 0.0
         for row, common in enumerate(self.common):
-            if float((-common.real / common.imag).max()) > _TOLERANCES.pitched / 2:
-                continue
             before = self.known[row]
+            if float((-common.real / common.imag).max()) > _TOLERANCES.pitched / 2:
+                settled += float(before.energy)
+                continue
             sounds = self.left + _rung(before.poles, before.gains, self.samples, self.rate)
             band = _Band.of(sounds, common, self.rate).without_mirrored(before.poles, before.gains)
             mean, poles = band.own_poles(common, shift, drift)
             self.known[row] = found = _Found(mean, poles, band.gains(poles), before.energy)
             self.left = sounds - _rung(poles, found.gains, self.samples, self.rate)
+            settled += float(found.settled)
+            if settled >= half:
+                return None
         return self.known
 
 
