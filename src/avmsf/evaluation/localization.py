@@ -29,6 +29,8 @@ MAX_VERTICES = 20_000
 meshes is called mesh_16k."""
 _FFT_SIZE = 4096
 """Samples of a Hann window at 44.1 and 48 kHz: its bins part modes some twenty hertz apart."""
+_RENDERED = 64
+"""Points whose sounds are held at once."""
 _POWER_FLOOR = 1e-6
 """Power over the loudest bin's below which differences do not count: -60 dB."""
 _MAP = FileKind(
@@ -107,7 +109,7 @@ def _finder(
 
 def _field_finder(field: SoundField, points: Float64[Tensor, "points 3"], published: bool) -> _Find:
     locator = Locator.of(field, points=points)
-    gains = field.gains(points).double() if published else None
+    gains = rendered_gains(field, points) if published else None
 
     def find(sound: Sound) -> tuple[dict[str, Float64[Tensor, " 3"]], ContactPosterior | None]:
         distance = None if gains is None else published_distance(field, gains, sound)
@@ -126,18 +128,29 @@ def _field_finder(field: SoundField, points: Float64[Tensor, "points 3"], publis
 def published_distance(
     field: SoundField, gains: Float64[Tensor, "points modes"], sound: Float[Tensor, " samples"]
 ) -> Float64[Tensor, " points"]:
-    """Return the cosine distance, 0 to 2, of a field's gains at points from a sound's (eq. 15); 1 without gains.
+    """Return the cosine distance, 0 to 1, of `rendered_gains` at points from a sound's (eq. 15); 1 without gains.
 
-    A sound's gains are those of the paper's regression (eq. 5), that of the warm-up, at the bins of the field's own
-    frequencies; they have no sign, so that neither has a recording. The sound starts where the field's training sounds
-    do and has their sample rate. Raises LocationError where no mode of the field is found in it.
+    The sound starts where the field's training sounds do and has their sample rate. Raises LocationError where no mode
+    of the field is found in it.
     """
-    given = sound.detach().cpu()[None, : field.samples]
-    recorded = ShortTime().gains(given, field.bank, field.sample_rate)[0]
+    recorded = _regressed(field, sound.detach().cpu()[None, : field.samples])[0]
     if not bool(recorded.any()):
         advice = "record the impact louder, or with less noise"
         raise LocationError.expected("one of the field's modes", name="sound", advice=advice)
     return 1.0 - torch.nn.functional.cosine_similarity(gains, recorded[None], dim=1)
+
+
+def rendered_gains(field: SoundField, points: Float[Tensor, "points 3"]) -> Float64[Tensor, "points modes"]:
+    """Return the gains that the paper's regression (eq. 5) finds in the sounds that a field renders at points.
+
+    A recording's gains are found in this way too: at the bins of the field's own frequencies, not negative. What a
+    network is trained to output instead has signs that its loss does not see, and counts neighbors in one bin apart.
+    """
+    return torch.cat([_regressed(field, field.render(each, noise=False)) for each in points.float().split(_RENDERED)])
+
+
+def _regressed(field: SoundField, sounds: Float[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts modes"]:
+    return ShortTime().gains(sounds, field.bank, field.sample_rate)
 
 
 def nearest_spectrum(train: Impacts) -> Callable[[Sound], int]:

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.modal.config import ExtractionMethod, expect_modes
@@ -138,11 +138,22 @@ class ShortTime(ModeFinder):
     def gains(
         self, sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
     ) -> Float64[Tensor, "contacts modes"]:
-        """Return the gains that the regression itself gives for a bank's modes, as `Lines.gains` does."""
-        return self._lines(sounds, sample_rate).gains(bank)
+        """Return the gain g of eq. 5 in each recording at the bins nearest to the modes: not negative, without a sign.
 
-    def _lines(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> Lines:
-        fft_size = _power_of_two(self.fft_seconds * sample_rate, least=32)
+        It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most.
+        """
+        bins, modes = (
+            torch.round(bank.frequency * self._fft_size(sample_rate) / sample_rate).long().unique(return_inverse=True)
+        )
+        return self._lines(sounds, sample_rate, bins).gain[:, modes]
+
+    def _fft_size(self, sample_rate: float) -> int:
+        return _power_of_two(self.fft_seconds * sample_rate, least=32)
+
+    def _lines(
+        self, sounds: Float[Tensor, "contacts samples"], sample_rate: float, bins: Int[Tensor, " bins"] | None = None
+    ) -> Lines:
+        fft_size = self._fft_size(sample_rate)
         return Lines.of(
             sounds,
             sample_rate=sample_rate,
@@ -150,6 +161,7 @@ class ShortTime(ModeFinder):
             hop=min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4),
             latest_peak=self.latest_peak,
             least_damping=self.least_damping,
+            bins=bins,
         )
 
 

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Complex, Float, Float64
+from jaxtyping import Bool, Complex, Float, Float64, Int
 from torch import Tensor
 
 from avmsf.modal.modes import ModalBank
@@ -26,20 +26,23 @@ _CONSENSUS = 0.5
 
 
 def narrow_band(
-    sounds: Float[Tensor, "contacts samples"], *, fft_size: int, hop: int
+    sounds: Float[Tensor, "contacts samples"], *, fft_size: int, hop: int, bins: Int[Tensor, " bins"] | None = None
 ) -> Complex[Tensor, "contacts bins frames"]:
-    """Return the analytic signal of every bin's own inverse transform, sampled once a hop.
+    """Return the analytic signal of every bin's own inverse transform, or of some bins', sampled once a hop.
 
     `fft_size` and `hop` in samples, hop a divisor of fft_size. A steady sine of amplitude a at a bin's center has
     modulus 2a/3 there and a/6 in each of the two bins beside it: together they make up the sound (Hann window).
     """
     window = torch.hann_window(fft_size, dtype=sounds.dtype)
     frames = torch.stft(sounds, fft_size, hop, window=window, center=True, pad_mode="constant", return_complex=True)
+    if bins is None:
+        bins = torch.arange(fft_size // 2 + 1)
+    else:
+        frames = frames[:, bins]
     reach = fft_size // hop // 2
     lags = torch.arange(-reach, reach + 1)
     weights = torch.nn.functional.pad(window, (0, 1))[fft_size // 2 + lags * hop]
     # A frame's time zero is its own beginning: at its center half the transform has passed, and one hop for each lag.
-    bins = torch.arange(fft_size // 2 + 1)
     passed = torch.remainder(bins[:, None] * (lags[None, :] * hop - fft_size // 2), fft_size)
     turns = passed.to(sounds.dtype) * (2 * math.pi / fft_size)
     kernel = torch.polar(weights.expand(len(bins), -1).contiguous(), turns)
@@ -73,14 +76,17 @@ class Lines:
         hop: int,
         latest_peak: float,
         least_damping: float,
+        bins: Int[Tensor, " bins"] | None = None,
     ) -> "Lines":
-        """Fit the lines.
+        """Fit the lines of all bins, or of some.
 
         No mode can be in a bin whose envelope peaks later than `latest_peak` seconds after the onset, or falls by less
         than `least_damping` 1/s, or as fast as the window.
         """
         lines = [
-            _regress(narrow_band(sound[None], fft_size=fft_size, hop=hop)[0], hop / sample_rate, fft_size // hop)
+            _regress(
+                narrow_band(sound[None], fft_size=fft_size, hop=hop, bins=bins)[0], hop / sample_rate, fft_size // hop
+            )
             for sound in sounds
         ]
         gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
@@ -88,7 +94,8 @@ class Lines:
         # ranking. An envelope that falls as fast as the window itself is the window's, not a mode's.
         ringing = (damping >= least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
         # The phase is known up to whole turns from one hop to the next: those that bring it nearest to the center.
-        center = torch.arange(gain.shape[1], dtype=torch.float64) * (sample_rate / fft_size)
+        numbers = torch.arange(gain.shape[1]) if bins is None else bins
+        center = numbers.double() * (sample_rate / fft_size)
         turns = sample_rate / hop
         frequency = center + torch.remainder(advance - center + turns / 2, turns) - turns / 2
         return cls(torch.where((peak <= latest_peak) & ringing, gain, 0.0), damping, frequency, sample_rate)
@@ -106,14 +113,6 @@ class Lines:
         # The lowest bin holds the recorder's offset and the room's rumble.
         candidate[:, 0] = False
         return self._agreed(candidate, count)
-
-    def gains(self, bank: ModalBank) -> Float64[Tensor, "contacts modes"]:
-        """Return the gain g of eq. 5 in each recording at the bins nearest to the modes: not negative, without a sign.
-
-        It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most.
-        """
-        width = self.sample_rate / (2 * (self.gain.shape[1] - 1))
-        return self.gain[:, torch.round(bank.frequency / width).long()]
 
     def _agreed(self, candidate: Bool[Tensor, "contacts bins"], count: int) -> ModalBank:
         once = candidate.to(torch.float64)
