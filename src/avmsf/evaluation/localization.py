@@ -146,7 +146,9 @@ def rendered_gains(field: SoundField, points: Float[Tensor, "points 3"]) -> Floa
     A recording's gains are found in this way too: at the bins of the field's own frequencies, not negative. What a
     network is trained to output instead has signs that its loss does not see, and counts neighbors in one bin apart.
     """
-    return torch.cat([_regressed(field, field.render(each, noise=False)) for each in points.float().split(_RENDERED)])
+    return torch.cat(
+        [_regressed(field, field.render(each, noise=False)) for each in torch.split(points.float(), _RENDERED)]
+    )
 
 
 def _regressed(field: SoundField, sounds: Float[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts modes"]:

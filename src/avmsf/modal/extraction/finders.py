@@ -142,9 +142,8 @@ class ShortTime(ModeFinder):
 
         It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most.
         """
-        bins, modes = (
-            torch.round(bank.frequency * self._fft_size(sample_rate) / sample_rate).long().unique(return_inverse=True)
-        )
+        nearest = torch.round(bank.frequency * self._fft_size(sample_rate) / sample_rate).long()
+        bins, modes = torch.unique(nearest, return_inverse=True)
         return self._lines(sounds, sample_rate, bins).gain[:, modes]
 
     def _fft_size(self, sample_rate: float) -> int:
