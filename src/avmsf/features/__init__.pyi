@@ -1,5 +1,6 @@
 from .descriptors import ImageDescriptors as ImageDescriptors
 from .dino import DinoEncoder as DinoEncoder
+from .efficientnet import EfficientNetEncoder as EfficientNetEncoder
 from .feature_field import FeatureField as FeatureField
 from .feature_field import reduce as reduce
 from .feature_field import resize as resize

@@ -7,11 +7,10 @@ from typing import Any, Final
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
-from torch.nn import functional
 
 from avmsf._utils.text import read_json_object
 from avmsf.errors import SceneError, download_failure
-from avmsf.features.encoder import unit_image
+from avmsf.features.encoder import describe_patches
 
 MODELS: Final = tuple(
     f"facebook/dinov2{registers}-{size}" for registers in ("", "-with-registers") for size in ("small", "base", "large")
@@ -28,9 +27,7 @@ _HUB_SECONDS = 5.0
 class DinoEncoder:
     """A DINOv2 model, with or without registers, as an encoder: its patches' last hidden states.
 
-    The image is brought to `longest` pixels on its longer side, continued by its last row and column to whole patches,
-    and the class and register tokens are dropped. Where the image ends inside a patch the tokens are interpolated at
-    the middles of equal cells of the image, so that the map covers the image alone.
+    The class and register tokens are dropped.
     """
 
     model: nn.Module
@@ -65,34 +62,16 @@ class DinoEncoder:
         self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
     ) -> Float[Tensor, "dim rows columns"]:
         """Return the patches' features, float32, on a grid that covers the image evenly."""
-        color = unit_image(image).permute(2, 0, 1)
-        height, width = color.shape[1:]
-        if self.longest is not None:
-            factor = self.longest / max(height, width)
-            height, width = max(1, round(height * factor)), max(1, round(width * factor))
-        color = functional.interpolate(
-            color[None], (height, width), mode="bicubic", align_corners=False, antialias=True
-        ).clamp(0.0, 1.0)
-        color = (color - self.mean.to(color)) / self.deviation.to(color)
         patch = int(self.model.config.patch_size)  # type: ignore[union-attr,arg-type]
-        rows, columns = -(-height // patch), -(-width // patch)
-        color = functional.pad(color, (0, columns * patch - width, 0, rows * patch - height), mode="replicate")
-        with torch.no_grad():
-            states = self.model(pixel_values=color.to(next(self.model.parameters()))).last_hidden_state[0].float()
-        tokens = states[len(states) - rows * columns :].T.reshape(-1, rows, columns)
-        down, across = _interpolation(height, patch).to(tokens), _interpolation(width, patch).to(tokens)
-        return (down @ tokens @ across.T).to(image.device)
 
+        def tokens(color: Float[Tensor, "3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
+            color = color[None].to(next(self.model.parameters()))
+            states = self.model(pixel_values=color).last_hidden_state[0]
+            rows, columns = (side // patch for side in color.shape[2:])
+            return states[len(states) - rows * columns :].T.reshape(-1, rows, columns)
 
-def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
-    """Return what interpolates linearly from patches' centers to those of as many equal cells of `length` pixels.
-
-    The identity where the patches end with the image.
-    """
-    count = -(-length // patch)
-    places = (torch.arange(count, dtype=torch.float64) + 0.5) * length / count / patch - 0.5
-    places = places.clamp(0.0, count - 1.0)
-    return (1 - (places[:, None] - torch.arange(count)).abs()).clamp(min=0.0)
+        normalization = self.mean, self.deviation
+        return describe_patches(image, tokens, patch=patch, normalization=normalization, longest=self.longest)
 
 
 def _download(name: str) -> Path:

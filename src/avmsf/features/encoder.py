@@ -1,9 +1,10 @@
-"""What turns an image into features: one interface for DINOv2, for descriptors that need no download, for anyone's own.
+"""What turns an image into features: one interface for networks, for descriptors without any, for anyone's own.
 
 A feature map covers its image evenly, whatever its size: cell [row, column] stands for the rectangle that many equal
 columns and rows cut out, so that its center lies at ((column + 1/2) width / columns, (row + 1/2) height / rows) pixels.
 """
 
+from collections.abc import Callable
 from typing import Protocol, cast, runtime_checkable
 
 import cv2
@@ -12,10 +13,14 @@ import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from avmsf.errors import SceneError
 
 _Pixels = NDArray[np.float32]
+
+Normalization = tuple[Float[Tensor, "3 1 1"], Float[Tensor, "3 1 1"]]
+"""Mean and standard deviation that a model was trained to have colors normalized with."""
 
 
 @runtime_checkable
@@ -51,6 +56,49 @@ def unit_image(
             "bytes, or numbers from 0 to 1", [lowest, highest], got=got, name="image", advice=advice
         )
     return color.clamp(0.0, 1.0)
+
+
+def describe_patches(
+    image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"],
+    model: Callable[[Float[Tensor, "3 pixel_rows pixel_columns"]], Float[Tensor, "dim rows columns"]],
+    *,
+    patch: int,
+    normalization: Normalization,
+    longest: int | None,
+) -> Float[Tensor, "dim rows columns"]:
+    """Return what a model of square patches says of an image, on a grid that covers the image evenly.
+
+    The image is brought to `longest` pixels on its longer side (None: left at its size), normalized, and continued by
+    its last row and column to whole patches of `patch` pixels. Where it ends inside a patch the features are
+    interpolated at the middles of equal cells of the image, so that the map covers the image alone.
+    """
+    color = unit_image(image).permute(2, 0, 1)
+    height, width = color.shape[1:]
+    if longest is not None:
+        factor = longest / max(height, width)
+        height, width = max(1, round(height * factor)), max(1, round(width * factor))
+    color = functional.interpolate(
+        color[None], (height, width), mode="bicubic", align_corners=False, antialias=True
+    ).clamp(0.0, 1.0)
+    mean, deviation = normalization
+    color = (color - mean.to(color)) / deviation.to(color)
+    rows, columns = -(-height // patch), -(-width // patch)
+    color = functional.pad(color, (0, columns * patch - width, 0, rows * patch - height), mode="replicate")
+    with torch.no_grad():
+        found = model(color[0]).float()
+    down, across = _interpolation(height, patch).to(found), _interpolation(width, patch).to(found)
+    return (down @ found @ across.T).to(image.device)
+
+
+def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
+    """Return what interpolates linearly from patches' centers to those of as many equal cells of `length` pixels.
+
+    The identity where the patches end with the image.
+    """
+    count = -(-length // patch)
+    places = (torch.arange(count, dtype=torch.float64) + 0.5) * length / count / patch - 0.5
+    places = places.clamp(0.0, count - 1.0)
+    return (1 - (places[:, None] - torch.arange(count)).abs()).clamp(min=0.0)
 
 
 def continue_outside(

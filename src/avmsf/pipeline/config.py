@@ -62,9 +62,10 @@ class LiftConfig:
 
     encoder: str = AUTO
     """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
-    `descriptors` (built in, no download), or `auto`: DINOv2 base if it is available, else the built-in ones."""
+    `efficientnet-lite0` (extra `efficientnet`, no download), `descriptors` (built in), or `auto`: DINOv2 base if it is
+    available, else the built-in ones."""
     longest: int = 518
-    """Pixels of the longer side of DINOv2's input images."""
+    """Pixels of the longer side of a network's input images."""
     encoder_background: Literal["inpainted", "kept"] = "inpainted"
     """Encoder input outside an object's mask: colors of the object continued, or the image unchanged (paper)."""
     weighting: Literal["plain", "visibility"] = "visibility"

