@@ -29,7 +29,7 @@ from avmsf.evaluation.results import (
     write_sound,
 )
 from avmsf.evaluation.runner import run_objects
-from avmsf.evaluation.tables import Section, missing_of, object_values, sections, summarize
+from avmsf.evaluation.tables import CHOSEN_ON_TEST, Section, missing_of, object_values, sections, summarize
 from factories.plate_set import fill_plates
 from factories.raising import raises
 
@@ -40,7 +40,7 @@ IDENTITY = {
     "seed": 0,
     "metrics": {"kind": "m"},
     "modes": {"kind": "n"},
-    "methods": {"knn3": "", "paper": "", "nearest": ""},
+    "methods": {"knn3": "", "paper": "", "paper-per-contact": "", "nearest": ""},
 }
 
 
@@ -90,6 +90,24 @@ def test_the_best_is_marked_among_methods_that_have_all_objects() -> None:
     # Where every method lacks an object there is no mean to compare.
     best, _ = best_of((easy, record("2", {"nearest": (8.0, 8.0)}), record("3", {"knn3": (1.0, 1.0)})))
     assert best == []
+
+
+def test_the_damping_of_lower_env_on_test_contacts_has_a_row_that_says_so_and_is_never_best() -> None:
+    def tested(name: str, *both: tuple[float, float]) -> ObjectRecord:
+        """Return an object with L1 and ENV of both forms of the paper's dampings."""
+        outcomes = [
+            Outcome("farthest", method, {"l1": (l1, l1), "envelope": (env, env)})
+            for method, (l1, env) in zip(("paper", "paper-per-contact"), both, strict=False)
+        ]
+        return replace(record(name, {}), outcomes=tuple(outcomes))
+
+    # By ENV, object by object: where the loser has the lower L1, too.
+    shared, own = tested("1", (4.0, 1.0), (3.0, 2.0)), tested("2", (1.0, 5.0), (2.0, 0.5))
+    assert summarize((shared, own), IDENTITY)["methods"][CHOSEN_ON_TEST] == {"l1": 3.0, "envelope": 0.75}
+    best, part = best_of((shared, own))
+    assert CHOSEN_ON_TEST in [row[0] for row in part.rows]
+    assert set(best) == {"paper", "paper-per-contact"}
+    assert CHOSEN_ON_TEST not in object_values(tested("3", (1.0, 1.0)), "farthest")
 
 
 def test_a_failure_is_not_missing_but_a_method_or_an_object_that_has_not_run_is() -> None:

@@ -22,12 +22,14 @@ from factories.raising import raises
 
 
 @pytest.mark.parametrize(
-    ("name", "damping"), [("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")]
+    ("name", "damping"),
+    [("av-msf", "validated"), ("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")],
 )
 def test_the_papers_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
     field: Any = method_named(name)
     preset = PRESETS["paper"]
     assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
+    assert (field.pipeline == preset) == (name == "av-msf")
     assert (field.visual_input, field.published) == ("paper", True)
 
 

@@ -113,6 +113,11 @@ METHODS: dict[str, MethodEntry] = {
     "field-no-residual": _network("attention network, quick settings, without residual noise", residual=False),
     # The warm-up moves no damping, so there is nothing to choose between.
     "field-warmup": _network("attention network, quick settings, warm-up only", steps=0, damping="shared"),
+    "av-msf": _paper(
+        "AV-MSF, the preset `paper`: the paper's method with the damping, shared or per contact, of lower ENV at "
+        "held-out training contacts",
+        damping="validated",
+    ),
     "paper": _paper("the paper's method with the preset `paper`, shared damping"),
     "paper-positions": _paper("the paper's method without visual features", visual_input="paper-positions"),
     "paper-no-initialization": _paper("the paper's method without extracted modes", informed=False),

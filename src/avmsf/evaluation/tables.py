@@ -23,6 +23,11 @@ WARNING = (
     "noise. Compare ratios to KNN with the paper's, not absolute values."
 )
 _DASH = format_number(None)
+CHOSEN_ON_TEST = "paper, damping chosen on test contacts"
+"""The likely reading of the paper's choice of its dampings: of both forms, for each object that of lower ENV at its
+test contacts. What has seen the contacts that it is tested at is never marked as best."""
+DAMPING_FORMS = ("paper", "paper-per-contact")
+"""The methods that it is a choice of: where both have values, its row is shown."""
 Values = Mapping[str, Mapping[str, Mapping[str, float]]]
 """By object, method and metric."""
 
@@ -57,7 +62,7 @@ def labels_of(records: Iterable[ObjectRecord]) -> tuple[str, ...]:
 def object_values(record: ObjectRecord, label: str) -> dict[str, dict[str, float]]:
     """Return an object's figures in one experiment by method and metric: means over its contacts.
 
-    A method that failed in any of the experiment's parts has none.
+    A method that failed in any of the experiment's parts has none. `CHOSEN_ON_TEST` counts as a method.
     """
     keys = {case.key for case in record.cases if case.label == label}
     table = {}
@@ -70,6 +75,9 @@ def object_values(record: ObjectRecord, label: str) -> dict[str, dict[str, float
             for metric, values in (*each.values.items(), *((name, (one,)) for name, one in each.figures.items())):
                 found.setdefault(metric, []).extend(value for value in values if value is not None)
         table[method] = {metric: math.fsum(values) / len(values) for metric, values in found.items() if values}
+    forms = [table[form] for form in DAMPING_FORMS if "envelope" in table.get(form, {})]
+    if len(forms) == len(DAMPING_FORMS):
+        table[CHOSEN_ON_TEST] = min(forms, key=lambda values: values["envelope"])
     return table
 
 
@@ -242,7 +250,7 @@ class _Report:
     @cached_property
     def tables(self) -> dict[str, Values]:
         """Values of each experiment by its label, the main one first, with the methods in the requested order."""
-        order = list(self.identity["methods"])
+        order = [*self.identity["methods"], CHOSEN_ON_TEST]
         return {
             label: {
                 name: {method: values[method] for method in order if method in values}
@@ -377,7 +385,11 @@ class _Report:
         best = set()
         for column, metric in enumerate(self.shown, 1):
             total = sum(any(metric in values for values in methods.values()) for methods in self.main.values())
-            known = {row: values[metric] for row, values in enumerate(found.values()) if metric in values}
+            known = {
+                row: values[metric]
+                for row, (method, values) in enumerate(found.items())
+                if metric in values and method != CHOSEN_ON_TEST
+            }
             complete = {row: mean.mean for row, mean in known.items() if mean.objects == total}
             if complete:
                 best.add(((max if _is_rising(metric) else min)(complete, key=complete.__getitem__), column))
