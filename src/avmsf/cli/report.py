@@ -214,6 +214,11 @@ def features_lines(report: Mapping[str, Any]) -> list[str]:
         f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of them in no view; "
         f"consistency of the views {100 * report['agreement']:.0f} % of the features' variance"
     ]
+    if "length" in report:
+        length, variation = (format_number(report[name]) for name in ("length", "variation"))
+        lines.append(
+            f"root mean square of the features' length: {length}; of their distance from their mean: {variation}"
+        )
     if report.get("dropped"):
         lines.append(
             f"removed: {counted(report['dropped'], 'Gaussian')} inside the object or behind its surface in the views"

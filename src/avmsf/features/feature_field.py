@@ -93,20 +93,25 @@ def reduce(features: FeatureField, dim: int) -> FeatureField:
     """
     if dim < 1:
         raise SceneError.expected("at least 1", dim, name="dim")
+    expect_varied(features)
     values = features.features.double()
     values = values - values.mean(0)
     variances, directions = torch.linalg.eigh(values.T @ values / len(values))
     variances, directions = variances.flip(0), directions.flip(1)
     # What is below the rounding of float32 features varies in no direction.
     kept = min(dim, int((variances > 1e-10 * variances[0]).sum()))
-    if not float(variances[0]) > 0:
-        wanted, got = "features that differ over the object", f"{len(values)} equal ones"
-        advice = "use another encoder, or only positions"
-        raise SceneError.expected(wanted, len(values), got=got, name=features.encoder, advice=advice)
     variances, directions = variances[:kept], directions[:, :kept]
     largest = directions.gather(0, directions.abs().argmax(0, keepdim=True))
     reduced = values @ (directions * largest.sign()) / variances.sqrt()
     return FeatureField(features.points, reduced.float(), f"{features.encoder}, {kept} components")
+
+
+def expect_varied(features: FeatureField) -> None:
+    """Raise SceneError for features that are all equal."""
+    if not bool((features.features != features.features[:1]).any()):
+        got, advice = f"{len(features.features)} equal ones", "use another encoder, or only positions"
+        wanted = "features that differ over the object"
+        raise SceneError.expected(wanted, len(features.features), got=got, name=features.encoder, advice=advice)
 
 
 def resize(features: FeatureField, size: float) -> FeatureField:

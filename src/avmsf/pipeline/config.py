@@ -71,7 +71,7 @@ class LiftConfig:
     weighting: Literal["plain", "visibility"] = "visibility"
     """Average over the views that see a point: weighted by visibility, or plain (paper)."""
     components: int = 32
-    """Principal components of the features to use; 0 uses the features unchanged."""
+    """Principal components of the features to use; 0 uses the features unchanged, at the encoder's own scale."""
     symmetry: bool = True
     """Average the features over the symmetries of the object's shape."""
     iterations: int = 3
@@ -83,7 +83,7 @@ class LiftConfig:
     positions: bool = True
     """Begin the features with the points' positions relative to the object's size."""
     feature_size: float = 0.3
-    """Root mean square length of the features after positions, which are about .5 long; without them it is 1."""
+    """Root mean square length of the components after positions, which are about .5 long; without them it is 1."""
     onto: Literal["mesh", "gaussians"] = "mesh"
     """Points of the features for a folder with a mesh only: on its surface, or Gaussians fitted to images of it."""
     points: int = 8192

@@ -12,7 +12,7 @@ from avmsf.features.dino import DinoEncoder
 from avmsf.features.efficientnet import NAME as EFFICIENTNET
 from avmsf.features.efficientnet import EfficientNetEncoder
 from avmsf.features.encoder import Encoder
-from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
+from avmsf.features.feature_field import FeatureField, expect_varied, reduce, resize, with_positions
 from avmsf.features.lift import Lifted, by_presence, by_visibility, lift, lift_points, supported
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.gaussians.cloud import GaussianCloud
@@ -76,13 +76,15 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> tuple[FeatureField, d
     """Reduce lifted features, pool them over the symmetries that the points have, and set positions beside them.
 
     Returns the features and a report of plain values: encoder, points, how many of them no view sees and how many were
-    left out, agreement of the views, symmetries, spread over orbits before and after.
+    left out, agreement of the views, symmetries, spread over orbits before and after, and the root mean squares of the
+    features' length and of their distance from their mean.
     """
     features = lifted.features
     if config.components:
-        features = reduce(features, config.components)
-    # Before pooling, which is meant to shrink what is noise.
-    features = resize(features, config.feature_size if config.positions else 1.0)
+        # Before pooling, which is meant to shrink what is noise.
+        features = resize(reduce(features, config.components), config.feature_size if config.positions else 1.0)
+    else:
+        expect_varied(features)
     report: dict[str, Any] = {
         "encoder": lifted.features.encoder,
         "points": len(features.points),
@@ -101,4 +103,9 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> tuple[FeatureField, d
             spreads = (orbit_spread(each, symmetries, angles=config.angles) for each in (features, pooled))
             report["orbit_spread"] = list(spreads)
             features = pooled
-    return with_positions(features) if config.positions else features, report
+    if config.positions:
+        features = with_positions(features)
+    values = features.features.double()
+    for name, each in {"length": values, "variation": values - values.mean(0)}.items():
+        report[name] = float(each.square().sum(1).mean().sqrt())
+    return features, report
