@@ -14,7 +14,7 @@ import avmsf
 from avmsf.capture import Capture, CaptureSettings, read_capture
 from avmsf.cli import VERBS, main
 from avmsf.cli.report import mode_rows, mode_table
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, FitError
 from avmsf.field.store import load
 from avmsf.modal.modes import ModalBank
 from factories.plate_capture import PLATE, TINY, fill_plate
@@ -178,6 +178,16 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
     assert max(errors, key=lambda method: errors[method]) == "white noise"
     assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
     assert {"modes.png", "gains.png", "spectrograms.png"} <= {each.name for each in (tmp_path / "plots").iterdir()}
+
+
+def test_the_paper_leaves_visual_features_out_only_if_that_is_allowed(
+    capture: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    words = ["fit", str(capture), "--preset", "paper", "--without-shape", "--cache", str(tmp_path), *TINY]
+    with raises(FitError, name="features"):
+        run_verb(*words)
+    _, said = results_of(capsys, *words, "--allow-missing-features")
+    assert "without visual features" in said
 
 
 def keep_one(folder: Path) -> Path:

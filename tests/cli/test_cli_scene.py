@@ -89,6 +89,15 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
+def test_features_of_other_settings_than_the_papers_are_noted(
+    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
+) -> None:
+    words = ["fit", capture, "--cache", tmp_path, *FIT, *MODES, "--preset", "paper", "--features"]
+    _, said = results_of(capsys, *words, kept / "features.safetensors")
+    assert "preset paper: encoder 'descriptors'" in said
+    assert "components 32" in said
+
+
 def test_what_a_trained_network_sees_becomes_a_field(
     capture: Path, kept: Path, tmp_path: Path, capsys: Streams
 ) -> None:

@@ -57,7 +57,9 @@ def test_a_seed_is_that_of_all_stages() -> None:
 
 def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = SceneConfig(ViewsConfig(count=9), SplatConfig(steps=8), LiftConfig(angles=7))
-    other = PipelineConfig("smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu")
+    other = PipelineConfig(
+        "smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu", False
+    )
     assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
     monkeypatch.setitem(PRESETS, "paper", other)
     assert FitOptions.parse(["mug", "--preset", "paper"]).all_settings == other

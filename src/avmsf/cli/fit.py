@@ -1,6 +1,7 @@
 """`avmsf fit`: a capture folder in, a field file out, or what a stage before it makes."""
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -93,6 +94,8 @@ class Options(Configured):
         Existing("features, as avmsf fit --until features writes them", ("features",)),
     ] = None
     """Features, in place of those of the folder's views."""
+    allow_missing_features: Flag = False
+    """With --preset paper: train without visual features where there are none."""
     without_shape: Flag = False
     """Fit to the positions of the contacts alone."""
     gain_model: Annotated[GainModelName | None, arg("NAME")] = None
@@ -117,6 +120,7 @@ class Options(Configured):
         """The preset with the settings that are given."""
         seeds = ("fit.seed", "scene.views.seed", "scene.splat.seed", "scene.lift.seed")
         options = {name: getattr(self, name) for name in ("gain_model", "extraction", "modes", "time_zero", "device")}
+        options["allow_missing_features"] = self.allow_missing_features or None
         return with_settings(
             PRESETS[self.preset], self.set, self.config, {**options, **dict.fromkeys(seeds, self.seed)}
         )
@@ -214,6 +218,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     features, described = None, None
     if options.features is not None:
         features, described = load_features(options.features), read_report(options.features)
+        _note_other_settings(options, described)
     stages, config = options.stages, options.all_settings
     with stages.lock("avmsf fit"):
         made = fit_in_stages(
@@ -252,6 +257,15 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
         next_command("avmsf render", path, _RENDER)
     else:
         next_step("the same command without --train-fraction and --train-count fits all recordings")
+
+
+def _note_other_settings(options: Options, described: Mapping[str, Any]) -> None:
+    """Say which settings of features in a file are not those of a preset that has its own."""
+    made = described.get("scene", {}).get("lift", {})
+    wanted = asdict(options.all_settings.scene.lift)
+    other = [f"{name} {value!r}" for name, value in made.items() if name in wanted and value != wanted[name]]
+    if options.preset != "default" and other:
+        display.listener.note(f"features of other settings than the preset {options.preset}: {', '.join(other)}")
 
 
 def _values(fitted: "SoundField", made: "StagedFit") -> dict[str, Any]:

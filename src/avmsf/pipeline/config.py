@@ -168,6 +168,8 @@ class PipelineConfig:
     device: str | None = None
     """cpu or cuda; None takes the GPU where there is one. Features and training give the same result up to rounding,
     Gaussians differ; cached stages are used for either device."""
+    allow_missing_features: bool = True
+    """Let the network read positions alone where nothing shows the object's appearance (the paper's "w/o visual")."""
 
     def __post_init__(self) -> None:
         """Raise FitError for the name of no gain model or extraction method, and for no modes."""
@@ -203,6 +205,7 @@ PRESETS: Mapping[Preset, PipelineConfig] = {
         fit=PAPER,
         extraction="short-time",
         time_zero="peak",
+        allow_missing_features=False,
     ),
 }
 """`paper` has every stage as published, and of each published list the middle value; docs/paper-map.md lists what the

@@ -14,7 +14,7 @@ from avmsf._utils.caching import once
 from avmsf._utils.files import write_whole
 from avmsf._utils.progress import ProgressListener
 from avmsf.capture import Capture
-from avmsf.errors import SceneError
+from avmsf.errors import FitError, SceneError
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features, read_report
 from avmsf.field.config import AUTO, NETWORK
@@ -132,7 +132,11 @@ def _points_of(
         expect_on_object(capture.impacts.contacts, features.points, names=capture.impacts.names)
         return features
     if config.gain_model == NETWORK:
-        log("no visual features were given: the network reads positions alone")
+        if not config.allow_missing_features:
+            advice = "name a file by --features, or fit without visual features by --allow-missing-features"
+            wanted = "visual features, of what the folder shows or of a file"
+            raise FitError.expected(wanted, got="none", name="features", advice=advice)
+        log("without visual features: the network reads positions alone")
     if capture.surface is None:
         log(_no_shape(config))
         return FeatureField.from_contacts(capture.impacts.contacts)
