@@ -9,20 +9,24 @@ modes, without noise, and no mode has to be found in them; their fields know the
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
+from avmsf.evaluation.editing import audible_modes
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import MATERIALS, Material
 from avmsf.fem.radiation import radiated
+from avmsf.field.config import FitConfig
+from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
@@ -31,7 +35,6 @@ from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Hammer
 from avmsf.simulate.shapes import make_shape
 from avmsf.simulate.simulation import MAX_FREQUENCY_RATIO, SoundingBody, recorded
-from benchmarks.editing_objects import KnownObject
 
 SHAPES = ("bowl", "mug", "plate", "pot")
 """Kinds of the simulated objects in the clusters."""
@@ -44,8 +47,39 @@ _CONTACTS, _POINTS = 16, 400
 """Recorded contacts, and all contacts of an edit."""
 _MICROPHONE = (0.45, -0.35, 0.4)
 """From the middle of the object, meters."""
+_SAMPLE_RATE, _SECONDS = 44100.0, 0.5
+"""Of the sounds, Hz and s."""
 _SMALLEST, _LARGEST = 0.7, 1.4
 """Factors on the size that a shape is drawn in."""
+
+
+DIRECT = FitConfig(steps=0, damping="shared", residual=False)
+"""Settings of a field without training end to end and without residual noise, which no edit changes."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownObject:
+    """An object of a known material, its recordings, and its true modes."""
+
+    name: str
+    material: str
+    impacts: Impacts
+    modes: Extraction
+    """Row for row of the impacts."""
+    body: CandidateBody
+    points: Float64[Tensor, "points 3"]
+    """Of its surface, meters."""
+
+    @property
+    def bank(self) -> ModalBank:
+        """Its audible modes."""
+        return audible_modes(self.modes.bank, self.modes.gains)
+
+    @cached_property
+    def sound_field(self) -> SoundField:
+        """Its field."""
+        gains, features = MixtureEstimator(bodies=CandidateBodies([self.body])), FeatureField.from_points(self.points)
+        return fit(self.impacts, features, self.modes, DIRECT, gains=gains, capture=self.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,30 +111,27 @@ class SolvedShape:
             mass=self.elastic.mass * density * size**3,
         )
 
-    def struck(
-        self, material: Material, *, size: float = 1.0, sample_rate: float = 44100.0, seconds: float = 0.5
-    ) -> KnownObject:
+    def struck(self, material: Material, *, size: float) -> KnownObject:
         """Return the object in a material and size, struck at contacts far apart, straight into its surface."""
         elastic = self.remade(material, size=size)
         damping = torch.diag(rayleigh(elastic.frequency, material))
-        vibration = damped(elastic.frequency, damping, highest=MAX_FREQUENCY_RATIO * sample_rate)
+        vibration = damped(elastic.frequency, damping, highest=MAX_FREQUENCY_RATIO * _SAMPLE_RATE)
         middle = 0.5 * (elastic.nodes.amax(0) + elastic.nodes.amin(0))
         sound = radiated(elastic, vibration, middle + torch.tensor(_MICROPHONE, dtype=torch.float64))
         body = SoundingBody(elastic, vibration, sound, Hammer())
         contacts = elastic.nodes[self._spread[:_CONTACTS]]
         directions = -elastic.normals(contacts)
         amplitudes = body.gains(contacts, directions)
-        starts, samples = torch.zeros(len(contacts), dtype=torch.float64), round(seconds * sample_rate)
-        sounds = recorded(vibration.poles, amplitudes, starts, sample_rate=sample_rate, samples=samples)
+        starts, samples = torch.zeros(len(contacts), dtype=torch.float64), round(_SECONDS * _SAMPLE_RATE)
+        sounds = recorded(vibration.poles, amplitudes, starts, sample_rate=_SAMPLE_RATE, samples=samples)
         names = tuple(f"{row + 1:03d}.wav" for row in range(len(contacts)))
-        impacts = Impacts(contacts, sounds.float(), sample_rate, names, directions=directions.float())
+        impacts = Impacts(contacts, sounds.float(), _SAMPLE_RATE, names, directions=directions.float())
         bank = ModalBank(vibration.frequency, vibration.damping)
         # Regression over shapes needs some variance: as much as noise 60 dB below the sounds would give.
         level = torch.full((17,), 1e-3 * float(sounds.square().mean().sqrt()))
         modes = Extraction(bank, (1j * amplitudes).to(torch.complex64), Residual(level))
-        recipe = MixtureEstimator(bodies=CandidateBodies([CandidateBody(None, elastic)]))
-        features = partial(FeatureField.from_points, elastic.nodes[self._spread])
-        return KnownObject(f"{self.kind}-{material.name}", material.name, impacts, modes, recipe, features)
+        name, points = f"{self.kind}-{material.name}", elastic.nodes[self._spread]
+        return KnownObject(name, material.name, impacts, modes, CandidateBody(None, elastic), points)
 
     @cached_property
     def _spread(self) -> Int[Tensor, " points"]:

@@ -130,7 +130,7 @@ def run(options: Options) -> int:
         taken = f"{protocol.name} takes {len(objects)} of {total} objects, {SUBSETS[protocol.subset]}"
         note(f"{taken}: {', '.join(objects)}; --objects NAME,NAME takes others")
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
-    settings, cdpam = options.all_settings, not (options.no_cdpam or protocol.locating)
+    settings, cdpam = options.all_settings, protocol.scoring == "sounds" and not options.no_cdpam
     evaluation = plan_evaluation(
         dataset,
         title,

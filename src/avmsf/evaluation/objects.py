@@ -20,6 +20,7 @@ from avmsf.datasets.dataset import Dataset
 from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
 from avmsf.editing.clips import resampled
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
+from avmsf.evaluation.editing import TRANSITIONS, materials_of
 from avmsf.evaluation.modal_metrics import simulated
 from avmsf.evaluation.registry import Protocol
 from avmsf.evaluation.task import VisualInput
@@ -197,13 +198,18 @@ def members(dataset: Dataset) -> dict[str, frozenset[str]]:
 
 
 def choose_objects(dataset: Dataset, protocol: Protocol, asked: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the objects that take part: those asked for, else the protocol's group, else all.
+    """Return the objects that take part: those asked for, else the protocol's group, else all; for edits, those of
+    materials that others of the dataset contrast with.
 
     Raises DatasetError for unknown ones, and EvaluationError where the protocol is about a group that the dataset does
     not have.
     """
     if asked:
         return tuple(dict.fromkeys(dataset.facts(identifier).identifier for identifier in asked))
+    if protocol.scoring == "edits":
+        materials = materials_of(dataset)
+        reached = [first for first, second in TRANSITIONS if second in materials.values()]
+        return tuple(name for name, material in materials.items() if material in reached)
     if protocol.subset is not None:
         group = members(dataset).get(protocol.subset, frozenset())
         if group:

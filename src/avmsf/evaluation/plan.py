@@ -11,11 +11,12 @@ from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.editing import Edits
 from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
 from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, table_modules
-from avmsf.evaluation.results import ENCODER, ResultsFolder
+from avmsf.evaluation.results import ENCODER, SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import expect_metrics
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.features.descriptors import ImageDescriptors
@@ -50,13 +51,15 @@ class Evaluation:
     own_starts: Dataset | None = None
     """The same dataset with its own starts, for fields that are not of the paper's configuration; None where all
     methods are fitted to the sounds that they are scored on."""
+    edits: Edits | None = None
+    """What the protocol `edit` needs besides; None with all others."""
 
     def begin(self, results: ResultsFolder) -> None:
         """Take a folder for this evaluation's results.
 
         Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
         """
-        if not self.protocol.locating:
+        if self.protocol.scoring == "sounds":
             expect_metrics(self.metric_settings)
         identity = {
             "version": version("avmsf"),
@@ -72,6 +75,8 @@ class Evaluation:
             "settings": dict(self.settings),
         }
         results.begin(identity, {method.name: self._described(method) for method in self.methods})
+        if self.edits is not None:
+            write_json(results.path / SPACES, {name: space.record() for name, space in self.edits.spaces.items()})
 
     def _described(self, method: Method) -> str:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
@@ -106,7 +111,13 @@ def plan_evaluation(
     """
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
-    lift, paper = available_encoders(settings.lift, visual_inputs(methods, protocol), device=device, log=log)
+    finder, edits, edit = finder_named(settings.extraction, settings.modes), None, {}
+    if protocol.scoring == "edits":
+        edits, edit = Edits(dataset, settings.edit, finder, cache, seed), {"edit": asdict(settings.edit)}
+        # Where a model cannot be loaded nothing else is worth its time. Workers load their own.
+        _ = replace(edits).model, replace(edits).clap
+    read = visual_inputs(methods if edits is None else (edits.field_method,), protocol)
+    lift, paper = available_encoders(settings.lift, read, device=device, log=log)
     scene = SceneConfig(views, settings.splat, settings.lift)
     inputs = ObjectInputs(
         dataset, cache, replace(scene, lift=lift), paper, settings.geometry, settings.body, device, seed=seed
@@ -120,11 +131,12 @@ def plan_evaluation(
         inputs,
         seed,
         metrics,
-        finder_named(settings.extraction, settings.modes),
-        {"scene": asdict(scene), "paper": asdict(paper), "geometry": settings.geometry, "body": body},
+        finder,
+        {"scene": asdict(scene), "paper": asdict(paper), "geometry": settings.geometry, "body": body, **edit},
         device,
         None if lift == settings.lift else lift.encoder,
         time_zero,
+        edits=edits,
     )
 
 
@@ -155,7 +167,7 @@ def available_encoders(
 def visual_inputs(methods: Sequence[Method], protocol: Protocol) -> frozenset[VisualInput]:
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
     read = {method.visual_input for method in methods if isinstance(method, FieldMethod)}
-    return frozenset(read | {"surface"} if protocol.locating else read)
+    return frozenset(read | {"surface"} if protocol.scoring == "contacts" else read)
 
 
 def dataset_title(dataset: Dataset, folder: Path) -> str:

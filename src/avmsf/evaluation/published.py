@@ -49,6 +49,15 @@ PUBLISHED: Mapping[tuple[str, str], tuple[PublishedRow, ...]] = {
         _row("SonicGauss", "sonicgauss", 0.039, 1.580, 0.025, 2.43e-4),
         _row("AV-MSF", "av-msf", 0.021, 0.996, 0.017, 2.16e-4),
     ),
+    # Its objects and prompts are not published, and every set of objects has another UMAP.
+    (REALIMPACT, "edit"): tuple(
+        PublishedRow(title, {"umap": value}, method)
+        for title, method, value in (
+            ("Generation", "generation", 3.077),
+            ("Audio-SDS", "edit-independent", 4.234),
+            ("AV-MSF", "edit-published", 2.753),
+        )
+    ),
     (OBJECTFOLDER, "ablation"): (
         _row("AV-MSF", "av-msf", 0.019, 0.927, 0.015, 2.00e-4),
         _row("without visual", "paper-positions", 0.028, 1.148, 0.015, 4.20e-4),

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from avmsf.editing.config import GuidedEditConfig
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.config import SplatConfig
 from avmsf.modal.config import ExtractionMethod, expect_modes
@@ -53,6 +54,10 @@ METRICS: dict[str, MetricEntry] = {
     "rmed": MetricEntry("RMED"),
     "rmed_posterior": MetricEntry("RMED, posterior"),
     "found": MetricEntry("", rising=True),
+    "umap": MetricEntry("UMAP"),
+    "umap_dampings": MetricEntry("UMAP with dampings"),
+    "spectral": MetricEntry("spectral distance"),
+    "clap": MetricEntry("CLAP", rising=True),
 }
 """All metrics that tables show or of which more is better, by name, in the order of columns."""
 
@@ -75,11 +80,14 @@ class MethodEntry:
 
 
 def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
-    return lambda title, **settings: MethodEntry(title, make=f"methods:{make}", settings={**common, **settings})
+    return lambda title, **settings: MethodEntry(title, make=make, settings={**common, **settings})
 
 
-_process, _network = _made("gaussian_process"), _made("network", visual_input="visual")
-_paper = _made("network", visual_input="paper", published=True)
+_process, _network = _made("methods:gaussian_process"), _made("methods:network", visual_input="visual")
+_paper = _made("methods:network", visual_input="paper", published=True)
+_EDIT = "editing:edit_method"
+"""Makes the methods of the protocol `edit`."""
+_edit, _guided = _made(_EDIT), _made(_EDIT, edit="guided")
 METHODS: dict[str, MethodEntry] = {
     "white-noise": MethodEntry("Gaussian noise at the level of the training recordings", "methods:white_noise"),
     "random-impact": MethodEntry("a recording of another object", "methods:random_impact"),
@@ -143,6 +151,13 @@ METHODS: dict[str, MethodEntry] = {
         path="a folder with a folder of wav files for every object",
         is_folder=True,
     ),
+    "unedited": _edit("the field before the edit", edit="unedited"),
+    "generation": _edit("a sound that the model generates from the prompt alone", edit="generation"),
+    "edit-independent": _guided("guided edit of every mode by itself (Audio-SDS)", parameters="independent"),
+    "edit-published": _guided("guided edit with the paper's parameters", parameters="published"),
+    "edit-hierarchical": _guided("guided edit with this package's parameters", parameters="hierarchical"),
+    "edit-searched": _guided("guided edit of every mode by itself, after a search", parameters="searched"),
+    "edit-physics": _edit("the laws of elasticity with both materials' constants", edit="physics"),
 }
 """All methods by name, in the order of tables."""
 _TABLE = (
@@ -167,8 +182,8 @@ class Protocol:
     subset: Literal["ablation", "non-symmetric"] | None = None
     """The objects that take part unless others are asked for; None for all. All objects of a dataset stand for those of
     the ablation where it has none of them."""
-    locating: bool = False
-    """Whether methods are evaluated by localizing the test recordings, not by their sounds."""
+    scoring: Literal["sounds", "contacts", "edits"] = "sounds"
+    """What methods are evaluated by: the sounds of the test recordings, their contacts as located, or edited sounds."""
 
     @property
     def choosing(self) -> "Choosing":
@@ -222,7 +237,7 @@ PROTOCOLS: dict[str, Protocol] = {
             "Train as in `farthest`; locate the test recordings, on objects without rotational symmetry.",
             methods=("white-noise", "nearest", "diffsound", "field", "field-no-residual", "field-auto"),
             subset="non-symmetric",
-            locating=True,
+            scoring="contacts",
         ),
         Protocol(
             "grid",
@@ -230,6 +245,13 @@ PROTOCOLS: dict[str, Protocol] = {
             "test as in `farthest`.",
             methods=(BASELINE, "field", "field-grid"),
             subset="ablation",
+        ),
+        Protocol(
+            "edit",
+            "Change the material of objects, towards prompts or recordings; distance from objects of the new material.",
+            "splits:Edited",
+            ("unedited", "edit-independent", "edit-hierarchical"),
+            scoring="edits",
         ),
     )
 }
@@ -259,6 +281,10 @@ def method_entry(name: str) -> MethodEntry:
 
 def expect_suited(method: str, protocol: str) -> None:
     """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
+    edits = PROTOCOLS[protocol].scoring == "edits"
+    if (method_entry(method).make == _EDIT) != edits:
+        wanted = f"a method that {'edits' if edits else 'predicts'} sounds, such as {PROTOCOLS[protocol].methods[0]}"
+        raise EvaluationError.expected(f"{wanted}, for {protocol}", method, name="method")
     if kind_of(method) == "recorded" and protocol == "shots":
         wanted, advice = f"a protocol that tests each recording once for {method}", "choose another, such as farthest"
         got = f"{protocol}, which trains on several sets of recordings, and the folder holds the sounds of one"
@@ -274,6 +300,29 @@ def _unknown(kind: str, name: str, known: Iterable[str]) -> EvaluationError:
     near = difflib.get_close_matches(name, known, n=1)
     wanted, advice = f"one of {', '.join(known)}", f"did you mean {near[0]}?" if near else ""
     return EvaluationError.expected(wanted, name, name=kind, advice=advice)
+
+
+@dataclass(frozen=True)
+class EditProtocolSettings:
+    """Settings of the protocol `edit`."""
+
+    fields: str = "field-auto"
+    """The method that fits the fields that are edited; `paper` is the paper's."""
+    model: str | None = None
+    """Stable Audio, a folder or a name on the hub, to edit towards prompts; by default edits are towards recordings of
+    another object of the new material, and need no weights."""
+    model_seconds: float | None = None
+    """Length that the model works at; by default all that it was trained for."""
+    generated: float = 3.0
+    """Seconds of the sounds of the method `generation`."""
+    clap: str | None = None
+    """CLAP, likewise, for the CLAP score of edits towards prompts; needs the extra `eval`."""
+    guide: GuidedEditConfig = field(default_factory=GuidedEditConfig)
+    """How the modes are optimized; the seed is that of the evaluation."""
+
+    def __post_init__(self) -> None:
+        if self.clap is not None and self.model is None:
+            raise EvaluationError.expected("edit.model with it, for there are no prompts without", name="edit.clap")
 
 
 @dataclass(frozen=True)
@@ -297,6 +346,8 @@ class EvaluationSettings:
     without `lift.encoder`, which then has to be installed."""
     body: BodyConfig = field(default_factory=BodyConfig)
     """Elastic bodies."""
+    edit: EditProtocolSettings = field(default_factory=EditProtocolSettings)
+    """The protocol `edit`."""
 
     def __post_init__(self) -> None:
         expect_modes(self.modes)

@@ -3,7 +3,7 @@
 import base64
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, zip_longest
+from itertools import chain, product, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,12 +17,13 @@ from PIL import Image
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text import format_number
+from avmsf._utils.text import format_number, read_json
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
 from avmsf.evaluation.registry import METRICS
 from avmsf.evaluation.results import (
     RECORDED,
+    SPACES,
     CaseRecord,
     ObjectRecord,
     Outcome,
@@ -35,6 +36,7 @@ from avmsf.evaluation.splits import evenly_spaced
 from avmsf.evaluation.tables import Section, missing_of, sections, summarize, times_of
 from avmsf.export.web import report_directives, with_policy
 from avmsf.plotting.contacts import draw_contact
+from avmsf.plotting.edits import Curve, Move, draw_clap_curves, draw_embedding
 from avmsf.plotting.pictures import save_picture
 from avmsf.plotting.spectrograms import RANGE_DB, draw_spectrograms, log_spectrogram
 from avmsf.plotting.style import SEQUENTIAL
@@ -45,6 +47,8 @@ FIGURES = "figures"
 """Folder of the spectrograms, one file for each object, or for each object and case, and of the heat maps."""
 MAX_PAGE_CHARACTERS = 13_000_000
 """Of the page's pictures and sounds; further contacts are omitted."""
+MAX_SPACES_BYTES = 1 << 24
+"""Of the embeddings of all objects: some ten thousand."""
 MAX_PAGE_OBJECTS = 4
 """Objects with sounds on the page, evenly spaced over all."""
 _LOWEST_HZ = 60.0
@@ -196,12 +200,36 @@ def _address(kind: str, content: bytes) -> str:
 def write_figures(results: ResultsFolder) -> list[Path]:
     """Draw what is stored, and return the files.
 
-    Sounds are drawn as spectrograms, the recording next to all methods, one PNG for each object and each label of its
-    cases; localized contacts as heat maps with the true contact marked, one PNG for each field and recording. Raises
-    EvaluationError where a stored file is missing.
+    Edits are drawn as moves in the embedding of their metric, one PNG for each two materials, and as CLAP scores over
+    the steps. Sounds are drawn as spectrograms, the recording next to all methods, one PNG for each object and each
+    label of its cases; localized contacts as heat maps with the true contact marked, one PNG for each field and
+    recording. Raises EvaluationError where a stored file is missing.
     """
-    drawn = (_write_spectrograms, _write_maps)
-    return [path for record in results.records() for draw in drawn for path in draw(record, results.path)]
+    drawn, records = (_write_spectrograms, _write_maps), results.records()
+    paths = [path for record in records for draw in drawn for path in draw(record, results.path)]
+    return [*paths, *_write_edits(records, results.path)]
+
+
+def _write_edits(records: Sequence[ObjectRecord], folder: Path) -> Iterator[Path]:
+    outcomes = [each for record in records for each in record.outcomes if "places" in each.report]
+    before = {each.case: each.report["places"] for each in outcomes if each.method == "unedited"}
+    edited = [each for each in outcomes if each.case in before and each.method != "unedited"]
+    pairs = dict.fromkeys((each.report["source"], each.report["target"]) for each in edited)
+    spaces = read_json(folder / SPACES, max_bytes=MAX_SPACES_BYTES) if pairs else {}
+    for (metric, space), (source, target) in product(spaces.items(), pairs):
+        moves: dict[str, list[Move]] = {}
+        for each in (each for each in edited if (each.report["source"], each.report["target"]) == (source, target)):
+            moves.setdefault(each.method, []).append((before[each.case][metric], each.report["places"][metric]))
+        title = f"{source} to {target}, {METRICS[metric].heading} of {len(space['names'])} objects"
+        figure = draw_embedding(np.array(space["embedding"]), space["materials"], moves, target=target, title=title)
+        yield _write_figure(figure, folder, f"{metric} {source} to {target}")
+    curves: dict[str, list[Curve]] = {}
+    for each in outcomes:
+        if each.report.get("clap"):
+            curves.setdefault(each.method, []).append(each.report["clap"])
+    if curves:
+        figure = draw_clap_curves(curves, title="CLAP score of the previews and the prompt")
+        yield _write_figure(figure, folder, "clap")
 
 
 def _write_spectrograms(record: ObjectRecord, folder: Path) -> Iterator[Path]:

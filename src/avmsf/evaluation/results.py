@@ -25,8 +25,8 @@ from avmsf._utils.text import read_json
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.splits import Case
 
-IDENTITY, OBJECTS = "protocol.json", "objects"
-"""The file that identifies the evaluation, and the folder of the objects' files."""
+IDENTITY, SPACES, OBJECTS = "protocol.json", "spaces.json", "objects"
+"""The files that identify the evaluation and embed the objects of `edit`, and the folder of the objects' files."""
 ENCODER = ", encoder "
 """What comes between a method's description and the encoder of the features that it reads."""
 _MAX_BYTES = 64 << 20

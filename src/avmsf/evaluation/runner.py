@@ -22,6 +22,7 @@ from avmsf._utils.caching import Given, Result, once
 from avmsf._utils.device import one_thread
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.evaluation.editing import Edited, Generated, score_edit
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import FieldMethod, RecordedMethod
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
@@ -42,6 +43,8 @@ from avmsf.evaluation.results import (
 from avmsf.evaluation.scores import Values, metric_values
 from avmsf.evaluation.splits import Case, align_split, evenly_spaced
 from avmsf.evaluation.task import Method, Renderer, Task, expect_renderer, report_of
+from avmsf.field.sound_field import SoundField
+from avmsf.field.store import load
 from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import ModeFinder
 
@@ -106,7 +109,9 @@ class CaseRun:
         """Prepare the `number`-th case of an object; with `stores_sounds`, some of its sounds go into `folder`."""
         self.evaluation, self.data, self.case, self.folder = evaluation, data, case, folder
         self.name = f"{data.identifier}/{number:02d}"
-        path, finder = folder / "modes" / f"{self.name}.safetensors", evaluation.finder
+        path, finder, edits = folder / "modes" / f"{self.name}.safetensors", evaluation.finder, evaluation.edits
+        if edits is not None:
+            path = edits.modes_file(data.identifier)
         self.scored = self.own = _Recordings(data.impacts, case, finder, path)
         if data.own_starts is not None:
             own_path = path.with_name(f"{number:02d} own starts.safetensors")
@@ -119,22 +124,32 @@ class CaseRun:
     def outcome(self, method: Method) -> Outcome:
         """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
         begun, shared = time.perf_counter(), self.shared
-        published = isinstance(method, FieldMethod) and method.published
-        recordings = self.own if isinstance(method, FieldMethod) and not published else self.scored
+        edits = self.evaluation.edits
+        fitting = method if edits is None else edits.field_method
+        published = isinstance(fitting, FieldMethod) and fitting.published
+        recordings = self.own if isinstance(fitting, FieldMethod) and not published else self.scored
         try:
             for each in (self.scored, recordings):
                 self._shared(each.align)()
-            renderer = expect_renderer(method.fit(self._task(recordings)))
+            task = self._task(recordings)
+            if edits is not None:
+                field = self._shared(self._stored_field)(edits.field_method, task)
+                task = replace(task, edit=edits.request(self.data.identifier, self.case, field))
+            renderer = expect_renderer(method.fit(task))
             fit_seconds = time.perf_counter() - begun - (self.shared - shared)
             begun = time.perf_counter()
             with torch.no_grad():
                 sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
             render_seconds = time.perf_counter() - begun
-            if self.evaluation.protocol.locating:
+            maps, report = dict[str, str](), report_of(renderer)
+            figures: Mapping[str, float | None] = {}
+            if edits is not None and task.edit is not None and isinstance(renderer, Edited | Generated):
+                contacts = recordings.test.contacts
+                values, figures, report = score_edit(renderer, sounds, contacts, task.edit, edits.spaces, edits.clap)
+            elif self.evaluation.protocol.scoring == "contacts":
                 values, maps = self._located(method.name, recordings, renderer, published)
-                figures: Mapping[str, float | None] = {}
             else:
-                loudest, maps = float(self.data.impacts.sounds.abs().max()), {}
+                loudest = float(self.data.impacts.sounds.abs().max())
                 settings, test = self.evaluation.metric_settings, self.scored.test
                 values, figures = metric_values(settings, renderer, sounds, test, self.truth, loudest=loudest)
         except Exception as error:  # A fault in one method must not cost the others their hours.
@@ -146,16 +161,23 @@ class CaseRun:
             figures,
             round(fit_seconds, 4),
             round(render_seconds, 4),
-            self._write_sounds(method.name, sounds),
-            report_of(renderer),
+            self._write_sounds(method.name, sounds, renderer.sample_rate),
+            report,
             maps,
         )
 
     def described(self, known: CaseRecord) -> CaseRecord:
         """Return the case's record with the recordings' files and with the time of modes and features so far."""
-        sounds = known.sounds or self._write_sounds(RECORDED, self.scored.test.sounds)
+        sounds = known.sounds or self._write_sounds(RECORDED, self.scored.test.sounds, self.scored.test.sample_rate)
         seconds, self.shared = known.shared_seconds + self.shared, 0.0
         return replace(known, sounds=sounds, shared_seconds=round(seconds, 4))
+
+    def _stored_field(self, method: FieldMethod, task: Task) -> SoundField:
+        """Return the field of an object's recordings, which is fitted once for all edits."""
+        path = self.folder / "fields" / self.data.identifier / f"{self.data.digest[:16]}.safetensors"
+        if not path.exists():
+            method.fit(task).save(path)
+        return load(path)
 
     def _located(
         self, name: str, recordings: _Recordings, renderer: Renderer, published: bool
@@ -195,20 +217,20 @@ class CaseRun:
         """Return `make`, whose time is added to `shared`."""
 
         def made(*given: Given.args, **named: Given.kwargs) -> Result:
-            begun = time.perf_counter()
+            begun, before = time.perf_counter(), self.shared
             try:
                 return make(*given, **named)
-            finally:
-                self.shared += time.perf_counter() - begun
+            finally:  # without what shared steps within have added
+                self.shared = before + time.perf_counter() - begun
 
         return made
 
-    def _write_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"]) -> dict[str, str]:
+    def _write_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> dict[str, str]:
         """Write the sounds to listen to, and return their files by the names of their recordings."""
         stored, test = {}, self.scored.test
         for row in self.stored_rows:
             file, gain = f"sounds/{self.name}/{row:03d} {file_word(name)}.flac", listening_gain(test.sounds[row])
-            write_sound(self.folder / file, sounds[row], sample_rate=test.sample_rate, gain=gain)
+            write_sound(self.folder / file, sounds[row], sample_rate=sample_rate, gain=gain)
             stored[test.names[row]] = file
         return stored
 
@@ -226,6 +248,8 @@ def run_object(
         try:
             data = ObjectData(evaluation, identifier)
             cases = evaluation.protocol.choosing.cases(data.impacts)
+            if evaluation.edits is not None:
+                cases = evaluation.edits.cases(identifier, *cases)
         except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.
             results.write(replace(record, failure=failure_of(error)))
             return

@@ -36,6 +36,10 @@ class Case:
     """Fold of the experiment, where it has several."""
     views: int | None = None
     """Maximum number of views for visual features; None for all."""
+    target: str = ""
+    """Material that the object is to change to, of the protocol `edit`."""
+    goal: str = ""
+    """Prompt, or name of the object whose recordings the edit is towards."""
 
     @property
     def key(self) -> str:
@@ -94,6 +98,19 @@ class Predefined:
         chosen = [contact for contact, rows in enumerate(distinct.rows) if tested.isdisjoint(rows)]
         distinct.check_count(len(chosen))
         return (replace(distinct.case("predefined", chosen), test=tuple(sorted(tested))),)
+
+
+@dataclass(frozen=True)
+class Edited:
+    """All recordings are for training, and some of their contacts are rendered after an edit."""
+
+    contacts: int = 8
+    """Number of rendered contacts, the first ones."""
+
+    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
+        """Return the one case, of which an edit's goals make one each (`avmsf.evaluation.editing.Edits.cases`)."""
+        every = tuple(range(len(impacts)))
+        return (Case("edit", every, every[: self.contacts]),)
 
 
 @dataclass(frozen=True)

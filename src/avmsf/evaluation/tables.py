@@ -293,7 +293,8 @@ class _Report:
                 "Values are means over an object's test recordings (CDPAM: over `cdpam_contacts` of them, 0 for all), "
                 "then over objects, ± the standard error over objects. RMED is the distance between the located and "
                 "the true contact relative to the diagonal of the object, by cosine distance; methods that cannot "
-                "locate count as a random point. Lower is better, except for MAC. L1, "
+                "locate count as a random point. UMAP is the distance of edited modes from the center of the "
+                "objects of the new material. Lower is better, except for MAC and CLAP. L1, "
                 "L1-log and ENV follow the convention `paper` of docs/conventions.md; relative STFT does not depend on "
                 "unit and level. With the level full-scale, an object's sounds are multiplied by one factor that "
                 "brings its loudest recording to a peak of one.",

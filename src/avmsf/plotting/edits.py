@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
@@ -107,8 +107,45 @@ def _count(axes: Axes, drawn: list[tuple[str, ModeLevels, str]]) -> None:
         axes.stairs(np.histogram(places, edges)[0], 2.0 ** (edges / _BANDS), color=color, fill=True, alpha=0.35)
 
 
+Move: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
+"""Where an edited object's modes lie in an embedding before and after the edit."""
 Curve: TypeAlias = Sequence[tuple[int, float]]
 """Steps of an edit and its CLAP score after each; step 0 is the object as it was."""
+
+
+@styled
+def draw_embedding(
+    points: Float[np.ndarray, "objects 2"],
+    materials: Sequence[str],
+    moves: Mapping[str, Sequence[Move]],
+    *,
+    target: str,
+    title: str,
+) -> Figure:
+    """Draw labelled objects in an embedding of their modes, and arrows from edited objects before to after the edit.
+
+    One panel for each method of `moves`. A star marks the mean of the objects of the material `target`, from which the
+    UMAP distance is measured.
+    """
+    figure = titled_figure(title, 4.2 * len(moves) + 1.6, 4.8)
+    panels = figure.subplots(1, len(moves), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, (method, changes) in zip(panels, moves.items(), strict=True):
+        for number, material in enumerate(sorted(set(materials))):
+            own = points[[each == material for each in materials]]
+            axes.scatter(own[:, 0], own[:, 1], s=36, alpha=0.75, color=series_color(number), label=material)
+        center = points[[material == target for material in materials]].mean(axis=0)
+        axes.plot(*center, "*", color="black", markersize=13, label=f"mean of {target}")
+        arrow = {"arrowstyle": "->", "color": "0.3", "shrinkA": 0, "shrinkB": 0}
+        for before, after in changes:
+            axes.annotate("", after, before, arrowprops=arrow)
+        ends = np.asarray(changes, dtype=float).reshape(-1, 2, 2)
+        axes.plot(*ends[:, 0].T, "o", mfc="white", color="black", markersize=6, label="before the edit")
+        axes.plot(*ends[:, 1].T, "D", color="black", markersize=5, label="after the edit")
+        axes.set_title(method)
+        axes.set_xlabel("UMAP 1")
+    panels[0].set_ylabel("UMAP 2")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right upper")
+    return figure
 
 
 @styled

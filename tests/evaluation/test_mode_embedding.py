@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace, pitches, pitches_and_dampings
 from avmsf.modal.modes import ModalBank
-from benchmarks.mode_embedding import FEATURES, MaterialSpace, pitches, rings
 from factories.raising import raises
 
 
@@ -32,18 +32,18 @@ def shift(features, first: ModalBank, second: ModalBank) -> float:
 def test_an_octave_and_twice_the_damping_are_one_away(modes):
     low, high, fast = (random_bank(modes, seed=0, **change) for change in ({}, {"pitch": 1.0}, {"decay": 1.0}))
     assert shift(pitches, low, high) == pytest.approx(1.0, abs=1e-12)
-    assert shift(rings, low, fast) == pytest.approx(1.0, abs=1e-12)
+    assert shift(pitches_and_dampings, low, fast) == pytest.approx(1.0, abs=1e-12)
     assert shift(pitches, low, fast) == 0.0
 
 
 def test_dampings_are_taken_where_their_pitch_is():
     # d = 3 (f / 1000)^2 is a straight line of slope 2; inside a dense set, its mean around a pitch is its value there.
     frequency = 2 ** torch.linspace(5, 16, 2000, dtype=torch.float64)
-    curve = rings(bank(frequency, 3.0 * (frequency / 1000) ** 2))[32:] * math.sqrt(15)
+    curve = pitches_and_dampings(bank(frequency, 3.0 * (frequency / 1000) ** 2))[32:] * math.sqrt(15)
     expected = math.log2(3.0) + 2 * (np.linspace(math.log2(125.0), math.log2(16000.0), 15) - math.log2(1000.0))
     assert np.abs(curve - expected)[2:-4] == pytest.approx(0.0, abs=0.01)
     # Far from every mode the nearest one counts.
-    assert rings(bank([15.0, 16.0], [4.0, 32.0]))[-1] * math.sqrt(15) == pytest.approx(5.0, abs=0.1)
+    assert pitches_and_dampings(bank([15.0, 16.0], [4.0, 32.0]))[-1] * math.sqrt(15) == pytest.approx(5.0, abs=0.1)
 
 
 @pytest.mark.parametrize("features", FEATURES.values(), ids=FEATURES)
@@ -85,8 +85,8 @@ BANKS, MATERIALS = labelled()
     ("make", "attributes"),
     [
         (lambda: pitches(bank([])), {"name": "bank", "value": 0}),
-        (lambda: rings(bank([100.0, 0.0])), {"row": 1, "name": "frequency", "value": 0.0}),
-        (lambda: rings(bank([100.0], math.nan)), {"row": 0, "name": "damping"}),
+        (lambda: pitches_and_dampings(bank([100.0, 0.0])), {"row": 1, "name": "frequency", "value": 0.0}),
+        (lambda: pitches_and_dampings(bank([100.0], math.nan)), {"row": 0, "name": "damping"}),
         (lambda: MaterialSpace.of(BANKS, MATERIALS[1:]), {"name": "materials", "value": 15}),
         (lambda: MaterialSpace.of(BANKS[:4], MATERIALS[:4]), {"name": "mode_sets", "value": (4, 1)}),
         (lambda: MaterialSpace.of(BANKS, MATERIALS).center("steel"), {"name": "material", "value": "steel"}),

@@ -23,9 +23,9 @@ from avmsf.modal.modes import ModalBank
 _QUANTILES = 32
 _PITCHES, _WIDTH = 15, 0.5
 """Pitches at which dampings are compared, from 125 Hz to 16 kHz, two an octave; and the width of the mean, octaves."""
-_FEWEST = 6
+_MIN_OBJECTS = 6
 """Objects that UMAP has anything to arrange of."""
-_NEIGHBORS, _LEAST_DISTANCE = 8, 0.1
+_NEIGHBORS, _MIN_DISTANCE = 8, 0.1
 """Objects that each one's place is decided by, and how close points may come; all else is umap-learn's default."""
 _PACKAGES = ("umap-learn", "numba", "numpy", "scipy", "scikit-learn", "avmsf")
 """Those that an embedding depends on, down to its last digits."""
@@ -41,7 +41,7 @@ def pitches(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
     return np.quantile(_logarithms(bank)[0], levels, method="hazen") / math.sqrt(_QUANTILES)
 
 
-def rings(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
+def pitches_and_dampings(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
     """Return the frequencies as `pitches` does, and how fast each pitch decays, which tells materials apart.
 
     Frequencies alone hardly do: sound runs equally fast, to 6 %, in ceramic, glass, iron and steel. At evenly spaced
@@ -57,8 +57,11 @@ def rings(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
     return np.concatenate([pitches(bank), curve / math.sqrt(_PITCHES)])
 
 
-FEATURES: dict[str, Callable[[ModalBank], Float64[np.ndarray, " dim"]]] = {"pitches": pitches, "rings": rings}
-"""What makes a vector of a set of modes, by the names in reports."""
+FEATURES: dict[str, Callable[[ModalBank], Float64[np.ndarray, " dim"]]] = {
+    "umap": pitches,
+    "umap_dampings": pitches_and_dampings,
+}
+"""What makes a vector of a set of modes, by the metrics that rest on it."""
 
 
 def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, " modes"]]:
@@ -93,7 +96,7 @@ class MaterialSpace:
         materials: Sequence[str],
         *,
         names: Sequence[str] | None = None,
-        features: str = "pitches",
+        features: str = "umap",
         seed: int = 0,
     ) -> "MaterialSpace":
         """Return the space of labelled sets of modes, by the paper's features unless others are named.
@@ -105,9 +108,9 @@ class MaterialSpace:
         for name, labels in (("materials", materials), ("names", called)):
             if len(labels) != len(mode_sets):
                 raise EvaluationError.expected(f"one for each of {len(mode_sets)} sets", len(labels), name=name)
-        if len(mode_sets) < _FEWEST or len(set(materials)) < 2:
+        if len(mode_sets) < _MIN_OBJECTS or len(set(materials)) < 2:
             raise EvaluationError(
-                f"expected {_FEWEST} objects of two materials or more, got {len(mode_sets)} objects of "
+                f"expected {_MIN_OBJECTS} objects of two materials or more, got {len(mode_sets)} objects of "
                 f"{len(set(materials))} materials",
                 name="mode_sets",
                 value=(len(mode_sets), len(set(materials))),
@@ -154,8 +157,9 @@ class MaterialSpace:
         """Return all that the scores rest on, as JSON holds it: settings, versions, vectors and the embedding."""
         return {
             "features": self.features,
-            "umap": {"neighbors": _NEIGHBORS, "least_distance": _LEAST_DISTANCE, "seed": self.seed},
+            "umap": {"neighbors": _NEIGHBORS, "min_distance": _MIN_DISTANCE, "seed": self.seed},
             "versions": {name: version(name) for name in _PACKAGES},
+            "neighbor_accuracy": self.nearest_neighbor_accuracy(),
             "materials": list(self.materials),
             "names": list(self.names),
             "vectors": self.vectors.tolist(),
@@ -178,7 +182,7 @@ class MaterialSpace:
             model = umap.UMAP(
                 n_components=2,
                 n_neighbors=min(_NEIGHBORS, len(self.vectors) - 1),
-                min_dist=_LEAST_DISTANCE,
+                min_dist=_MIN_DISTANCE,
                 random_state=self.seed,
                 transform_seed=self.seed,
                 n_jobs=1,
