@@ -31,8 +31,13 @@ from avmsf.evaluation.runner import CaseRun, ObjectData, Progress, run_objects
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import Case, split
 from avmsf.evaluation.task import Method, Renderer, Task
+from avmsf.features.feature_field import FeatureField
+from avmsf.field.fit import fit as field_fit
+from avmsf.field.gains.attention import Attention
+from avmsf.field.sound_field import SoundField
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from factories.plate_field import QUICK
 from factories.plate_set import PlateInputs, fill_plates
 from factories.raising import raises
 
@@ -339,6 +344,31 @@ def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(
     assert torch.equal(fitted[0], run.own.modes().aligned(own.take(range(TRAIN))).sounds)
     assert torch.equal(fitted[1], peaks.take(range(TRAIN)).sounds)
     assert published.values["relative_stft"] == nearest.values["relative_stft"] != ours.values["relative_stft"]
+
+
+def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fitted = list[str]()
+
+    def trained(method: FieldMethod, task: Task) -> SoundField:
+        fitted.append(method.name)
+        task.gaussians()
+        points = FeatureField.from_contacts(task.train.contacts, count=60)
+        return field_fit(task.train, points, task.modes(), replace(QUICK, steps=1), gains=Attention())
+
+    monkeypatch.setattr(FieldMethod, "fit", trained)
+    run = run_of(strikes(STRIKES), tmp_path)
+    # What methods share is counted once, also where one asks for it by way of another.
+    monkeypatch.setattr(run.data, "gaussians", lambda views: time.sleep(0.3))
+    methods = asking(lambda task: task.field("paper")), method_named("paper"), method_named("paper-mean-gains")
+    outcomes = [run.outcome(method) for method in methods]
+    assert [each.failure for each in outcomes] == [None] * 3
+    assert fitted == ["paper"]
+    before, paper, after = (each.fit_seconds for each in outcomes)
+    assert min(before, after) > 0
+    assert paper > before
+    assert paper > after
 
 
 KILLED = """

@@ -68,6 +68,16 @@ def paper_gains(net: AttentionGains, contact: torch.Tensor) -> list[float]:
     return (gains * state["gain_scale"]).tolist()
 
 
+def test_positive_gains_are_a_softplus_of_the_papers() -> None:
+    contacts = points(70)[60:]
+    plain, positive = (network(replace(SHAPE, positive=each)).predict(contacts).mean for each in (False, True))
+    used = GAIN_SCALE > 0
+    assert bool((plain < 0).any())
+    assert bool((positive[:, used] > 0).all())
+    expected = torch.log1p(torch.exp((plain / GAIN_SCALE)[:, used]))
+    torch.testing.assert_close((positive / GAIN_SCALE)[:, used], expected)
+
+
 @pytest.mark.parametrize("bands", [0, 3])
 @pytest.mark.parametrize("layers", [0, 1, 2])
 def test_gains_are_the_papers_equations(bands, layers):

@@ -55,6 +55,19 @@ def test_a_field_comes_back_to_the_last_bit(tmp_path):
     assert not any(parameter.requires_grad for parameter in loaded.gain_field.parameters())
 
 
+def test_settings_that_earlier_versions_lack_are_stored_only_where_they_differ(tmp_path):
+    positive = plate_fit(replace(CONFIG, positive_gains=True), train=plate_impacts(forces=True))
+    for saved, stored in ((field(), False), (positive, True)):
+        save(saved, tmp_path / "plate.safetensors")
+        with safe_open(tmp_path / "plate.safetensors", framework="pt") as file:
+            record = json.loads(file.metadata()["avmsf"])
+        assert ("positive_gains" in record["config"]) == ("positive" in record["gains"]["shape"]) == stored
+        loaded = load(tmp_path / "plate.safetensors")
+        assert loaded.origin.config == saved.origin.config
+        assert torch.equal(loaded.gains(CONTACTS), saved.gains(CONTACTS))
+    assert float(loaded.gains(CONTACTS).min()) >= 0 > float(field().gains(CONTACTS).min())
+
+
 def test_a_file_names_its_tensors_and_itself(tmp_path):
     save(field(), tmp_path / "plate.safetensors")
     with safe_open(tmp_path / "plate.safetensors", framework="pt") as file:

@@ -1,5 +1,7 @@
 """Features as the settings ask for them: what the network reads of what an encoder said."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -37,6 +39,15 @@ def test_components_are_centered_and_have_the_length_that_is_asked_for() -> None
     assert (report["length"], report["variation"]) == pytest.approx((1.0, 1.0))
     beside, _ = finish_features(lifted(said), LiftConfig(components=4, feature_size=0.2))
     assert float(beside.features[:, 3:].norm(dim=1).square().mean().sqrt()) == pytest.approx(0.2)
+
+
+def test_standardized_features_have_mean_zero_and_length_one() -> None:
+    said = 40.0 + 3.0 * torch.randn(300, 16, generator=torch.Generator().manual_seed(0))
+    config = replace(PRESETS["paper"].scene.lift, standardize=True)
+    features, report = finish_features(lifted(said), config)
+    assert (report["length"], report["variation"]) == pytest.approx((1.0, 1.0))
+    # They differ from what was said in nothing else.
+    torch.testing.assert_close(features.features * (said - said.mean(0)).norm() / 300**0.5, said - said.mean(0))
 
 
 def test_features_that_say_nothing_are_refused() -> None:

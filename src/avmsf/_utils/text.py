@@ -9,9 +9,10 @@ import json
 import math
 import sys
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from avmsf.errors import AvmsfError
@@ -113,19 +114,25 @@ class RecordError(AvmsfError, ValueError):
     """A value of a file's record is missing, unknown or of another type or size: `name` is its key."""
 
 
-def record_of(example: _Record, values: Any, name: str) -> _Record:
+def record_of(example: _Record, values: Any, name: str, *, added: Mapping[str, Any] = MappingProxyType({})) -> _Record:
     """Return a record of settings from a dict of exactly the example's fields, each of the type that it has there.
 
-    `example` is a dataclass's instance; `name` is what errors call the record. Raises RecordError for fields that are
-    missing or unknown or of another type, and for what is not a dict.
+    `example` is a dataclass's instance; `name` is what errors call the record; `added` are the values of fields that
+    may be missing. Raises RecordError for other fields that are missing, for fields that are unknown or of another
+    type, and for what is not a dict.
     """
-    like(values, {}, name)
     examples = {each.name: getattr(example, each.name) for each in fields(example)}  # type: ignore[arg-type]
+    values = {each: value for each, value in added.items() if each in examples} | like(values, {}, name)
     if values.keys() != examples.keys():
         differing = sorted(values.keys() ^ examples.keys())
         got = f"{', '.join(differing)}, missing or unknown"
         raise RecordError.expected("its own keys", values.get(differing[0]), got=got, name=f"{name}.{differing[0]}")
     return type(example)(**{each: like(value, examples[each], f"{name}.{each}") for each, value in values.items()})
+
+
+def without_defaults(values: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record's values for a file, which `record_of` reads: those of `added` fields only where they differ."""
+    return {name: value for name, value in values.items() if name not in added or value != added[name]}
 
 
 def like(value: Any, example: Any, name: str) -> Any:

@@ -81,6 +81,8 @@ class FunctionMethod:
     """Makes the renderer from the task's training recordings. Raises AvmsfError where it cannot."""
     weights: str = ""
     """Digest of the weights that it starts from: results of other weights are not mixed."""
+    visual_input: VisualInput = "surface"
+    """What is read of the object's points, by the field that it asks for."""
 
 
 def method_named(name: str) -> Method:
@@ -95,7 +97,8 @@ def method_named(name: str) -> Method:
         # However it is written: results of one path are those of one method.
         name, settings = f"{kind_of(name)}:{path}", {"path": path}
     if not entry.make:
-        return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings))
+        function = partial(resolve(entry.fit), **entry.settings)
+        return FunctionMethod(name, function, visual_input=entry.visual_input)
     made: Method = resolve(entry.make)(name, **entry.settings, **settings)
     return made
 
@@ -126,21 +129,34 @@ def mean_gains(task: Task) -> MeanGains:
     return MeanGains(task.train, task.modes(), count=count, noise=True, seed=task.seed)
 
 
+def mean_trained_gains(task: Task) -> MeanGains:
+    """Return the trained field of `paper` with the mean of its own gains at the nearest training contacts."""
+    field, count = task.field("paper"), min(NEIGHBORS, len(task.train))
+    gains = 1j * field.complex_gains(task.train.contacts)
+    trained = Extraction(field.bank, gains.to(torch.complex64), field.residual)
+    # The network knows no directions: its gains are of one sign wherever a hammer came from.
+    return MeanGains(replace(task.train, directions=None), trained, count=count, noise=True, seed=task.seed)
+
+
 def spline_gains(task: Task) -> SplineGains:
     """Return the shared modes with gains by splines over the contacts."""
     return SplineGains(task.train, task.modes(), noise=True, seed=task.seed)
 
 
-def diffsound(task: Task, *, weighted: bool = False, config: DiffSoundConfig | None = None) -> DiffSound:
+def diffsound(
+    task: Task, *, weighted: bool = False, learned_residual: bool = False, config: DiffSoundConfig | None = None
+) -> DiffSound:
     """Fit the material of a simulation, from the dataset's material where it is in the table.
 
-    With `weighted` each mode has a weight of its own, fitted to the training recordings. Raises AvmsfError where the
-    object has no body, or its recordings no modes.
+    With `weighted` each mode has a weight of its own, fitted to the training recordings. With `learned_residual` its
+    noise is that which the field `paper` has learned, as in the paper, where otherwise it is measured. Raises
+    AvmsfError where the object has no body, or its recordings no modes.
     """
     config = config or DiffSoundConfig()
     if task.material in MATERIALS:
         config = replace(config, material=task.material)
-    return fit_diffsound(task.train, task.family(), task.modes(), config, weighted=weighted)
+    found = fit_diffsound(task.train, task.family(), task.modes(), config, weighted=weighted)
+    return replace(found, noise=task.field("paper").noise()) if learned_residual else found
 
 
 def sonicgauss(name: str, path: Path) -> FunctionMethod:

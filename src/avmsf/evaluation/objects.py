@@ -81,7 +81,9 @@ class ObjectInputs:
         if visual_input == "surface" and lift.encoder == AUTO:
             # Positions do not depend on the encoder.
             lift = replace(lift, encoder=DESCRIPTORS)
-        lift = replace(lift, symmetry=not visual_input.endswith("unaligned"))
+        lift = replace(
+            lift, symmetry=not visual_input.endswith("unaligned"), standardize=visual_input.endswith("standardized")
+        )
         # The ablated features lie beside those of the fields without ablation.
         name = f"{visual_input.removesuffix('-positions')}.safetensors"
         if visual_input in ("surface", "positions", "visual"):

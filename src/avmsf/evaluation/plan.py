@@ -12,7 +12,6 @@ from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.editing import Edits
-from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
 from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, table_modules
@@ -80,7 +79,7 @@ class Evaluation:
 
     def _described(self, method: Method) -> str:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        read = self.encoder is not None and isinstance(method, FieldMethod) and method.visual_input != "surface"
+        read = self.encoder is not None and input_of(method) != "surface"
         return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
 
 
@@ -164,9 +163,15 @@ def available_encoders(
     return replace(lift, encoder=DESCRIPTORS if built_in else DINO), paper
 
 
+def input_of(method: Method) -> VisualInput:
+    """Return the features that a method reads; `surface`, which needs no encoder, for one that says nothing of it."""
+    read: VisualInput = getattr(method, "visual_input", "surface")
+    return read
+
+
 def visual_inputs(methods: Sequence[Method], protocol: Protocol) -> frozenset[VisualInput]:
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
-    read = {method.visual_input for method in methods if isinstance(method, FieldMethod)}
+    read = {input_of(method) for method in methods}
     return frozenset(read | {"surface"} if protocol.scoring == "contacts" else read)
 
 

@@ -18,6 +18,7 @@ from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
 
 if TYPE_CHECKING:
     from avmsf.evaluation.splits import Choosing
+    from avmsf.evaluation.task import VisualInput
 
 AmplitudeScale = Literal["full-scale", "raw"]
 BASELINE = "knn3"
@@ -73,6 +74,8 @@ class MethodEntry:
     make: str = ""
     """Import path of what makes the method of its name and `settings`, where it is more than a function."""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    visual_input: "VisualInput" = "surface"
+    """The features that a function with `fit` reads (`task.VisualInput`), by the field that it asks for."""
     path: str = ""
     """The folder or file that it reads, for a method whose name goes on with `:` and a path."""
     is_folder: bool = False
@@ -100,7 +103,13 @@ METHODS: dict[str, MethodEntry] = {
     ),
     "knn-gains": MethodEntry("modal gains averaged over the three nearest recordings", "methods:mean_gains"),
     "spline-gains": MethodEntry("modal gains by thin-plate splines", "methods:spline_gains"),
-    "diffsound": MethodEntry("reimplementation of DiffSound, as in the paper", "methods:diffsound"),
+    "diffsound": MethodEntry("reimplementation of DiffSound with a measured residual", "methods:diffsound"),
+    "paper-diffsound": MethodEntry(
+        "reimplementation of DiffSound with the residual that `paper` learns, as in the paper",
+        "methods:diffsound",
+        settings={"learned_residual": True},
+        visual_input="paper",
+    ),
     "diffsound-weighted": MethodEntry(
         "DiffSound with a fitted weight for each mode", "methods:diffsound", settings={"weighted": True}
     ),
@@ -132,6 +141,17 @@ METHODS: dict[str, MethodEntry] = {
     "paper-unaligned": _paper("the paper's method without symmetry pooling", visual_input="paper-unaligned"),
     "paper-no-residual": _paper("the paper's method without residual noise", residual=False),
     "paper-per-contact": _paper("the paper's method with damping per contact", damping="per-contact"),
+    "paper-regularized": _paper(
+        "the paper's method with positive gains, standardized features and weight decay",
+        visual_input="paper-standardized",
+        positive_gains=True,
+        weight_decay=1.0,
+    ),
+    "paper-mean-gains": MethodEntry(
+        "the modes and noise of `paper`, with its own gains averaged over the three nearest training contacts",
+        "methods:mean_trained_gains",
+        visual_input="paper",
+    ),
     "field-grid": _network("attention network, settings chosen from a small grid", grid=True),
     "paper-grid": _paper("the paper's method with settings chosen from its lists", grid=True),
     "sonicgauss": MethodEntry(

@@ -24,7 +24,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.editing import Edited, Generated, score_edit
 from avmsf.evaluation.localization import located, write_map
-from avmsf.evaluation.methods import FieldMethod, RecordedMethod
+from avmsf.evaluation.methods import FieldMethod, RecordedMethod, method_named
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import draw_other_recording
 from avmsf.evaluation.plan import Evaluation
@@ -120,23 +120,21 @@ class CaseRun:
         self.stored_rows = evenly_spaced(len(case.test), MAX_STORED_SOUNDS) if stores_sounds else []
         self.shared = 0.0
         """Seconds of modes and features, which count to no method: whichever asks first would seem the slowest."""
+        self.fields: dict[str, tuple[Renderer, float]] = {}
+        """Fitted fields, which other methods may start from, and the seconds that each took."""
 
     def outcome(self, method: Method) -> Outcome:
         """Return what a method comes to; whatever it raises, but for an interruption, is its failure."""
-        begun, shared = time.perf_counter(), self.shared
         edits = self.evaluation.edits
         fitting = method if edits is None else edits.field_method
         published = isinstance(fitting, FieldMethod) and fitting.published
-        recordings = self.own if isinstance(fitting, FieldMethod) and not published else self.scored
+        recordings = self._recordings(fitting)
         try:
-            for each in (self.scored, recordings):
-                self._shared(each.align)()
-            task = self._task(recordings)
+            task = self._aligned_task(recordings)
             if edits is not None:
                 field = self._shared(self._stored_field)(edits.field_method, task)
                 task = replace(task, edit=edits.request(self.data.identifier, self.case, field))
-            renderer = expect_renderer(method.fit(task))
-            fit_seconds = time.perf_counter() - begun - (self.shared - shared)
+            renderer, fit_seconds = self._fitted(method, task)
             begun = time.perf_counter()
             with torch.no_grad():
                 sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
@@ -165,6 +163,26 @@ class CaseRun:
             report,
             maps,
         )
+
+    def _recordings(self, method: Method) -> "_Recordings":
+        return self.own if isinstance(method, FieldMethod) and not method.published else self.scored
+
+    def _fitted(self, method: Method, task: Task) -> tuple[Renderer, float]:
+        """Return a method's renderer and the seconds of its fit, without those of what methods share."""
+        if method.name in self.fields:
+            return self.fields[method.name]
+        begun, shared = time.perf_counter(), self.shared
+        renderer = expect_renderer(method.fit(task))
+        found = renderer, time.perf_counter() - begun - (self.shared - shared)
+        if isinstance(method, FieldMethod):
+            self.fields[method.name] = found
+        return found
+
+    def _field(self, name: str) -> SoundField:
+        method = method_named(name)
+        renderer, _ = self._fitted(method, self._aligned_task(self._recordings(method)))
+        assert isinstance(renderer, SoundField)
+        return renderer
 
     def described(self, known: CaseRecord) -> CaseRecord:
         """Return the case's record with the recordings' files and with the time of modes and features so far."""
@@ -195,7 +213,9 @@ class CaseRun:
             maps[test.names[row]] = file
         return dict(errors), maps
 
-    def _task(self, recordings: _Recordings) -> Task:
+    def _aligned_task(self, recordings: _Recordings) -> Task:
+        for each in (self.scored, recordings):
+            self._shared(each.align)()
         data, views = self.data, self.case.views
         return Task(
             name=data.identifier,
@@ -209,6 +229,7 @@ class CaseRun:
             other_recording=self._shared(data.other_recording),
             family=self._shared(data.family),
             gaussians=self._shared(lambda: data.gaussians(views)),
+            field=self._shared(self._field),
             material=data.facts.material,
             device=self.evaluation.device,
         )

@@ -7,10 +7,10 @@ paper's tables allow, is given too.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from statistics import fmean, geometric_mean, stdev
+from statistics import fmean, geometric_mean, median, stdev
 from typing import Any
 
 from avmsf._utils.text import counted, format_number
@@ -59,31 +59,37 @@ def labels_of(records: Iterable[ObjectRecord]) -> tuple[str, ...]:
     return max(found, key=len, default=())
 
 
-def object_values(record: ObjectRecord, label: str) -> dict[str, dict[str, float]]:
-    """Return an object's figures in one experiment by method and metric: means over its contacts.
+def object_values(
+    record: ObjectRecord, label: str, average: Callable[[Sequence[float]], float] = fmean
+) -> dict[str, dict[str, float]]:
+    """Return an object's figures in one experiment by method and metric: means over its contacts, or other averages.
 
     A method that failed in any of the experiment's parts has none. `CHOSEN_ON_TEST` counts as a method.
     """
     keys = {case.key for case in record.cases if case.label == label}
-    table = {}
+    pooled: dict[str, dict[str, list[float]]] = {}
     for method in dict.fromkeys(each.method for each in record.outcomes):
         outcomes = [each for each in record.outcomes if each.method == method and each.case in keys]
         if len(outcomes) < len(keys) or any(each.failure is not None for each in outcomes):
             continue
-        found: dict[str, list[float]] = {}
+        found = pooled.setdefault(method, {})
         for each in outcomes:
             for metric, values in (*each.values.items(), *((name, (one,)) for name, one in each.figures.items())):
                 found.setdefault(metric, []).extend(value for value in values if value is not None)
-        table[method] = {metric: math.fsum(values) / len(values) for metric, values in found.items() if values}
-    forms = [table[form] for form in DAMPING_FORMS if "envelope" in table.get(form, {})]
+    forms = [pooled[form] for form in DAMPING_FORMS if pooled.get(form, {}).get("envelope")]
     if len(forms) == len(DAMPING_FORMS):
-        table[CHOSEN_ON_TEST] = min(forms, key=lambda values: values["envelope"])
-    return table
+        pooled[CHOSEN_ON_TEST] = min(forms, key=lambda found: fmean(found["envelope"]))
+    return {
+        method: {metric: average(values) for metric, values in found.items() if values}
+        for method, found in pooled.items()
+    }
 
 
-def values_of(records: Iterable[ObjectRecord], label: str) -> dict[str, dict[str, dict[str, float]]]:
-    """Return all objects' figures in one experiment; objects without any are left out."""
-    figures = {record.identifier: object_values(record, label) for record in records}
+def values_of(
+    records: Iterable[ObjectRecord], label: str, average: Callable[[Sequence[float]], float] = fmean
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Return all objects' figures in one experiment, as `object_values`; objects without any are left out."""
+    figures = {record.identifier: object_values(record, label, average) for record in records}
     return {identifier: found for identifier, found in figures.items() if found}
 
 
@@ -128,8 +134,9 @@ def summarize(
 ) -> dict[str, Any]:
     """Return all figures as plain values, of which the same records always give the same.
 
-    `methods`, `standard_errors`, `ratio_to_knn3` and the like are of the main experiment, `cases` of each; `subsets`
-    names groups of objects that have means of their own; `missing` are the results that are yet to be computed.
+    `methods`, `standard_errors`, `ratio_to_knn3` and the like are of the main experiment, `cases` of each; `medians`
+    are over an object's contacts, and means of these over objects; `subsets` names groups of objects that have means
+    of their own; `missing` are the results that are yet to be computed.
     """
     labels = labels_of(records)
     tables = {label: values_of(records, label) for label in labels}
@@ -145,6 +152,7 @@ def summarize(
         ),
         "methods": _plain(found),
         "standard_errors": _plain(found, "standard_error"),
+        "medians": _plain(means(values_of(records, labels[0], median))) if labels else {},
         "counts": {method: max(each.objects for each in figures.values()) for method, figures in found.items()},
         f"ratio_to_{BASELINE}": ratios(main),
         f"ratio_of_means_to_{BASELINE}": ratios(main, of_means=True),
@@ -236,6 +244,7 @@ def sections(
         parts.append(report.main_table())
         if any(BASELINE in methods for methods in report.main.values()):
             parts.append(report.ratio_table())
+        parts.append(report.median_table())
         if len(report.tables) > 1:
             parts += [report.case_table(metric) for metric in report.shown]
     return [*parts, report.times(), report.failures()]
@@ -250,13 +259,12 @@ class _Report:
     @cached_property
     def tables(self) -> dict[str, Values]:
         """Values of each experiment by its label, the main one first, with the methods in the requested order."""
+        return {label: self._ordered(values_of(self.records, label)) for label in labels_of(self.records)}
+
+    def _ordered(self, table: Values) -> Values:
         order = [*self.identity["methods"], CHOSEN_ON_TEST]
         return {
-            label: {
-                name: {method: values[method] for method in order if method in values}
-                for name, values in values_of(self.records, label).items()
-            }
-            for label in labels_of(self.records)
+            name: {method: values[method] for method in order if method in values} for name, values in table.items()
         }
 
     @property
@@ -350,6 +358,12 @@ class _Report:
         )
         columns = ("method", *(METRICS[metric].heading for metric in falling))
         return Section(f"Ratio to {BASELINE}", (text,), columns, tuple(rows))
+
+    def median_table(self) -> Section:
+        found = means(self._ordered(values_of(self.records, str(self.label), median)))
+        rows = [(method, *(_mean(values.get(metric)) for metric in self.shown)) for method, values in found.items()]
+        text = "Medians over an object's test recordings, which single contacts do not decide, then means over objects."
+        return Section("Medians", (text,), ("method", *(METRICS[metric].heading for metric in self.shown)), tuple(rows))
 
     def case_table(self, metric: str) -> Section:
         found = {label: means(table) for label, table in self.tables.items()}

@@ -80,11 +80,14 @@ def report_of(renderer: Renderer) -> dict[str, Any]:
     return dict(getattr(getattr(renderer, "origin", renderer), "report", {}))
 
 
-VisualInput = Literal["surface", "positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned"]
+VisualInput = Literal[
+    "surface", "positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned", "paper-standardized"
+]
 """Features of an object's points. `surface`: positions of points on its mesh, or as `positions` without one.
 `positions`: only the positions of the points that visual features are of. `visual`: positions with visual features,
 pooled over the object's symmetries; `unaligned`: without pooling. `paper`: the paper's features of Gaussians;
-`paper-positions`: only their positions; `paper-unaligned`: without pooling."""
+`paper-positions`: only their positions; `paper-unaligned`: without pooling; `paper-standardized`: of mean 0 and
+length 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +143,8 @@ class Task:
     """Computes the FE models of the object's surface, of any material. Raises AvmsfError likewise."""
     gaussians: Callable[[], GaussianCloud]
     """Fits Gaussians to the object's views. Raises AvmsfError without views."""
+    field: Callable[[str], SoundField]
+    """Fits the field of the method with that name to the case's recordings, once for all methods. Raises AvmsfError."""
     material: str | None = None
     """Material of the object in the dataset, in lower case; None where it is unknown."""
     device: str | None = None

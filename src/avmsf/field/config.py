@@ -12,6 +12,9 @@ AUTO, NETWORK = "auto", "network"
 GainModelName = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
 """How gains vary over an object: see `avmsf.field.gains.estimator`."""
 
+ADDED_SETTINGS = {"positive_gains": False, "positive": False}
+"""Settings of a fit and of the network that the first field files lack, and what they stand for there: files hold them
+only where they differ, so that earlier versions read all others."""
 _COUNTS = ("clusters", "width", "hidden", "interleave", "early")
 _POSITIVE = ("feature_scale", "warmup_rate", "learning_rate")
 
@@ -36,6 +39,8 @@ class AttentionShape:
     """Let the dampings depend on the contact too."""
     projection: bool = False
     """Project what attention reads before it is joined with the contact's feature."""
+    positive: bool = False
+    """Let gains be positive."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,8 @@ class FitConfig:
     """Project what attention reads before it is joined with the contact's feature (paper)."""
     feature_scale: float = 4.0
     """Factor on the features as the network reads them: larger lets gains change over shorter distances."""
+    positive_gains: bool = False
+    """Pass the network's output through a softplus, as the gains of the paper's regression are not negative either."""
     warmup_rate: float = 3e-3
     """Adam's step at the start of the warm-up; it falls on a cosine to a tenth."""
     learning_rate: float = 1e-3
@@ -133,7 +140,7 @@ class FitConfig:
     def shape(self) -> AttentionShape:
         """Sizes of the network, with shared damping."""
         sizes = (self.clusters, self.bands, self.width, self.hidden, self.layers, self.feature_scale)
-        return AttentionShape(*sizes, projection=self.projection)
+        return AttentionShape(*sizes, projection=self.projection, positive=self.positive_gains)
 
     def resolutions(self, sample_rate: float) -> tuple[tuple[int, ...], tuple[int, ...], int]:
         """Return FFT sizes, hops and the early length in samples at a sample rate, Hz."""

@@ -22,11 +22,11 @@ import torch
 from torch import Tensor
 
 from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
-from avmsf._utils.text import RecordError, count_of, like, record_of
+from avmsf._utils.text import RecordError, count_of, like, record_of, without_defaults
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfError, FieldFileError
-from avmsf.field.config import FitConfig
+from avmsf.field.config import ADDED_SETTINGS, FitConfig
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
 from avmsf.field.header import FIELD, checked_report
@@ -109,7 +109,7 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         capture=like(origin["capture"], "", "origin.capture"),
         trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
         per_newton=like(origin["per_newton"], True, "origin.per_newton"),
-        config=record_of(FitConfig(), record["config"], "config"),
+        config=record_of(FitConfig(), record["config"], "config", added=ADDED_SETTINGS),
         report=checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
         settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
     )
@@ -170,7 +170,7 @@ def _record(field: SoundField) -> dict[str, Any]:
         "alignment": None
         if alignment is None
         else {"modes": len(alignment.phases.bank), "names": alignment.names, "keys": alignment.keys},
-        "config": asdict(field.origin.config),
+        "config": without_defaults(asdict(field.origin.config), ADDED_SETTINGS),
         "origin": origin | {"settings": asdict(field.origin.settings)},
     }
 

@@ -72,6 +72,8 @@ class LiftConfig:
     """Average over the views that see a point: weighted by visibility, or plain (paper)."""
     components: int = 32
     """Principal components of the features to use; 0 uses the features unchanged, at the encoder's own scale."""
+    standardize: bool = False
+    """Without components, subtract the features' mean over the points and scale them to a mean square length of 1."""
     symmetry: bool = True
     """Average the features over the symmetries of the object's shape."""
     iterations: int = 3

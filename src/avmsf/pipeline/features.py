@@ -1,6 +1,7 @@
 """From views to the features that a gain field reads: described, lifted onto the object, pooled over symmetries."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -85,6 +86,8 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> tuple[FeatureField, d
         features = resize(reduce(features, config.components), config.feature_size if config.positions else 1.0)
     else:
         expect_varied(features)
+        if config.standardize:
+            features = resize(replace(features, features=features.features - features.features.mean(0)), 1.0)
     report: dict[str, Any] = {
         "encoder": lifted.features.encoder,
         "points": len(features.points),

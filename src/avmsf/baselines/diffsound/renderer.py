@@ -57,11 +57,10 @@ class DiffSound:
     """Their damped frequencies, below half the sample rate, and dampings."""
     weight: Float64[Tensor, " modes"]
     """Level times w_i: the recordings' unit per simulated displacement."""
-    residual: Residual
+    noise: Float[Tensor, " samples"]
+    """What is added to the modes' sounds, as long as they are."""
     sample_rate: float
     """Hz."""
-    samples: int
-    """Length of rendered sounds."""
 
     @property
     def report(self) -> dict[str, Any]:
@@ -90,9 +89,9 @@ class DiffSound:
         """Return the sound of an impact at each contact, in the unit of the training sounds."""
         gains = self.gains(contacts, directions=directions).float()
         sounds = synthesize(
-            gains, self.bank.frequency, self.bank.damping, samples=self.samples, sample_rate=self.sample_rate
+            gains, self.bank.frequency, self.bank.damping, samples=len(self.noise), sample_rate=self.sample_rate
         )
-        return sounds + low_fluctuation_noise(self.residual.magnitude, samples=self.samples).to(sounds)
+        return sounds + self.noise.to(sounds)
 
     def distance(
         self, gains: Float64[Tensor, "points modes"], sound: Float[Tensor, " samples"]
@@ -102,7 +101,7 @@ class DiffSound:
         The sound starts about at its onset and has the renderer's sample rate. Raises LocationError where it is silent
         or not finite.
         """
-        audible = sound.detach().cpu()[: self.samples].double()
+        audible = sound.detach().cpu()[: len(self.noise)].double()
         if not bool(torch.isfinite(audible).all()) or not bool(audible.any()):
             wanted, advice = "finite samples that are not all 0", "record the impact again"
             raise LocationError.expected(wanted, got="others", name="sound", advice=advice)
@@ -147,7 +146,8 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
     elastic = replace(elastic, frequency=elastic.frequency[inside], shapes=elastic.shapes[:, inside].contiguous())
     bank = ModalBank(audible[inside], damping[inside])
     weight = _weights(_displacements(elastic, bank, train.contacts, train.directions), bank, train, weighted=weighted)
-    return DiffSound(fit, elastic, bank, weight, residual, train.sample_rate, train.sounds.shape[1])
+    noise = low_fluctuation_noise(residual.magnitude, samples=train.sounds.shape[1])
+    return DiffSound(fit, elastic, bank, weight, noise, train.sample_rate)
 
 
 def _displacements(

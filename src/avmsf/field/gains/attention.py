@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
-from avmsf._utils.text import RecordError, count_of, like, record_of
+from avmsf._utils.text import RecordError, count_of, like, record_of, without_defaults
 from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.config import AttentionShape
+from avmsf.field.config import ADDED_SETTINGS, AttentionShape
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import Directions, GainModel, Gains, Points
 from avmsf.field.trainer import FittedGains, GainEstimator, Trainer
@@ -100,7 +101,10 @@ class AttentionGains(TrainableGains, GainModel):
         attention = torch.softmax(query @ key.T / math.sqrt(self.shape.width), dim=1)
         hidden = self.head(torch.cat([self.project(attention @ value), feature], dim=1))
         factors = None if self.to_dampings is None else torch.exp(self.to_dampings(hidden))
-        return Gains(self.to_gains(hidden) * self.gain_scale, damping=factors)
+        gains = self.to_gains(hidden)
+        if self.shape.positive:
+            gains = softplus(gains)
+        return Gains(gains * self.gain_scale, damping=factors)
 
     def finished(self, order: Int[Tensor, " modes"]) -> "AttentionGains":
         """Put the network's modes in the given order and return it, ready for use."""
@@ -119,7 +123,7 @@ class AttentionGains(TrainableGains, GainModel):
             "dim": self.features.shape[1],
             "modes": self.gain_scale.shape[0],
             "encoder": self.encoder,
-            "shape": asdict(self.shape),
+            "shape": without_defaults(asdict(self.shape), ADDED_SETTINGS),
         }
 
     def tensors(self) -> dict[str, Tensor]:
@@ -142,7 +146,7 @@ class AttentionGains(TrainableGains, GainModel):
     def _empty(cls, record: Mapping[str, Any]) -> "AttentionGains":
         points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
         encoder = like(record["encoder"], "", "encoder")
-        shape = record_of(_EXAMPLE, record["shape"], "shape")
+        shape = record_of(_EXAMPLE, record["shape"], "shape", added=ADDED_SETTINGS)
         if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
             most = max(shape.layers, shape.bands)
             raise RecordError(f"layers, bands: expected at most {_MAX_LAYERS}, got {most}", name="layers", value=most)
