@@ -277,6 +277,9 @@ def test_the_papers_grid_has_all_its_combinations():
     names = ("clusters", "learning_rate", "steps", "early_weight", "damping")
     assert len(candidates) == len({tuple(getattr(each, name) for name in names) for each in candidates}) == 162
     assert {each.warmup_steps for each in candidates} == {TINY.warmup_steps}
+    # Adam has one rate in the paper.
+    for each in candidates:
+        assert each.warmup_rate == each.correction_rate == each.noise_rate == each.learning_rate
 
 
 def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training(monkeypatch):

@@ -282,16 +282,27 @@ class Grid:
     """Steps end to end; on a whole object's recordings a step is an epoch."""
     early_weight: tuple[float, ...]
     damping: tuple[Literal["shared", "per-contact"], ...] = ("shared", "per-contact")
+    other_rates: tuple[str, ...] = ()
+    """Settings that have the learning rate's value, too."""
 
     def candidates(self, base: FitConfig) -> Iterator[FitConfig]:
         """Yield `base` with every combination of the values, the last setting changing fastest."""
         values = asdict(self)
+        others = values.pop("other_rates")
         for chosen in itertools.product(*values.values()):
-            yield replace(base, **dict(zip(values, chosen, strict=True)))
+            settings = dict(zip(values, chosen, strict=True))
+            yield replace(base, **settings, **dict.fromkeys(others, settings["learning_rate"]))
 
 
-PAPER_GRID = Grid((128, 256, 512), (1e-2, 5e-3, 1e-3), (5000, 10000, 20000), (0.5, 1.0, 2.0))
-"""The paper's lists (supplement, training setup): 162 fits an object, to run where there is time for them."""
+PAPER_GRID = Grid(
+    (128, 256, 512),
+    (1e-2, 5e-3, 1e-3),
+    (5000, 10000, 20000),
+    (0.5, 1.0, 2.0),
+    other_rates=("warmup_rate", "correction_rate", "noise_rate"),
+)
+"""The paper's lists (supplement, training setup), with one rate of Adam for all parameters: 162 fits an object, to run
+where there is time for them."""
 QUICK_GRID = Grid((8, 16, 32), (3e-3, 1e-3), (150,), (1.0,))
 """What of it matters at the quick recipe's sizes: 12 fits an object."""
 
@@ -373,7 +384,7 @@ class FieldMethod:
             "validated": True,
             "validation_contacts": list(held.names),
             "validation_envelope": errors,
-            "chosen": {each.name: getattr(chosen, each.name) for each in fields(grid)},
+            "chosen": {each.name: getattr(chosen, each.name) for each in fields(grid) if hasattr(chosen, each.name)},
         }
 
 
