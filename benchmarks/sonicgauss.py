@@ -2,24 +2,13 @@
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
-from avmsf.baselines.sonicgauss.small import (
-    PatchCodec,
-    SmallConfig,
-    SmallSonicGauss,
-    SmallWeights,
-    clip_loss,
-    log_magnitudes,
-    object_tokens,
-    spectra,
-    visible,
-)
-from avmsf.baselines.sonicgauss.training import TrainingConfig, train
+from avmsf.baselines.sonicgauss.small import SmallConfig, object_tokens, train_small, visible
+from avmsf.baselines.sonicgauss.training import TrainingConfig
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, SceneError, SimulationError
 from avmsf.fem.material import MATERIALS
@@ -42,8 +31,6 @@ SPLAT = SplatConfig(steps=300, degree=1, start_points=3000, gaussians=4000, halv
 _AZIMUTHS, _PIXELS = 8, 96
 PRETRAINING = TrainingConfig(steps=1000, batch=24, rate=1e-3, warmup=100)
 """A quarter of an hour on one core."""
-_CURVE = 20
-"""Points of the loss curve that is kept."""
 
 
 def training_recipes(count: int, *, seed: int = 0, contacts: int = 32) -> tuple[ObjectRecipe, ...]:
@@ -81,48 +68,6 @@ def training_objects(recipes: Sequence[ObjectRecipe]) -> Iterator[tuple[Gaussian
         yield cloud, simulation.capture.impacts
 
 
-def pretrain(
-    objects: Iterable[tuple[GaussianCloud, Impacts]],
-    sizes: SmallConfig,
-    config: TrainingConfig = PRETRAINING,
-    *,
-    seed: int = 0,
-) -> SmallWeights:
-    """Train on objects' recordings. Raises EvaluationError where there is no object."""
-    begun = time.process_time()
-    tokens, places, logs = [], [], []
-    for cloud, impacts in objects:
-        seen = visible(cloud)
-        found = spectra(impacts.sounds, impacts.sample_rate)
-        tokens.append(object_tokens(seen, count=sizes.tokens))
-        places.append(seen.places(impacts.contacts.float()))
-        logs.append(log_magnitudes(found, float(found.abs().max())))
-    if not tokens:
-        raise EvaluationError("expected objects to train on, got none", name="objects", value=0)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = SmallSonicGauss(sizes)
-    features = torch.stack(tokens)
-    network.mean.copy_(features.mean((0, 1)))
-    network.deviation.copy_(features.std((0, 1)).clamp(min=1e-3))
-    codec = PatchCodec.of(logs, seed=seed)
-    owners = torch.cat([torch.full((len(each),), row) for row, each in enumerate(places)])
-    latents = torch.cat([codec.encode(each) for each in logs])
-    logs.clear()
-    loss = clip_loss(network.train(), features, owners, torch.cat(places), latents)
-    losses = train(network.parameters(), loss, len(owners), config, seed=seed)
-    report = {
-        "objects": len(tokens),
-        "clips": len(owners),
-        "steps": config.steps,
-        "batch": config.batch,
-        "seed": seed,
-        "losses": [round(float(part.mean()), 4) for part in np.array_split(losses, min(_CURVE, len(losses)))],
-        "seconds": round(time.process_time() - begun, 1),
-    }
-    return SmallWeights(network.eval(), codec, report)
-
-
 def training(settings: Settings) -> Iterator[Record]:
     """Make the weights of sonicgauss-small in the file `--weights`: mean losses of the parts of training, in order.
 
@@ -134,9 +79,10 @@ def training(settings: Settings) -> Iterator[Record]:
     begun = time.process_time()
     objects = list(training_objects(training_recipes(2 if settings.quick else OBJECTS)))
     made = time.process_time() - begun
-    found = pretrain(objects, sizes, config)
+    found = train_small(objects, sizes, config)
+    trained = time.process_time() - begun - made
     found.write(settings.weights)
     losses = found.report["losses"]
     for number, loss in enumerate(losses, 1):
         yield from records({"loss": loss}, group=f"{number / len(losses):.0%} of the steps")
-    yield from records({"objects_seconds": made, "training_seconds": found.report["seconds"]})
+    yield from records({"objects_seconds": made, "training_seconds": trained})

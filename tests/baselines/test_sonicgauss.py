@@ -24,12 +24,11 @@ from avmsf.baselines.sonicgauss.small import (
     log_magnitudes,
     sounds_of,
     spectra,
+    train_small,
 )
 from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, draw_times, flow_loss, integrate, train
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
-from avmsf.simulate.recipe import SIM20
-from benchmarks.sonicgauss import pretrain, training_recipes
 from factories.raising import raises
 from factories.sonicgauss_cases import SECONDS, cloud, impacts
 
@@ -39,7 +38,7 @@ TINY = SmallConfig(width=16, heads=2, blocks=1, encoder_blocks=1, tokens=4), Tra
 @cache
 def weights(seed: int = 0) -> SmallWeights:
     objects = [(cloud(seed=row), impacts(seed=row)) for row in range(2)]
-    return pretrain(objects, *TINY, seed=seed)
+    return train_small(objects, *TINY, seed=seed)
 
 
 def tuned(level: float = 1.0, seed: int = 0) -> TunedRenderer:
@@ -269,17 +268,6 @@ def test_a_sound_depends_on_its_contact_the_seed_and_the_level_alone(monkeypatch
 def test_silence_is_refused():
     with raises(EvaluationError, name="sounds", value=0.0):
         fit_small(weights(), cloud(), replace(impacts(), sounds=torch.zeros(6, 12_000)))
-
-
-def test_no_training_object_is_one_of_sim_20():
-    recipes = training_recipes(60, seed=0)
-    known = {(recipe.kind, recipe.material) for recipe in SIM20.values()}
-    seeds = {recipe.seed for recipe in SIM20.values()}
-    assert not {(recipe.kind, recipe.material) for recipe in recipes} & known
-    assert not {recipe.seed for recipe in recipes} & seeds
-    assert len({recipe.seed for recipe in recipes}) == 60
-    assert training_recipes(60, seed=0) == recipes
-    assert not {recipe.seed for recipe in training_recipes(60, seed=1)} & {recipe.seed for recipe in recipes}
 
 
 def test_the_method_names_the_command_where_there_are_no_weights(tmp_path):

@@ -8,7 +8,7 @@ are found by Griffin and Lim's algorithm.
 import copy
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from avmsf.baselines.sonicgauss.training import (
     flow_loss,
     integrate,
     load_tensors,
+    train,
     tune,
 )
 from avmsf.capture.impacts import Impacts
@@ -56,6 +57,8 @@ LATENTS = 32
 """Principal components of a patch; further ones hold the noise of single recordings."""
 FLOOR = -4.0
 """Decadic logarithm of the least magnitude, over the object's largest."""
+_CURVE = 20
+"""Points of the loss curve that weights keep."""
 _ITERATIONS, _MOMENTUM = 32, 0.99 / 1.99
 """Of the fast Griffin-Lim algorithm (Perraudin et al. 2013), as torchaudio has them by default."""
 
@@ -318,8 +321,38 @@ def clip_loss(
     return loss
 
 
+def train_small(
+    objects: Iterable[tuple[GaussianCloud, Impacts]], sizes: SmallConfig, config: TrainingConfig, *, seed: int = 0
+) -> SmallWeights:
+    """Train from scratch on objects' Gaussians and recordings. Raises EvaluationError where there is no object."""
+    tokens, places, logs = [], [], []
+    for cloud, impacts in objects:
+        seen = visible(cloud)
+        found = spectra(impacts.sounds, impacts.sample_rate)
+        tokens.append(object_tokens(seen, count=sizes.tokens))
+        places.append(seen.places(impacts.contacts.float()))
+        logs.append(log_magnitudes(found, float(found.abs().max())))
+    if not tokens:
+        raise EvaluationError.expected("objects to train on", 0, name="objects")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = SmallSonicGauss(sizes)
+    features = torch.stack(tokens)
+    network.mean.copy_(features.mean((0, 1)))
+    network.deviation.copy_(features.std((0, 1)).clamp(min=1e-3))
+    codec = PatchCodec.of(logs, seed=seed)
+    owners = torch.cat([torch.full((len(each),), row) for row, each in enumerate(places)])
+    latents = torch.cat([codec.encode(each) for each in logs])
+    logs.clear()
+    loss = clip_loss(network.train(), features, owners, torch.cat(places), latents)
+    losses = torch.as_tensor(train(network.parameters(), loss, len(owners), config, seed=seed))
+    report = {"objects": len(tokens), "clips": len(owners), "steps": config.steps, "batch": config.batch, "seed": seed}
+    parts = torch.tensor_split(losses, min(_CURVE, len(losses)))
+    return SmallWeights(network.eval(), codec, report | {"losses": [round(float(each.mean()), 4) for each in parts]})
+
+
 def fit_small(
-    weights: SmallWeights, cloud: GaussianCloud, train: Impacts, config: TrainingConfig = TUNING, *, seed: int = 0
+    weights: SmallWeights, cloud: GaussianCloud, recordings: Impacts, config: TrainingConfig = TUNING, *, seed: int = 0
 ) -> TunedRenderer:
     """Fine-tune all of the network to an object's recordings, by the objective that it was trained with.
 
@@ -328,11 +361,11 @@ def fit_small(
     """
     network, codec, seen = copy.deepcopy(weights.network), weights.codec, visible(cloud)
     features = object_tokens(seen, count=network.config.tokens)[None]
-    found = spectra(train.sounds, train.sample_rate)
+    found = spectra(recordings.sounds, recordings.sample_rate)
     largest, phases = float(found.abs().max()), found.mean(0).angle()
-    expect_sound(largest, train)
+    expect_sound(largest, recordings)
     latents = codec.encode(log_magnitudes(found, largest))
-    owners = torch.zeros(len(train), dtype=torch.int64)
+    owners = torch.zeros(len(recordings), dtype=torch.int64)
     noise = torch.randn(1, PATCHES, LATENTS, generator=torch.Generator().manual_seed(seed))
 
     def generate(place: Float[Tensor, "1 3"], steps: int) -> Float[Tensor, " samples"]:
@@ -340,7 +373,7 @@ def fit_small(
         flown = integrate(lambda state, times: network(state, times, tokens), noise, steps=steps)
         # Training has seen no magnitude above the largest.
         magnitudes = largest * 10.0 ** codec.decode(flown).clamp(max=0.0)
-        return sounds_of(magnitudes, phases, sample_rate=train.sample_rate, samples=train.sounds.shape[1])[0]
+        return sounds_of(magnitudes, phases, sample_rate=recordings.sample_rate, samples=recordings.sounds.shape[1])[0]
 
-    loss = clip_loss(network.train(), features, owners, seen.places(train.contacts), latents)
-    return tune(network, network.parameters(), loss, train, config, seed=seed, seen=seen, generate=generate)
+    loss = clip_loss(network.train(), features, owners, seen.places(recordings.contacts), latents)
+    return tune(network, network.parameters(), loss, recordings, config, seed=seed, seen=seen, generate=generate)
