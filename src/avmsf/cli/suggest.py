@@ -95,6 +95,8 @@ def run(options: Options) -> int:
     title = f"where to record next: uncertainty of the gains now {format_number(found.before)}"
     lines = [table(title, [headings.get(each, each) for each in columns], cells, words=1 + (names is not None))]
     lines.append(_EXPLANATION)
+    if len(rows) < options.count:
+        lines.append(f"{options.count} asked for: no other candidate is without a recording")
     if found.unreachable:
         lines.append(f"left out: {counted(found.unreachable, 'position')} that no hammer reaches from outside")
     if found.directions is not None:

@@ -66,7 +66,8 @@ def suggest(
     unseen: bool = False,
     progress: bool = True,
 ) -> Suggestions:
-    """Return the `count` contacts that lower the expected error of the whole field most, each given those before it.
+    """Return the `count` contacts that lower the expected error of the whole field most, each given those before it, or
+    all that have no recording where there are fewer.
 
     `candidates` are the places to choose from (meters, on the surface; contacts of the fit are passed over); without
     them they are points spread over the surface that a hammer can strike from outside (`hammer_access`). `directions`
@@ -74,7 +75,7 @@ def suggest(
     of photographs has points where they show the object; with `unseen`, error and candidates are those of all of the
     surface of the field's body instead. With `progress`, a terminal shows that it works.
 
-    Raises FitError for gains without a posterior, unfit arguments, fewer candidates than contacts asked for, places
+    Raises FitError for gains without a posterior, unfit arguments, no candidate without a recording, places
     none of which a hammer gets to, and `unseen` without a body.
     """
     count = as_count(count, "count", raising=FitError)
@@ -87,7 +88,7 @@ def suggest(
         wanted, advice = "a field with the object's surface", "leave unseen out, or give candidates"
         raise FitError.expected(wanted, True, got="one without", name="unseen", advice=advice)
     _expect_directions(directions, given)
-    with ProgressDisplay(quiet=not progress) as display:
+    with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
         points = surface[farthest_points(surface, min(MAX_POINTS, len(surface)))].double()
@@ -98,10 +99,9 @@ def suggest(
             _expect_on_surface(pool, gains.points.double())
         same = _SAME_POSITION_RATIO * float((points.amax(0) - points.amin(0)).norm())
         allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
-        left = int(allowed.sum())
-        if left < count:
-            wanted, advice = f"{count} or more without a recording", "ask for fewer, or give more candidates"
-            raise FitError.expected(wanted, left, got=f"{left} of {len(pool)}", name="candidates", advice=advice)
+        if not bool(allowed.any()):
+            wanted, got = "a place without a recording", f"none of {len(pool)}"
+            raise FitError.expected(wanted, 0, got=got, name="candidates", advice="give other candidates")
         kept, most = torch.arange(len(pool)), max(MAX_CANDIDATES, count)
         if len(pool) > most:
             kept = torch.nonzero(allowed).flatten()
@@ -147,7 +147,7 @@ class _ExpectedError:
     def choose(self, allowed: Bool[Tensor, " candidates"], count: int, *, same: float) -> tuple[list[int], list[float]]:
         """Return the rows of `count` allowed candidates that lower the error most in turn, and the error after each.
 
-        They are taken as measured. Raises FitError where fewer lie farther apart than `same`.
+        They are taken as measured; fewer where fewer lie farther apart than `same`.
         """
         rows, after = list[int](), list[float]()
         while len(rows) < count and bool(allowed.any()):
@@ -158,9 +158,6 @@ class _ExpectedError:
             self._measure(rows[-1])
             allowed = allowed & ((self.candidates - self.candidates[rows[-1]]).norm(dim=1) > same)
             after.append(self.total())
-        if len(rows) < count:
-            wanted = f"{count} different positions or more"
-            raise FitError.expected(wanted, len(rows), name="candidates", advice="ask for fewer")
         return rows, after
 
     def _measure(self, row: int) -> None:
