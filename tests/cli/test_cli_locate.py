@@ -224,7 +224,8 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         soundfile.write(tmp_path / name, sound, RATE)
-    # The field was fitted to a contact of the fourth; a row may have an absolute path, and the third none.
+    # The fourth is a recording of the field's capture; a row may have an absolute path, and the third none.
+    (tmp_path / "capture.toml").write_text('name = "plate"')
     fitted = positional().contacts[0].double()
     rows = ("b/hit.wav", points[SECOND_PLACE]), (tmp_path / "a" / "hit.wav", points[STRUCK]), ("fitted.wav", fitted)
     table = tmp_path / "impacts.csv"
@@ -242,6 +243,10 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_
     wanted = {"impacts": 2, "training": 1, "median_error": 0.5 * distance, "in_region": 0.5}
     wanted |= {"rmed": relative, "rmed_posterior": relative}
     assert results["summary"] == pytest.approx(wanted, abs=1e-6)
+    # A recording of the same name, at the same contact, is another one where it is of another capture.
+    (tmp_path / "capture.toml").write_text('name = "other plate"')
+    results, _ = located(place, capsys, paths[3], "--true-contact", *map(str, fitted.tolist()))
+    assert results["impacts"][0]["training"] is False
 
 
 @pytest.mark.parametrize(

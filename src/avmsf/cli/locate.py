@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from avmsf._utils.text import counted, format_number
-from avmsf.capture.settings import CaptureSettings
+from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.cli.options import Common, Flag, Number, Unit
 from avmsf.cli.output import doing, next_command, note, print_json, say, show
 from avmsf.cli.paths import ContactTable, Existing, FieldFile, OutputError, PictureFolder, SettingsFile, arg
@@ -105,7 +105,7 @@ def run(options: Options) -> int:
         for values, contact in answers:
             if truth is not None and contact is not None:
                 values |= _error(contact, truth, options.probability)
-                values["training"] = _is_training(field, path, truth)
+                values["training"] = _is_training(field, path)
             show(_words(values))
             if contact is not None and options.output is not None:
                 values |= _draw(contact, options.output, _name(path, taken), values, truth)
@@ -190,14 +190,11 @@ def _error(contact: "ContactPosterior", truth: "Float64[Tensor, ' 3']", level: f
     return {"true_contact": truth.tolist(), "error": likely, **relative, "in_region": contact.contains(truth, level)}
 
 
-def _is_training(field: "SoundField", path: Path, truth: "Float64[Tensor, ' 3']") -> bool:
-    """Return whether a field was fitted to a recording, by its name and, where they are known, the fit's contacts."""
-    if not any(f"/{path.absolute().as_posix()}".endswith(f"/{name}") for name in field.origin.trained_on):
-        return False
-    contacts, points = field.gain_field.contacts, field.gain_field.points
-    # Tables have fewer digits than a field.
-    near = 1e-4 * float((points.amax(0) - points.amin(0)).norm())
-    return contacts is None or float((contacts.double() - truth).norm(dim=1).min()) <= near
+def _is_training(field: "SoundField", path: Path) -> bool:
+    """Return whether a field was fitted to a file: a recording of its capture, the folder of that name around it."""
+    path, origin = path.resolve(), field.origin
+    owners = [each for each in path.parents if path.relative_to(each).as_posix() in origin.trained_on]
+    return any((settings_of(each).name or each.name) == origin.capture for each in owners)
 
 
 def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
