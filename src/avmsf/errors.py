@@ -96,7 +96,7 @@ class CaptureWarning(AvmsfWarning):
 
 
 @dataclass(frozen=True)
-class Remark:
+class Note:
     """What looks wrong in a file, before the file's name is known."""
 
     message: str
@@ -133,7 +133,7 @@ class FieldFileError(AvmsfError):
 
 
 class LocationError(AvmsfError):
-    """A recording from which no contact with this object can be told."""
+    """A recording that has no contact with this object."""
 
 
 class EditError(AvmsfError):

@@ -15,7 +15,7 @@ class Terminal(io.StringIO):
 @pytest.mark.parametrize(
     ("stream", "options", "count"),
     [
-        (io.StringIO, {"quiet": True}, 1),
+        (io.StringIO, {"shown": False}, 1),
         (io.StringIO, {}, 4),
         (io.StringIO, {"verbose": True}, 5),
         (Terminal, {}, None),

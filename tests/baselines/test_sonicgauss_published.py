@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from avmsf.baselines.sonicgauss import published
 from avmsf.baselines.sonicgauss.conditioning import first_nine, normalized
 from avmsf.baselines.sonicgauss.point_transformer import (
     EncoderSizes,
@@ -218,10 +219,10 @@ def test_contact_object_duration_and_dropped_conditions_change_the_velocity():
         assert not torch.allclose(changed, base, rtol=0, atol=1e-5)
 
 
-def test_it_fits_and_renders_from_a_folder_by_its_seed(folder):
+def test_it_fits_and_renders_from_a_folder_by_its_seed(folder, monkeypatch):
+    monkeypatch.setattr(published, "EPOCHS", 2)
     first, again = (
-        replace(fit_published(PublishedSonicGauss.load(folder, TINY), cloud(60), impacts(3), epochs=2), steps=2)
-        for _ in range(2)
+        replace(fit_published(PublishedSonicGauss.load(folder, TINY), cloud(60), impacts(3)), steps=2) for _ in range(2)
     )
     contacts = impacts(3).contacts
     sounds = first.render(contacts)

@@ -176,7 +176,7 @@ def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
     sampled = SampledField.of(load(field_file), limit=5)
     factor = torch.tensor([1.0, 1.0, 1e-3, 1.0, 1.0])[:, None]
     silent = replace(sampled, gains=factor * sampled.gains)
-    monkeypatch.setattr("avmsf.cli.export._sampled", lambda *_: silent)
+    monkeypatch.setattr(SampledField, "of", lambda *_, **__: silent)
     for given, keys in (((), 4), (("--position", 0, 0, 0), 5)):
         folder = export(field_file, "wavs", tmp_path / str(keys), "--seconds", 0.05, *given)
         assert len(list((folder / "sounds").iterdir())) == keys

@@ -120,7 +120,7 @@ def test_cdpam_is_taken_of_a_few_contacts(monkeypatch: pytest.MonkeyPatch) -> No
         def distance(self, predicted: torch.Tensor, truth: torch.Tensor, *, sample_rate: float) -> torch.Tensor:
             return (predicted - truth).abs().sum(1).double()
 
-    monkeypatch.setattr("avmsf.evaluation.scores._cdpam", Ear)
+    monkeypatch.setattr("avmsf.evaluation.scores.shared_cdpam", Ear)
     train, test = split(plate_impacts(10), 0.2)
     sounds = NearestRecording(train).render(test.contacts)
     settings = MetricSettings(level="raw", cdpam_contacts=3)

@@ -3,7 +3,6 @@
 import math
 import warnings
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from torch.nn.functional import normalize
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureWarning, EvaluationError
-from avmsf.evaluation.scores import evaluate, score
+from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.simple_methods import (
     MeanGains,
     MeanWaveform,
@@ -25,10 +24,8 @@ from avmsf.evaluation.simple_methods import (
 )
 from avmsf.evaluation.splits import split
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from avmsf.modal.synthesis import synthesize
 from factories.raising import raises
 from oracles.plate import Plate, plate_modes, sample_contacts, strike
 
@@ -90,28 +87,11 @@ def test_mean_gains_have_both_phases():
 def test_the_floor_is_the_noise_alone():
     impacts, clean = plate_impacts(noise_db=-40.0), plate_impacts()
     bank = true_extraction(impacts).bank
-    for make in (floor, partial(floor, sines=True)):
-        left = (make(impacts, bank) - impacts.sounds).square().mean() / impacts.sounds.square().mean()
-        # Least squares takes away the noise in as many directions of 4410 as there are gains, so 2 % at most.
-        assert 10 * math.log10(float(left)) == pytest.approx(-40.0, abs=0.15)
-        left = (make(clean, bank) - clean.sounds).square().mean() / clean.sounds.square().mean()
-        assert 10 * math.log10(float(left)) < -90.0
-
-
-def test_only_the_floor_with_cosines_follows_a_turned_phase():
-    impacts = plate_impacts()
-    bank = true_extraction(impacts).bank
-    # Two samples late: up to a third of a period at 4 kHz.
-    late = replace(impacts, sounds=torch.roll(impacts.sounds, -2, dims=1))
-    makers = (floor, partial(floor, sines=True))
-    both, sines = (score(make(late, bank), late).mean()["relative_stft"] for make in makers)
-    assert both < 0.02
-    assert sines > 5 * both
-    # The best sines are not what is left of the best sines and cosines without the cosines.
-    gains = fit_gains(late.sounds, bank, sample_rate=late.sample_rate).real
-    without = synthesize(gains, bank.frequency, bank.damping, samples=4410, sample_rate=22050.0)
-    best = float((floor(late, bank, sines=True) - late.sounds).square().sum())
-    assert best < 0.999 * float((without - late.sounds).square().sum())
+    left = (floor(impacts, bank) - impacts.sounds).square().mean() / impacts.sounds.square().mean()
+    # Least squares takes away the noise in as many directions of 4410 as there are gains, so 2 % at most.
+    assert 10 * math.log10(float(left)) == pytest.approx(-40.0, abs=0.15)
+    left = (floor(clean, bank) - clean.sounds).square().mean() / clean.sounds.square().mean()
+    assert 10 * math.log10(float(left)) < -90.0
 
 
 def test_neighbors_and_extractions_that_do_not_fit_are_refused():

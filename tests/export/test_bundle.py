@@ -116,9 +116,10 @@ def test_a_mesh_in_millimeters_is_shown_in_meters_with_its_colors(tmp_path: Path
         read_object(path, ball_points())
 
 
-def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word() -> None:
+def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avmsf.export.geometry.MAX_FACES", 1000)
     surface = ball_surface(divisions=4)
-    _, content, (remark,) = read_object(surface, ball_points(), most=1000)
+    _, content, (remark,) = read_object(surface, ball_points())
     mesh = shown_mesh(content)
     assert 500 < len(mesh.faces) <= 1000
     assert float(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.1).max()) < 0.005

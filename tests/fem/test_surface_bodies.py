@@ -137,12 +137,12 @@ def test_points_alone_have_no_body():
 
 
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 2 * 377e6)
+    monkeypatch.setattr(body_meshes, "free_memory", lambda: 2 * 377e6)
     with raises(SimulationError, name="memory") as caught:
         computed(sheet(), thicknesses=[0.004], dofs=80_000)
     [reason] = caught.value.value
     assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
-    monkeypatch.setattr(body_meshes, "_free_memory", lambda: None)
+    monkeypatch.setattr(body_meshes, "free_memory", lambda: None)
     assert computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies
 
 
@@ -178,7 +178,7 @@ def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory_or_f
 
     monkeypatch.setattr(candidate_bodies, "elastic_modes", fail)
     if error is None:
-        monkeypatch.setattr(body_meshes, "_free_memory", lambda: 1e9)
+        monkeypatch.setattr(body_meshes, "free_memory", lambda: 1e9)
     messages: list[str] = []
     bodies = SurfaceBodies(sheet(), count=4, dofs=3000 if error else 400_000, log=messages.append)
     assert bodies.refined(coarse) is coarse
@@ -210,10 +210,10 @@ def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
     walls, settings = [0.004, 0.006], {"count": 4, "dofs": 80_000, "cache": tmp_path}
     monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 2000)
     # Enough for the few degrees of freedom that two bodies are compared with.
-    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 377e6)
+    monkeypatch.setattr(body_meshes, "free_memory", lambda: 377e6)
     found = computed(sheet(), thicknesses=walls, **settings)
     assert [body.thickness for body in found.bodies] == walls
-    monkeypatch.setattr(body_meshes, "_free_memory", lambda: 0.0)
+    monkeypatch.setattr(body_meshes, "free_memory", lambda: 0.0)
     again = computed(sheet(), thicknesses=walls, **settings)
     assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
     with raises(SimulationError, name="memory") as caught:

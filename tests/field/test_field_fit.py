@@ -187,7 +187,7 @@ def test_looking_more_often_changes_no_step(monkeypatch):
     """The looks draw noise too, which must not be missing in the training's stream."""
     losses: dict[int, list[float]] = {1: [], 100: []}
     for every, seen in losses.items():
-        monkeypatch.setattr("avmsf.field.trainer._VALIDATION_STEPS", every)
+        monkeypatch.setattr("avmsf.field.trainer.VALIDATION_STEPS", every)
         plate_fit(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
     assert losses[1] == losses[100]
 

@@ -66,7 +66,7 @@ def test_frames_that_do_not_fit_one_chunk_are_none_the_worse(monkeypatch):
     target = spectral_target(recorded, fft_sizes=SIZES, hops=HOPS)
     whole = spectral_loss(made, target)
     (gradient,) = torch.autograd.grad(whole, made)
-    monkeypatch.setattr("avmsf.field.losses._CHUNK", 3 * 256)
+    monkeypatch.setattr("avmsf.field.losses.CHUNK_SAMPLES", 3 * 256)
     again = spectral_target(recorded, fft_sizes=SIZES, hops=HOPS)
     for one, other in zip(target.resolutions, again.resolutions, strict=True):
         assert torch.equal(one.magnitudes, other.magnitudes)

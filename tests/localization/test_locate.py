@@ -1,6 +1,5 @@
 import math
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import pytest
 import torch
@@ -26,7 +25,6 @@ from factories.located_plate import (
     true_field,
 )
 from factories.raising import raises
-from factories.unsaved_gains import Unsaved
 from oracles.plate import plate_surface_points
 
 
@@ -84,11 +82,7 @@ def test_dampings_that_vary_are_accounted_for():
 
 def test_a_known_force_tells_places_apart_that_sound_alike():
     # Two points that differ in nothing but how loud they are.
-    @dataclass(frozen=True, eq=False)
-    class Twice(Unsaved):
-        points: torch.Tensor
-        kind: ClassVar[str] = "twice"
-
+    class Twice(TrueGains):
         def predict(self, points, directions=None):
             return Gains((1.0 + points[:, :1].float()) * torch.linspace(1, 2, len(bank())))
 

@@ -87,7 +87,20 @@ def test_a_video_taken_upright_is_written_upright(tmp_path: Path) -> None:
 @pytest.mark.parametrize("claimed", [0, 5, 35, 37, 90])
 def test_spans_go_by_the_frames_that_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, claimed: int) -> None:
     film(tmp_path / "a.avi")
-    monkeypatch.setattr("avmsf.photographs.video._claimed_frames", lambda _: claimed)
+
+    opened = cv2.VideoCapture
+
+    class Claiming:
+        def __init__(self, path: str) -> None:
+            self.video = opened(path)
+
+        def get(self, what: int) -> float:
+            return claimed if what == cv2.CAP_PROP_FRAME_COUNT else self.video.get(what)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.video, name)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Claiming)
     ended_early = warns(CaptureWarning, file="a.avi", name="frames", value=36) if claimed == 90 else nullcontext()
     with ended_early:
         picked = pick(tmp_path / "a.avi", tmp_path / "images", 6)

@@ -217,7 +217,7 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
 
 
 def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.fem.body_meshes._free_memory", lambda: 1000.0)
+    monkeypatch.setattr("avmsf.fem.body_meshes.free_memory", lambda: 1000.0)
     with raises(SimulationError, name="memory"):
         candidate_bodies(dome(), BodyConfig(wall=0.004))
 

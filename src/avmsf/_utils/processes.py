@@ -42,7 +42,7 @@ def write_lock(
 
     The folder is made where it is missing, and with `parents` those that it lies in. The same thread may take the lock
     again within. A folder that cannot be written to, where each write fails with its own error, and one on a disk
-    without locks are used without a lock. `command` is what others are told to wait for.
+    without locks are used without a lock. `command` names what others wait for.
 
     Raises FolderInUseError where the lock is not free within `wait` seconds; `advice` ends its sentence. Raises
     AvmsfError where the folder can be written to and the lock cannot be had.

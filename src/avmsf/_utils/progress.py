@@ -36,9 +36,9 @@ class ProgressDisplay:
     A notebook counts as a terminal.
     """
 
-    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
-        """Show nothing but notes with `quiet`, and with `verbose` print each part of a stage as it begins."""
-        self.quiet, self.verbose = quiet, verbose
+    def __init__(self, *, shown: bool = True, verbose: bool = False) -> None:
+        """Show only notes unless `shown`, and with `verbose` print each part of a stage as it begins."""
+        self.shown, self.verbose = shown, verbose
         self._bar: Progress | None = None
         self._shown: tuple[str, TaskID] | None = None
 
@@ -54,13 +54,13 @@ class ProgressDisplay:
         return ProgressListener(self.doing, self.step, self.ready, self.note)
 
     def say(self, text: str, *, always: bool = False) -> None:
-        """Print a line on what is done, unless `quiet`; with `always`, which errors are, even then."""
+        """Print a line on what is done, if they are shown; with `always`, which errors are, even then."""
         self.close()
-        if always or not self.quiet:
+        if always or self.shown:
             print(printable(text), file=sys.stderr, flush=True)
 
     def note(self, text: str) -> None:
-        """Print what a user should know, `quiet` or not."""
+        """Print what a user should know, in any case."""
         self.say(f"note: {text}", always=True)
 
     def doing(self, text: str) -> None:
@@ -100,7 +100,7 @@ class ProgressDisplay:
             self._bar.stop()
 
     def _show(self, stage: str, text: str, done: int, total: int | None) -> None:
-        if self.quiet or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
+        if not self.shown or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
             return
         if self._bar is None:
             self._bar = _new_bar()

@@ -84,13 +84,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # Python has no stream where the descriptor is closed, as by `>&-`; the next file would take its place.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
     words = _verb_first(sys.argv[1:] if arguments is None else arguments)
-    before = display.quiet, display.verbose, display.json
+    before = display.shown, display.verbose, display.json
     display.json = "--json" in words
     try:
         try:
             return _run(words)
         finally:
-            display.quiet, display.verbose, display.json = before
+            display.shown, display.verbose, display.json = before
             # What is still buffered would otherwise fail after the end of this function.
             sys.stdout.flush()
     except BrokenPipeError:
@@ -115,7 +115,7 @@ def _run(words: list[str]) -> int:
             options = options_of(words[0], words[1:])
             options.check_inputs()
             goes_on = "; repeat the command to continue" if options.resumes else ""
-            display.quiet, display.verbose = options.quiet, options.verbose
+            display.shown, display.verbose = not options.quiet, options.verbose
             _show_plainly()
             display.doing("loading")
             code: int = import_module(f"avmsf.cli.{words[0]}").run(options)

@@ -3,7 +3,7 @@
 Where Poisson's ratio stays, stiffness goes as Young's modulus E and mass as the density r, so that the shapes of the
 modes stay. With the size times s, undamped angular frequencies become w' = w sqrt(E' / E) (r' / r)^(-1/2) / s, and
 mass-normalized shapes phi' = phi (r' / r)^(-1/2) s^(-3/2). With Rayleigh damping d = (alpha + beta w^2) / 2 a mode
-sounds at sqrt(w^2 - d^2) / 2 pi. What a blow moves at a place is the product of two shapes, over the damped angular
+sounds at sqrt(w^2 - d^2) / 2 pi. What an impact moves at a place is the product of two shapes, over the damped angular
 frequency where that is a displacement.
 """
 

@@ -34,7 +34,7 @@ Waveforms = Float[Tensor, "contacts channels samples"]
 
 @dataclass(frozen=True, eq=False)
 class Conditioning:
-    """What the denoiser is told, without the words (or with the negative ones) and with them."""
+    """What the denoiser is conditioned on, without the words (or with the negative ones) and with them."""
 
     text: Float[Tensor, "2 words dim"]
     """Embedded words and times, for cross-attention."""
@@ -154,7 +154,7 @@ class StableAudio:
             words = pipeline.encode_prompt(prompt, device, negative is not None, negative)
             times = pipeline.encode_duration(0.0, seconds, device, False, 1)
             parts = [torch.cat([each, *times], dim=1) for each in words.split(1)]
-        # Without negative words the denoiser is told nothing, the times of the cross-attention included.
+        # Without negative words the denoiser has no condition, the times of the cross-attention included.
         without, conditional = parts if negative is not None else (torch.zeros_like(parts[0]), parts[0])
         both = torch.cat(times, dim=2)
         return Conditioning(torch.cat([without, conditional]), torch.cat([both, both]))
@@ -303,7 +303,7 @@ def _load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
             else _HOW_TO_GET.format(name=name),
         ) from error
     for part in _NETWORKS:
-        # By hand, for how a pipeline is told its precision changed between versions of diffusers.
+        # By hand, for how a pipeline's precision is set changed between versions of diffusers.
         getattr(pipeline, part).to(torch.float32 if part == "vae" else dtype)
     return pipeline, name
 

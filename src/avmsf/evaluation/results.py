@@ -137,10 +137,10 @@ class ResultsFolder:
         stored = known.pop("methods")
         if wanted != known:
             name, ours, theirs = _first_difference(wanted, known)
-            told = f"of {name} {_brief(ours)}", _brief(theirs)
+            differing = f"of {name} {_brief(ours)}", _brief(theirs)
             if name == "source":
-                told = "made by this version of avmsf", "those of another, whose code differs"
-            raise self._of_another(name, theirs, *told)
+                differing = "made by this version of avmsf", "those of another, whose code differs"
+            raise self._of_another(name, theirs, *differing)
         for name in methods:
             if stored.get(name, methods[name]) != methods[name]:
                 (ours, _, encoder), (theirs, _, other) = (each[name].partition(ENCODER) for each in (methods, stored))

@@ -145,13 +145,14 @@ def score(sounds: ArrayLike, impacts: Impacts) -> Scores:
 
 Values = dict[str, tuple[float | None, ...]]
 """Each metric's value for every test contact; None where it was not computed."""
-_cdpam = lru_cache(maxsize=1)(Cdpam.load)
+shared_cdpam = lru_cache(maxsize=1)(Cdpam.load)
+"""Returns CDPAM, which is read once a process. Raises as `Cdpam.load`."""
 
 
 def expect_metrics(settings: MetricSettings) -> None:
     """Raise EvaluationError where a metric's package is not installed, before hours of computation."""
     if settings.cdpam:
-        _cdpam()
+        shared_cdpam()
 
 
 def metric_values(
@@ -173,7 +174,7 @@ def metric_values(
     values: Values = {metric: tuple(figures.tolist()) for metric, figures in score(sounds, scored).values.items()}
     if settings.cdpam:
         rows = evenly_spaced(len(test), settings.cdpam_contacts or len(test))
-        taken = _cdpam().distance(sounds[rows], scored.sounds[rows], sample_rate=test.sample_rate)
+        taken = shared_cdpam().distance(sounds[rows], scored.sounds[rows], sample_rate=test.sample_rate)
         found = dict(zip(rows, taken.tolist(), strict=True))
         values["cdpam"] = tuple(map(found.get, range(len(test))))
     if truth is None or not isinstance(renderer, ModalRenderer):

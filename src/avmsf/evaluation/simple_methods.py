@@ -25,7 +25,7 @@ from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites
 from avmsf.gaussians.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import shape_noise
 from avmsf.modal.synthesis import synthesize
@@ -198,14 +198,13 @@ class RandomImpact:
         return self.sound.expand(len(contacts), -1)
 
 
-def floor(test: Impacts, bank: ModalBank, *, sines: bool = False) -> Float[Tensor, "contacts samples"]:
+def floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:
     """Return the test sounds as `bank` expresses them best: their own complex gains.
 
-    No gains that are predicted for the same modes come nearer in the squared error of the waveform. With `sines` they
-    are damped sines without cosines: all that the paper's equation 3 has.
+    No gains that are predicted for the same modes come nearer in the squared error of the waveform.
     """
     rate, samples = test.sample_rate, test.sounds.shape[1]
-    gains = (fit_sine_gains if sines else fit_gains)(test.sounds, bank, sample_rate=rate)
+    gains = fit_gains(test.sounds, bank, sample_rate=rate)
     return synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
 
 

@@ -31,13 +31,13 @@ ObjectKind = Literal["mesh", "gaussians", "points"]
 
 
 def read_object(
-    source: Path | Surface | None, points: Float[Tensor, "points 3"], *, meters: float = 1.0, most: int = MAX_FACES
+    source: Path | Surface | None, points: Float[Tensor, "points 3"], *, meters: float = 1.0
 ) -> tuple[ObjectKind, bytes, tuple[str, ...]]:
     """Return an object for a field at `points`: its kind, its file, and notes on differences from the given one.
 
     A mesh becomes a `.glb`, Gaussians stay as they are, and without either the field's points are shown. A file's
-    coordinates count `meters` each; Gaussians are in meters. Meshes of more than `most` triangles are reduced. Raises
-    `ExportError` for a file that is missing, not a mesh, huge, or not in the field's unit.
+    coordinates count `meters` each; Gaussians are in meters. Meshes of more than `MAX_FACES` triangles are reduced.
+    Raises `ExportError` for a file that is missing, not a mesh, huge, or not in the field's unit.
     """
     if source is None:
         return "points", b"", ()
@@ -54,8 +54,8 @@ def read_object(
     _check_fits(np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes]), points, source)
     remarks: tuple[str, ...] = ()
     faces = sum(len(mesh.faces) for mesh in meshes)
-    if faces > most:
-        scene = trimesh.Scene([_reduced(mesh, most / faces) for mesh in meshes])
+    if faces > MAX_FACES:
+        scene = trimesh.Scene([_reduced(mesh, MAX_FACES / faces) for mesh in meshes])
         left = sum(len(mesh.faces) for mesh in scene.geometry.values())
         remarks = (
             f"{_named(source)} has {faces:,} triangles, too many for a browser: {left:,} are shown, without textures",

@@ -194,7 +194,7 @@ def _filling_detail(surface: CheckedSurface, dofs: int) -> float:
 
 def expect_memory(dofs: int) -> None:
     """Raise SimulationError where the modes of a mesh with so many degrees of freedom do not fit into memory."""
-    free, peak = _free_memory(), TOLERANCES.memory_safety * TOLERANCES.peak_bytes
+    free, peak = free_memory(), TOLERANCES.memory_safety * TOLERANCES.peak_bytes
     needed = peak * (dofs / TOLERANCES.peak_dofs) ** TOLERANCES.peak_power
     if free is not None and needed > free:
         fitting = int(TOLERANCES.peak_dofs * (free / peak) ** (1.0 / TOLERANCES.peak_power)) // 1000 * 1000
@@ -203,7 +203,7 @@ def expect_memory(dofs: int) -> None:
         raise SimulationError.expected(wanted, free, got=f"{free / 1e9:.2g} GB", name="memory", advice=advice)
 
 
-def _free_memory() -> float | None:
+def free_memory() -> float | None:
     """Return the bytes of memory that programs can still have, or None where the system does not say."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()

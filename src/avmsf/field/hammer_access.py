@@ -21,7 +21,7 @@ _RADIUS = 0.5 * HAMMER_DIAMETER
 MAX_TILT_DEGREES = 45.0
 """Angle between the hammer and the normal beyond which more of the force goes along the surface than into it."""
 MAX_DISTANCE_RATIO = 0.02
-"""Distance of a place from the surface over the object's size up to which the blow meant is that on the surface."""
+"""Distance of a place from the surface over the object's size up to which the impact meant is that on the surface."""
 _TILTS, _TURNS, _SIDES = 4, 12, 8
 """Tilts and turns of the axes that are tried, and lines along the rod that are checked beside its axis."""
 _GAP_RATIO = 1e-4

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from avmsf._utils.compiled import compiled
 
-_CHUNK, _CARD_CHUNK = 1 << 19, 1 << 27
+CHUNK_SAMPLES, CARD_CHUNK_SAMPLES = 1 << 19, 1 << 27
 """Samples of windowed frames held at once: near a processor's cache, or all frames in half a gigabyte of a card's."""
 _MIN_POWER_RATIO = 1e-12
 """Power below which a magnitude counts as zero, over that of the target's largest sample times the window's energy: its
@@ -184,7 +184,7 @@ def _padded(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[T
 def _chunks(frames: Float[Tensor, "contacts frames size"]) -> list[tuple[slice, slice]]:
     """Return contacts and frames that are transformed at once: several contacts, or a part of one's frames."""
     contacts, count, size = frames.shape
-    most = max(1, (_CHUNK if frames.device.type == "cpu" else _CARD_CHUNK) // size)
+    most = max(1, (CHUNK_SAMPLES if frames.device.type == "cpu" else CARD_CHUNK_SAMPLES) // size)
     rows = max(1, most // count)
     return [
         (slice(row, min(contacts, row + rows)), slice(first, min(count, first + most)))

@@ -21,7 +21,7 @@ from avmsf.field.losses import spectral_loss
 from avmsf.field.training import Targets, TrainableGains, TrainingRun
 from avmsf.modal.spectra import envelope
 
-_VALIDATION_STEPS = 10
+VALIDATION_STEPS = 10
 """Steps between validations."""
 
 
@@ -132,7 +132,7 @@ class _Validation:
     def stops(self, run: TrainingRun, end: int) -> bool:
         """Note the errors where it is time, relative and ENV (paper, 4.2); return whether patience is at its end."""
         done = run.step - self.config.warmup_steps
-        if done < 0 or (done % _VALIDATION_STEPS and run.step != end):
+        if done < 0 or (done % VALIDATION_STEPS and run.step != end):
             return False
         # Validation must not disturb the run: its noise comes from the same place in the stream every time.
         state = run.generator.get_state()

@@ -67,7 +67,7 @@ def locate(
         wanted = "one of this field, without points and directions"
         raise LocationError.expected(wanted, what, got=f"one with {what}", name="locator", advice="leave it out")
     known = None if force is None else Force.of(force)
-    with ProgressDisplay(quiet=not progress) as display:
+    with ProgressDisplay(shown=progress) as display:
         display.doing("locating the impact; the first of a field takes seconds to minutes")
         impact = preprocess_recording(recording, field, sample_rate=sample_rate, settings=settings)
         if locator is None and points is None and directions is None:

@@ -14,7 +14,7 @@ class TextureAtlas:
         self.levels = [_halvings(image) for image in images]
         self.sizes = np.array([image.shape[1::-1] for image in images], dtype=np.float64)
 
-    def look_up(
+    def sample(
         self,
         places: Float[np.ndarray, "samples 2"],
         materials: Int[np.ndarray, " samples"],

@@ -147,7 +147,7 @@ class _Painter:
         places = np.einsum("nca,nc->na", self.coordinates[hits.faces], hits.weights)
         # Size of a ray's neighborhood on a face that looks at the camera; one that leans shows more.
         spans = hits.depth / min(camera.focal) * self.texels_per_meter[hits.faces]
-        colors = self.atlas.look_up(places, self.materials[hits.faces], spans=spans)
+        colors = self.atlas.sample(places, self.materials[hits.faces], spans=spans)
         colors *= np.einsum("nca,nc->na", self.colors[hits.faces], hits.weights)
         if ambient < 1:
             normals = np.einsum("nca,nc->na", self.normals[hits.faces], hits.weights)

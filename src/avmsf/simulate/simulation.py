@@ -162,7 +162,7 @@ def simulate_object(
     """Simulate an object, its impacts and its recordings.
 
     `name` is what the object is called: shape or mesh and material without it. Elastic modes are kept in the folder
-    `cache`, where one is given, and found there again by all that decides them. `progress` is told what comes next.
+    `cache`, where one is given, and found there again by all that decides them. `progress` gets what comes next.
     Raises SimulationError where the recipe describes no object that sounds, and CaptureError for a mesh that cannot be
     read.
     """
@@ -180,7 +180,7 @@ def simulate_object(
 
 
 def name_of(recipe: ObjectRecipe) -> str:
-    """Return what an object is called unless told otherwise."""
+    """Return what an object is called by default."""
     return f"{recipe.kind if recipe.mesh is None else recipe.mesh.stem}-{recipe.material.lower()}"
 
 

@@ -208,9 +208,9 @@ def test_noise_accuses_nobody() -> None:
         size = 10.0 ** torch.randint(0, 2, (CONTACTS, 1), generator=generator)
         noise = torch.randn(CONTACTS, MODES, dtype=torch.complex128, generator=generator) * size
         gains = MeasuredGains(noise, measured.variance, measured.frequency, measured.damping)
-        judgment = assess_contacts(_fit(sites, gains), None, sites, _places(), gains)
-        assert judgment.outliers == ()
-        assert not judgment.informative
+        assessment = assess_contacts(_fit(sites, gains), None, sites, _places(), gains)
+        assert assessment.outliers == ()
+        assert not assessment.informative
 
 
 def test_few_places_accuse_nobody() -> None:

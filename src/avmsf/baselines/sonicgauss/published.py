@@ -227,7 +227,7 @@ EPOCHS, BATCH = 80, 2
 
 
 def fit_published(
-    model: PublishedSonicGauss, cloud: GaussianCloud, impacts: Impacts, *, epochs: int = EPOCHS, seed: int = 0
+    model: PublishedSonicGauss, cloud: GaussianCloud, impacts: Impacts, *, seed: int = 0
 ) -> TunedRenderer:
     """Fine-tune a model in place to an object's recordings, as published, on the device where it is.
 
@@ -264,7 +264,7 @@ def fit_published(
         sound = resampled(sound, sample_rate=rate, wanted=impacts.sample_rate)
         return peak * with_length(sound, impacts.sounds.shape[1])[0]
 
-    config = TrainingConfig(steps=epochs * math.ceil(len(impacts) / BATCH), batch=BATCH)
+    config = TrainingConfig(steps=EPOCHS * math.ceil(len(impacts) / BATCH), batch=BATCH)
     model.train().autoencoder.eval()
     for part in model.gaussians.modules():
         if isinstance(part, torch.nn.BatchNorm1d):

@@ -23,7 +23,7 @@ from avmsf.field.gains.data import GainData, along_phase
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import POSITIONAL, Unstructured, Visual
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.outliers import Judgment, others, predicts_better
+from avmsf.field.gains.outliers import ContactAssessment, others, predicts_better
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.regression import Regression, Solution, sites_of
 from avmsf.field.gains.symmetry import Symmetric
@@ -121,21 +121,22 @@ class MixtureEstimator(GainEstimator):
         if searched and self.bodies is not None:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.with_thickness)
         found = self._refined(fit, bodies)
-        judgment, evidence = fit.assess(found), dict[str, float]()
-        tried = found.best is not None and self._may_be_held(judgment)
+        assessment, evidence = fit.assess(found), dict[str, float]()
+        tried = found.best is not None and self._may_be_held(assessment)
         if tried and found.best is not None and self.bodies is not None:
             modes = self.bodies.held(found.best)
-            rows, stated = others(fit.sites, judgment.rows), bool(self.bodies.held_at)
-            held = None if modes is None else fit.held(rows, found.best, modes, stated=stated)
+            rows, stated = others(fit.sites, assessment.rows), bool(self.bodies.held_at)
+            choose = fit.held_on_all if stated else fit.held
+            held = None if modes is None else choose(rows, found.best, modes)
             if held is not None and modes is not None:
                 if stated:
                     free = replace(held, elastic=modes.free, support=None)
                     evidence = dict(zip(("held", "free"), fit.evidence(rows, [held, free]), strict=True))
                 # All modes have the support in common, so free bodies are no hypotheses any more.
                 found = self._refined(fit, [held])
-                judgment = fit.assess(found)
-        if judgment.outliers:
-            rows = others(fit.sites, judgment.rows)
+                assessment = fit.assess(found)
+        if assessment.outliers:
+            rows = others(fit.sites, assessment.rows)
             fewer = fit(rows, found.bodies)
             if predicts_better(fewer.model.leave_one_out(), found.model.leave_one_out()[rows], fit.measured.take(rows)):
                 found = fewer
@@ -144,12 +145,12 @@ class MixtureEstimator(GainEstimator):
             if updated is not None:
                 found = fit(found.rows, [*found.bodies, updated])
         kept, names = set(found.rows.tolist()), data.train.names
-        report = found.report() | {"unavailable": missing} | judgment.report(data.train)
+        report = found.report() | {"unavailable": missing} | assessment.report(data.train)
         report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
         report["supports_tried"] = tried
         report["support_evidence"] = evidence
         report["thickness"] = None if thickness is None else asdict(thickness)
-        report["advice"] = None if judgment.informative else fit.advice(found.bodies)
+        report["advice"] = None if assessment.informative else fit.advice(found.bodies)
         return replace(found.model, report=report), found.rows
 
     def _refined(self, fit: Regression, bodies: Sequence[CandidateBody]) -> Solution:
@@ -187,9 +188,9 @@ class MixtureEstimator(GainEstimator):
             return [], {Elastic.kind: missing} if missing else {}
         return list(self.bodies.bodies), {body_name(each): reason for each, reason in self.bodies.refused.items()}
 
-    def _may_be_held(self, judgment: Judgment) -> bool:
+    def _may_be_held(self, assessment: ContactAssessment) -> bool:
         """Return whether supports are tried: where they are asked for or stated, or the free body predicts little."""
-        tried, found = "free" if self.bodies is None else self.bodies.supports, judgment.credibility
+        tried, found = "free" if self.bodies is None else self.bodies.supports, assessment.credibility
         stated = self.bodies is not None and bool(self.bodies.held_at)
         return tried == "try" or stated or (tried == "auto" and found is not None and found.gained < _PREDICTS)
 

@@ -45,7 +45,7 @@ simulated objects with 1 to 8 impacts, one of them of sim-20 (docs/decisions/few
 _ROUNDS = 5
 """Of expectation maximization."""
 _PSEUDO_COUNT = 0.1
-"""Series' worth of belief in the prior of categories, for each series."""
+"""Weight of the prior of categories, in series, for each series."""
 _NEGLIGIBLE = 1e-2
 """Posterior probability, over the most probable one's of a series, below which a hypothesis is dropped. Not an absolute
 one: few contacts leave thousands of hypotheses almost equally probable."""

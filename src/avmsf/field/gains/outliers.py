@@ -243,7 +243,7 @@ class Outlier:
 
 
 @dataclass(frozen=True)
-class Judgment:
+class ContactAssessment:
     """What the log predictive ratios say of the contacts, and of the body."""
 
     outliers: tuple[Outlier, ...]
@@ -273,7 +273,9 @@ class Judgment:
         }
 
 
-def assess_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites, measured: MeasuredGains) -> Judgment:
+def assess_contacts(
+    plain: Fit, elastic: Fit | None, sites: Sites, places: Sites, measured: MeasuredGains
+) -> ContactAssessment:
     """Return the contacts that the others contradict, and whether the body is credible.
 
     `plain` fits the gain model without elastic families, `elastic` with them, where there is a body. Contacts are
@@ -290,7 +292,7 @@ def assess_contacts(plain: Fit, elastic: Fit | None, sites: Sites, places: Sites
     informative = mean >= _INFORMATIVE
     located = [_located(used, row, places, mean) for row in sorted(used.aside)] if informative else []
     outliers = sorted((each for each in located if each is not None), key=lambda each: each.ratio)
-    return Judgment(tuple(outliers), credibility, informative)
+    return ContactAssessment(tuple(outliers), credibility, informative)
 
 
 def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> frozenset[int]:

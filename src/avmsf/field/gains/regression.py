@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations
 from operator import itemgetter
 from typing import Any
@@ -24,7 +24,7 @@ from avmsf.field.gains.kernels import POSITIONAL, KernelFamily, Sites, Unstructu
 from avmsf.field.gains.labels import level_advice, order_advice
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.outliers import Fit, Judgment, assess_contacts, predicts_better
+from avmsf.field.gains.outliers import ContactAssessment, Fit, assess_contacts, predicts_better
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.gaussians.points import farthest_points
 from avmsf.symmetry.characters import Group
@@ -132,33 +132,19 @@ class Regression:
         elastic = (WeighedFamily.of(self.elastic(rows, body.elastic), measured) for body in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
 
-    def held(
-        self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes, *, stated: bool = False
-    ) -> CandidateBody | None:
-        """Return a body on its most probable support, by the evidence of all modes; None where it is free.
+    def held_on_all(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody:
+        """Return a body that all patches hold, at the most probable stiffness by the evidence of all modes."""
+        return self._most_probable(rows, body, modes, [modes.basis.patches], *STIFFNESS_RATIOS)[2]
 
-        Where patches are `stated` all of them hold it, and evidence decides on the stiffness alone.
+    def held(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody | None:
+        """Return a body on its most probable support, by the evidence of all modes; None where it is free.
 
         All patches and all pairs of them are tried at one stiffness, then the best with one patch more for as long as
         that is more probable, then other stiffnesses. Where both bodies are far from the object, evidence between them
         means little: the held one also has to predict contacts left out better.
         """
-        patches, scale = modes.basis.patches, modes.basis.stiffness_scale
+        patches, most_probable = modes.basis.patches, partial(self._most_probable, rows, body, modes)
         typical, *others = STIFFNESS_RATIOS
-
-        def most_probable(choices: Iterable[tuple[Patch, ...]], *ratios: float) -> tuple[float, Support, CandidateBody]:
-            supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
-            bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
-            # Numbers of patches share the probability of being held alike, and so do stiffnesses.
-            ways = [
-                math.comb(len(patches), len(each.patches)) * len(patches) * len(STIFFNESS_RATIOS) for each in supports
-            ]
-            logs = [evidence - math.log(each) for evidence, each in zip(self.evidence(rows, bodies), ways, strict=True)]
-            row = max(range(len(bodies)), key=logs.__getitem__)
-            return logs[row], supports[row], bodies[row]
-
-        if stated:
-            return most_probable([patches], *STIFFNESS_RATIOS)[2]
         best = most_probable([each for count in (1, 2) for each in combinations(patches, count)], typical)
         while len(best[1].patches) < len(patches):
             chosen = best[1].patches
@@ -172,6 +158,24 @@ class Regression:
             return None
         new, old = (self(rows, [each]).model.leave_one_out() for each in (best[2], free))
         return best[2] if predicts_better(new, old, self.measured.take(rows)) else None
+
+    def _most_probable(
+        self,
+        rows: Int[Tensor, " rows"],
+        body: CandidateBody,
+        modes: HeldModes,
+        choices: Iterable[tuple[Patch, ...]],
+        *ratios: float,
+    ) -> tuple[float, Support, CandidateBody]:
+        """Return the most probable of choices of patches at ratios of stiffness: log probability, support, body."""
+        patches, scale = modes.basis.patches, modes.basis.stiffness_scale
+        supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
+        bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
+        # Numbers of patches share the probability of being held alike, and so do stiffnesses.
+        ways = [math.comb(len(patches), len(each.patches)) * len(patches) * len(STIFFNESS_RATIOS) for each in supports]
+        logs = [evidence - math.log(each) for evidence, each in zip(self.evidence(rows, bodies), ways, strict=True)]
+        row = max(range(len(bodies)), key=logs.__getitem__)
+        return logs[row], supports[row], bodies[row]
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
@@ -187,7 +191,7 @@ class Regression:
         )  # fmt: skip
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
 
-    def assess(self, found: Solution) -> Judgment:
+    def assess(self, found: Solution) -> ContactAssessment:
         """Return what contradicts the other contacts, and whether the most probable body is credible."""
         points, best = found.model.points, found.best
         places = found.model.sites(points[farthest_points(points, min(_PLACES, len(points)))])

@@ -94,7 +94,7 @@ class GsplatRasterizer:
         """
         centers = cloud.centers
         for name, tensor in (("cloud", centers), ("background", background)):
-            if not _is_on_gpu(tensor):
+            if not is_on_gpu(tensor):
                 advice = "move it, or use the rasterizer of `choose_rasterizer` for that device"
                 raise SceneError.expected("a CUDA device", str(tensor.device), name=name, advice=advice)
         painted, covered, found = self._gsplat.rasterization(
@@ -124,7 +124,8 @@ class GsplatRasterizer:
         )
 
 
-def _is_on_gpu(tensor: Tensor) -> bool:
+def is_on_gpu(tensor: Tensor) -> bool:
+    """Return whether a tensor is on a CUDA device."""
     return tensor.device.type == "cuda"
 
 

@@ -242,7 +242,7 @@ class Draft:
 
 
 Maker = Callable[[np.random.Generator, float | None], Draft]
-"""Draws the proportions of one individual; walls as thick as told, meters, or drawn too."""
+"""Draws the proportions of one individual; walls as thick as given, meters, or drawn too."""
 
 
 def drawn_wall(random: np.random.Generator, low: float, high: float, wall: float | None) -> float:
