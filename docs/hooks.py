@@ -1,4 +1,4 @@
-"""What mkdocs builds besides the written pages: command line and API reference, formulas, and pages of the root."""
+"""What mkdocs builds besides the written pages: references, formulas, pages of the root, and the gallery's sounds."""
 
 import ast
 import json
@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from latex2mathml.converter import convert
@@ -49,9 +50,14 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the generated pages."""
+    """Add the generated pages and sounds."""
     for path, text in _generated.items():
         files.append(File.generated(config, path, content=text))
+    with TemporaryDirectory(prefix="avmsf-") as folder:
+        environment = {**os.environ, "PYTHONPATH": str(SOURCE.parent)}
+        subprocess.run([sys.executable, REPOSITORY / "docs" / "gallery.py", folder], check=True, env=environment)
+        for path in Path(folder).iterdir():
+            files.append(File.generated(config, f"gallery/{path.name}", content=path.read_bytes()))
     return files
 
 

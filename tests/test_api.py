@@ -1,11 +1,14 @@
 """The public interface: what a user of Python starts from, end to end, with lists, arrays and paths."""
 
+import inspect
 import math
+import re
 import subprocess
 import sys
 import warnings
 from dataclasses import replace
 from functools import cache
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -53,6 +56,15 @@ def capture() -> avmsf.Capture:
 @cache
 def field() -> SoundField:
     return avmsf.fit(capture(), config=PipelineConfig(modes=8), progress=False)
+
+
+def test_the_functions_to_start_from_describe_each_parameter_and_the_result():
+    for name in NAMES - {"Capture", "SoundField", "Surface"} | {"SoundField.render", "SoundField.posterior"}:
+        function = attrgetter(name)(avmsf)
+        described = inspect.getdoc(function)
+        given = [each for each in inspect.signature(function).parameters if each != "self"]
+        assert re.findall(r"^    (\w+): ", described.partition("Args:")[2].partition("\n\n")[0], re.MULTILINE) == given
+        assert "Returns:" in described
 
 
 def test_the_top_has_the_names_that_users_start_from_and_its_packages():

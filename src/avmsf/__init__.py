@@ -32,8 +32,16 @@ def __dir__() -> list[str]:
 def read(folder: "str | Path", settings: "CaptureSettings | None" = None) -> "Capture":
     """Read a capture folder: recordings, contacts, and a mesh where it has one.
 
-    `settings` take the place of the folder's `capture.toml`. Raises CaptureError for what cannot be used, and warns
-    with CaptureWarning of what is probably wrong (see `avmsf.capture.read_capture`).
+    Args:
+        folder: Folder with `impacts.csv` and the sound files that it names.
+        settings: Take the place of the folder's `capture.toml`.
+
+    Returns:
+        Contacts [contacts, 3] in meters, sounds [contacts, samples] from their onsets on, and the surface.
+
+    Raises:
+        CaptureError: For what cannot be used. What is probably wrong is a CaptureWarning (see
+            `avmsf.capture.read_capture`).
     """
     from avmsf.capture.folder import read_capture
 

@@ -247,12 +247,26 @@ def edit(
 ) -> SoundField:
     """Return the field of another material, size, pitch, decay or brightness; the shape stays.
 
-    `material` and `size` (new lengths over old ones) follow the laws of linear modal analysis, see `change_material`;
-    the material before, `old_material`, is the one nearest to the modes' dampings where it is not given. Then
-    frequencies are multiplied by `pitch`, decay times by `decay`, and levels changed by `gains_db` and, per octave,
-    `brightness_db`, see `adjust_modes`. Optimization towards recordings or a text is `avmsf.editing.edit_towards`.
+    `material` and `size` follow the laws of linear modal analysis, see `change_material`; the others come after them,
+    see `adjust_modes`. Optimization towards recordings or a text is `avmsf.editing.edit_towards`.
 
-    Raises EditError where nothing is to change, and as these two; SimulationError for an unknown material.
+    Args:
+        field: The field to edit; it stays as it is.
+        material: The new material, by name or with constants of its own.
+        old_material: The material before; by default the one nearest to the modes' dampings.
+        size: New lengths over old ones.
+        law: What the recordings are in proportion to.
+        pitch: Factor on frequencies, one or one for each mode.
+        decay: Factor on decay times, likewise.
+        brightness_db: Change of level per octave, dB.
+        gains_db: Change of level, dB, one or one for each mode.
+
+    Returns:
+        A new field.
+
+    Raises:
+        EditError: Where nothing is to change, and as `change_material` and `adjust_modes`.
+        SimulationError: For an unknown material.
     """
     adjusted = {"pitch": pitch, "decay": decay, "brightness_db": brightness_db, "gains_db": gains_db}
     neutral = {"pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}

@@ -67,13 +67,20 @@ def evaluate(
     *,
     train: Capture | Impacts | None = None,
 ) -> Scores:
-    """Score the sounds that `renderer` renders at the contacts of recordings against these recordings.
+    """Score the sounds that a renderer renders at the contacts of recordings against these recordings.
 
-    With the training recordings as `train`, `renderer` is a class or function that makes one from them. It gets them,
-    and is scored on `test`, as the methods of `avmsf evaluate` are: aligned with one another (`align_split`). Without
-    them, recordings are taken as they are. For a SoundField, those that are not aligned yet are aligned as its fit
-    aligned those it was fitted to, and its sounds are as long as the recordings. Raises as `score`, and EvaluationError
-    for what is no renderer, and for one at another sample rate.
+    Args:
+        renderer: A SoundField or another renderer; with `train`, a class or function that makes one from it.
+        test: The recordings to score on. Without `train` they are taken as they are, but for a SoundField, which aligns
+            them as its fit aligned those it was fitted to, and whose sounds are as long as the recordings.
+        train: The training recordings, which are aligned with `test` as the methods of `avmsf evaluate` get them
+            (`align_split`).
+
+    Returns:
+        A value for each metric and recording; `.mean()` and `.to_frame()` sum them up.
+
+    Raises:
+        EvaluationError: As `score`, for what is no renderer, and for one at another sample rate.
     """
     impacts = _impacts_of(test, "test")
     if train is not None:

@@ -213,14 +213,23 @@ class DistinctContacts:
 def split(
     recordings: Recordings, train_size: float | int = 0.75, *, seed: int | None = None, start: int = 0
 ) -> tuple[Recordings, Recordings]:
-    """Return (train, test): the recordings at contacts as far apart as possible, and all others.
+    """Split recordings into training and test recordings, whose contacts are as far apart as possible.
 
-    `recordings` are a capture, or the impacts of one. `train_size` is a fraction of the contacts (float, 0 to 1; at
-    least 2 contacts) or their number (int). Contacts nearer to each other than 1 % of the bounding box's diagonal count
-    as one (`places_of`), and all recordings at a contact are on one side. The choice, by farthest-point sampling,
-    starts from the contact of row `start`, or with a `seed` from one drawn at random. Training recordings are in the
-    order of the choice, one a contact, and then the repeated ones; so with more contacts the first ones stay the same.
-    Raises EvaluationError where no contact would remain to train on, with a fraction fewer than 2, or none to test.
+    Contacts nearer to each other than 1 % of the bounding box's diagonal count as one (`places_of`), and all recordings
+    at a contact are on one side. The choice is by farthest-point sampling.
+
+    Args:
+        recordings: A capture, or the impacts of one.
+        train_size: Fraction of the contacts (float, 0 to 1; at least 2 contacts) or their number (int).
+        seed: Draws the contact that the choice starts from.
+        start: Row of that contact without a `seed`.
+
+    Returns:
+        (train, test), of the type of `recordings`. Training recordings are in the order of the choice, one a contact,
+            and then the repeated ones; so with more contacts the first ones stay the same.
+
+    Raises:
+        EvaluationError: Where no contact would remain to train on, with a fraction fewer than 2, or none to test.
     """
     impacts = recordings if isinstance(recordings, Impacts) else recordings.impacts
     if isinstance(train_size, float) and not 0.0 < train_size < 1.0:

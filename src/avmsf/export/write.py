@@ -30,13 +30,23 @@ WRITERS: dict[Format, Callable[..., Written]] = {
 def write(
     field: SoundField, output: str | Path, *, to: Format | None = None, contacts: int | None = None, **options: Any
 ) -> Written:
-    """Write a field for other tools, and return what was written and what the format could not hold.
+    """Write a field for other tools.
 
-    `to` is the format, by default that of the ending: .html a web page, .glb glTF, .dsp and .lib Faust, .uff modal
-    analysis. Folders take "web", "wavs" (a sample set) or "avmsf-demo" (the layout of the paper's demo). At most
-    `contacts` points, spread over the object, are written, by default as many as the format's tools read easily.
-    `options` are those of the format's writer in `avmsf.export`, such as `strikes=` of `write_webpage`, or
-    `overwrite=True` to replace files. Raises ExportError for an unknown ending, and as the writer.
+    Args:
+        field: The field.
+        output: File or folder. The ending decides the format: .html a web page, .glb glTF, .dsp and .lib Faust, .uff
+            modal analysis.
+        to: The format of a folder: "web", "wavs" (a sample set) or "avmsf-demo" (the layout of the paper's demo).
+        contacts: Number of points, spread over the object, at most; by default as many as the format's tools read
+            easily.
+        options: Of the format's writer in `avmsf.export`, such as `strikes=` of `write_webpage`, or `overwrite=True` to
+            replace files.
+
+    Returns:
+        The files, and what the format could not hold.
+
+    Raises:
+        ExportError: For an unknown ending, and as the writer.
     """
     output = Path(output)
     kind = _FORMATS.get(output.suffix.lower()) if to is None else to

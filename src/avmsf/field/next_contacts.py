@@ -66,17 +66,25 @@ def suggest(
     unseen: bool = False,
     progress: bool = True,
 ) -> Suggestions:
-    """Return the `count` contacts that lower the expected error of the whole field most, each given those before it, or
-    all that have no recording where there are fewer.
+    """Return the contacts that lower the expected error of the whole field most, each given those before it.
 
-    `candidates` are the places to choose from (meters, on the surface; contacts of the fit are passed over); without
-    them they are points spread over the surface that a hammer can strike from outside (`hammer_access`). `directions`
-    are the unit vectors along which candidates can be struck, straight into the surface where not given. A field made
-    of photographs has points where they show the object; with `unseen`, error and candidates are those of all of the
-    surface of the field's body instead. With `progress`, a terminal shows that it works.
+    Args:
+        field: A field whose gains have a posterior.
+        count: Number of contacts; fewer come where fewer candidates have no recording.
+        candidates: Places to choose from [candidates, 3], meters, on the surface; contacts of the fit are passed over.
+            By default points spread over the surface that a hammer can strike from outside (`hammer_access`).
+        directions: Unit vectors [candidates, 3] along which candidates can be struck; by default straight into the
+            surface.
+        unseen: Take error and candidates of all of the surface of the field's body. A field made of photographs
+            otherwise has points where they show the object.
+        progress: Whether a terminal shows that it works.
 
-    Raises FitError for gains without a posterior, unfit arguments, no candidate without a recording, places
-    none of which a hammer gets to, and `unseen` without a body.
+    Returns:
+        The contacts [count, 3], meters, and the expected error after each.
+
+    Raises:
+        FitError: For gains without a posterior, unfit arguments, no candidate without a recording, places none of which
+            a hammer gets to, and `unseen` without a body.
     """
     count = as_count(count, "count", raising=FitError)
     given = None if candidates is None else as_vectors(candidates, "candidates").double()

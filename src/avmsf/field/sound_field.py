@@ -138,10 +138,18 @@ class SoundField:
         save(self, path)
 
     def posterior(self, positions: ArrayLike, directions: ArrayLike | None = None) -> GainPosterior:
-        """Return the posterior of the gains of impacts at positions (object frame, meters), [contacts, 3].
+        """Return the posterior of the gains of impacts.
 
-        `directions` as in `render`. Raises FitError for a field without a posterior: of the attention network, of
-        recordings in one place, or guessed without recordings.
+        Args:
+            positions: [contacts, 3], object frame, meters.
+            directions: As in `render`.
+
+        Returns:
+            Mean and standard deviation [contacts, modes], in the unit of the training sounds.
+
+        Raises:
+            FitError: For a field without a posterior: of the attention network, of recordings in one place, or guessed
+                without recordings.
         """
         from avmsf.field.posterior import posterior
 
@@ -193,18 +201,25 @@ class SoundField:
         pulse: ForcePulse | None = None,
         noise: bool = True,
     ) -> Float[Tensor, "contacts samples"]:
-        """Return the sound of an impact at each position (object frame, meters), [contacts, 3].
+        """Return the sound of an impact at each position.
 
-        `directions`, unit vectors, [contacts, 3], are those of the impacts. One of [0, 0, 0] is unknown, as in tables
-        of contacts: the impact goes straight into the surface, as all do without `directions`. `forces`, one for all or
-        one for each, are in newtons where the recordings were divided by theirs, else relative to an average one of
-        them; without them they are 1. Of `samples` samples, or as long as the training sounds. The noise is the same at
-        every contact and in every call, so that a contact's sound depends on nothing else. Modes that are not `audible`
-        are silent.
+        The noise is the same at every contact and in every call, so that a contact's sound depends on nothing else.
+        Modes that are not `audible` are silent. The noise grows with the force as the modes do, which is a
+        simplification: recorded background noise does not depend on the force of an impact.
 
-        `pulse` is what a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
-        it is, and leaves the noise as it is. The noise grows with the force as the modes do, which is a simplification:
-        recorded background noise does not depend on the force of an impact. `noise=False` renders the modes alone.
+        Args:
+            positions: [contacts, 3], object frame, meters.
+            directions: Unit vectors [contacts, 3] of the impacts. One of [0, 0, 0] is unknown, as in tables of
+                contacts: the impact goes straight into the surface, as all do without `directions`.
+            forces: One for all or one for each, in newtons where the recordings were divided by theirs, else relative
+                to an average one of them; by default 1.
+            samples: Length of the sounds, by default that of the training sounds.
+            pulse: What a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
+                it is, and leaves the noise as it is.
+            noise: Whether the residual noise is added to the modes.
+
+        Returns:
+            Sounds [contacts, samples] at `sample_rate`, in the unit of the training sounds.
         """
         contacts, ways = self._impacts(positions, directions)
         length = self.samples if samples is None else as_count(samples, "samples")

@@ -61,8 +61,15 @@ def save(field: SoundField, path: str | Path) -> None:
 def load(path: str | Path) -> SoundField:
     """Read a field that `save` wrote; it renders what the saved one does, to the last bit.
 
-    Raises `FieldFileError` for a file that is missing, cut short, of another kind or of a newer format, and where a
-    tensor is missing, unexpected, of another shape or dtype, or not finite.
+    Args:
+        path: The .safetensors file.
+
+    Returns:
+        The field.
+
+    Raises:
+        FieldFileError: For a file that is missing, cut short, of another kind or of a newer format, and where a tensor
+            is missing, unexpected, of another shape or dtype, or not finite.
     """
     path = Path(path)
     text, tensors = read_tensors(path, FIELD)

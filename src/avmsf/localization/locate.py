@@ -53,14 +53,27 @@ def locate(
 ) -> ContactPosterior:
     """Return where on the object a recorded impact was (paper, section Contact Localization, and a posterior).
 
-    `recording` is the path of a sound file, a Recording, or the samples of one channel. Bare samples are at
-    `sample_rate` Hz, or at the field's rate. `settings` take the place of those of the capture that the field was
-    fitted to (see `preprocess_recording`), `points` and `directions` as for `Locator.of`. `force` is the peak force of
-    the impact, a number or `Force`, see `Locator.locate`; a note says where the recording's own force channel differs.
-    `locator` is one made of the field before, with points of its own. That of the last field and its own points is
-    cached, so that of several recordings only the first waits for it. With `progress`, a terminal shows that it works.
-    The sound of another object has a `refusal` in place of a position, see `assess_match`. Raises LocationError
-    as `preprocess_recording` and `Locator.locate`, and for a locator of another field or given with points.
+    The field's locator with its own points is cached, so that of several recordings only the first waits for it.
+
+    Args:
+        field: The object's field.
+        recording: Path of a sound file, a Recording, or the samples of one channel.
+        sample_rate: Of bare samples, Hz; by default the field's.
+        settings: Take the place of those of the capture that the field was fitted to (see `preprocess_recording`).
+        points: Candidates [points, 3] on the surface, meters, as for `Locator.of`; by default the field's.
+        directions: Unit vectors [points, 3] of impacts at the candidates; by default straight into the surface.
+        force: Peak force of the impact, a number or `Force`, see `Locator.locate`; a note says where the recording's
+            own force channel differs.
+        locator: One made of the field before, with points of its own.
+        progress: Whether a terminal shows that it works.
+
+    Returns:
+        Probability [points] of each candidate, and the most probable position, meters. The sound of another object has
+            a `refusal` in place of a position, see `assess_match`.
+
+    Raises:
+        LocationError: As `preprocess_recording` and `Locator.locate`, and for a locator of another field or given with
+            points.
     """
     if locator is not None and (locator.field is not field or points is not None or directions is not None):
         what = "points or directions" if locator.field is field else "another field"

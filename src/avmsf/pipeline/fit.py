@@ -75,23 +75,31 @@ def fit(
 ) -> SoundField:
     """Fit a sound field to the recordings of a capture, as `avmsf fit` does.
 
-    `capture` is a folder, or what `avmsf.read` made of it. The recordings are aligned and their modes found. The
-    object's shape is its mesh, otherwise what photographs, a video or Gaussians in the folder show. Its elastic modes
-    are computed, and the gain model is fitted and compared with the recordings by leave-one-out (`SoundField.quality`).
-    It takes seconds to minutes with a mesh, minutes with photographs. Without any shape the field knows the contacts'
-    positions alone.
+    The recordings are aligned and their modes found. The object's shape is its mesh, otherwise what photographs, a
+    video or Gaussians in the folder show. Its elastic modes are computed, and the gain model is fitted and compared
+    with the recordings by leave-one-out (`SoundField.quality`). It takes seconds to minutes with a mesh, minutes with
+    photographs. Without any shape the field knows the contacts' positions alone.
 
-    Without recordings, a `material` gives an approximate field, see `guess_field`: `capture` is then a mesh (a file or
-    a Surface), or a folder with a mesh or with photographs whose cameras are in meters.
+    Args:
+        capture: A folder, or what `avmsf.read` made of it. With `material`, a mesh (a file or a Surface), or a folder
+            with a mesh or with photographs whose cameras are in meters.
+        gain_model: By default "auto", the Gaussian process over all kernel families. It, `seed` and `device` take the
+            place of those of `config`.
+        material: Give an approximate field without recordings, of this material, see `guess_field`.
+        features: Image features of the object's points, for the gain models "visual" and "network"; by default those of
+            what the folder shows, otherwise positions.
+        config: Settings of all stages.
+        cache: Folder that keeps what each stage makes, so that only what changed is computed again; by default `.avmsf`
+            in the capture's folder where its views are used, and none otherwise.
+        seed: Of all stages; by default 0.
+        device: "cpu" or "cuda"; by default a CUDA GPU where there is one.
+        progress: Whether the standard error says what is done.
 
-    `gain_model`, `seed` (of all stages) and `device` take the place of those of `config`: by default "auto", the
-    Gaussian process over all kernel families, seed 0, and a CUDA GPU where there is one. The gain models "visual" and
-    "network" read image features of the object's points: `features`, or those of what the folder shows, otherwise
-    positions. `cache` is a folder that keeps what each stage makes, so that only what changed is computed again; by
-    default `.avmsf` in the capture's folder where its views are used, and none otherwise. With `progress`, the standard
-    error says what is done.
+    Returns:
+        The field.
 
-    Raises AvmsfError for a capture that no field can be fitted to.
+    Raises:
+        AvmsfError: For a capture that no field can be fitted to.
     """
     config = _configured(PipelineConfig() if config is None else config, gain_model, seed, device)
     source = Path(capture) if isinstance(capture, str) else capture

@@ -71,9 +71,18 @@ class Extraction:
 def extract_modes(recordings: Capture | Impacts, method: ModeFinder | None = None) -> Extraction:
     """Return the modes that the recordings share, each recording's gains and the residual noise (paper, section 3.4).
 
-    `method` is `HighResolution()` unless another is given. Recordings that are not final (`Impacts.before`) are aligned
-    with one another first. Gains are the least-squares amplitudes of the modes over the whole of each sound. Raises
-    `ExtractionError` when no mode is found, and for recordings of another type.
+    Recordings that are not final (`Impacts.before`) are aligned with one another first.
+
+    Args:
+        recordings: A capture, or the impacts of one.
+        method: By default `HighResolution()`; `ShortTime()` is the paper's.
+
+    Returns:
+        Frequencies, Hz, and dampings, 1/s, [modes]; gains [contacts, modes], the least-squares amplitudes over the
+            whole of each sound; the noise.
+
+    Raises:
+        ExtractionError: When no mode is found, and for recordings of another type.
     """
     impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
     if not isinstance(impacts, Impacts):
