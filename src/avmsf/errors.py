@@ -79,6 +79,10 @@ class FolderInUseError(AvmsfError):
     """Another process writes into this folder; `value` says which, a dict that is empty where that is not known."""
 
 
+class WorkerError(AvmsfError):
+    """A process that worked on a part ended without a result; `value` says by what."""
+
+
 class ArrayError(AvmsfError):
     """An array given to a function has a shape or values that cannot be used: argument `name`, first index `row`."""
 

@@ -1,7 +1,9 @@
 """Running an evaluation: kept as it goes, gone on with, never mixed, and the same however it is run."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -420,17 +422,20 @@ def test_killed_five_times_it_comes_to_the_same_summary(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -> None:
-    pytest.importorskip("ray")
+@pytest.mark.parametrize("address", [None, "local"])
+def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path, address: str | None) -> None:
+    if address is not None:
+        pytest.importorskip("ray")
     heard: list[int] = []
     evaluation = planned(plates, *CHEAP, "spline-gains")
-    # Workers find what the package holds, and not what lies beside the tests.
+    # Workers of ray find what the package holds, and not what lies beside the tests.
     dataset, kept = evaluation.dataset, tmp_path / "features"
     evaluation = replace(evaluation, inputs=ObjectInputs(dataset, kept))
     objects = evaluation.dataset.objects()
     run_objects(evaluation, objects, ResultsFolder(tmp_path / "one"))
     many = ResultsFolder(tmp_path / "many")
-    run_objects(evaluation, objects, many, workers=2, progress=lambda message, done, total: heard.append(done))
+    listen: Progress = lambda message, done, total: heard.append(done)  # noqa: E731
+    run_objects(evaluation, objects, many, workers=2, address=address, progress=listen)
     assert heard == [0, 1, 2, 3]
     one, other = summed(tmp_path / "one"), summed(tmp_path / "many")
     for method, figures in one["methods"].items():
@@ -438,10 +443,24 @@ def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -
     assert one["failures"] == other["failures"] == []
 
 
-def test_without_ray_the_extra_is_named(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with raises(EvaluationError, name="ray") as caught:
-        run_objects(planned(plates), ("a",), ResultsFolder(tmp_path), workers=2)
-    assert "pip install 'avmsf[scale]'" in str(caught.value)
+@pytest.mark.slow
+def test_an_object_whose_processes_are_killed_costs_no_other_its_results(plates: Path, tmp_path: Path) -> None:
+    results, evaluation = ResultsFolder(tmp_path), planned(plates, "knn3", FunctionMethod("dying", die_at_b))
+    run_objects(evaluation, ("a", "b"), results, workers=2)
+    (failure,) = summed(tmp_path)["failures"]
+    assert (failure["object"], failure["method"]) == ("b", None)
+    assert "SIGKILL" in failure["failure"]
+    assert [[each.method for each in record.outcomes] for record in results.records()] == [["knn3", "dying"], ["knn3"]]
+    run_objects(planned(plates, "knn3"), ("a", "b"), results)
+    assert summed(tmp_path)["failures"] == []
+
+
+def die_at_b(task: Task) -> Renderer:
+    if task.name == "b":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return NearestRecording(task.train)
+
+
+def test_workers_are_one_or_more(plates: Path, tmp_path: Path) -> None:
     with raises(EvaluationError, name="workers", value=0):
         run_objects(planned(plates), ("a",), ResultsFolder(tmp_path), workers=0)

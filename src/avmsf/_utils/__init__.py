@@ -14,6 +14,7 @@ What is written:
 - `checkpoint`: the state of work that may be interrupted.
 - `caching`: files that only save time, and digests of the sources that a cached result depends on.
 - `processes`: one writer at a time in a folder (`flock`), and child processes that end with their parent.
+- `parallel`: tasks in processes of their own, on this computer or on a ray cluster, begun again where one is killed.
 
 How it is computed: `compiled` (loops by numba, on several threads), `device` (CPU or GPU, denormals, threads), and
 `progress` for those who wait.

@@ -11,7 +11,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -119,10 +119,14 @@ def end_child(process: "subprocess.Popen[bytes]") -> None:
     _RUNNING.discard(process)
 
 
-def end_with_parent() -> None:
-    """Wait for the end of the standard input, which is the parent's; end this process and those that it started."""
+def _end_of_input() -> None:
     while sys.stdin.buffer.read(1):
         pass
+
+
+def end_with_parent(wait: Callable[[], object] = _end_of_input) -> None:
+    """Wait for the parent's end, by default for that of the standard input; end this process and what it started."""
+    wait()
     for process in _RUNNING.copy():
         process.kill()
     os._exit(1)

@@ -12,7 +12,7 @@ In go recordings with their contacts; out come one value for each metric, method
 - `methods`: all methods by name, those of the sound field as configurations of the pipeline. Their renderers: k nearest
   recordings, mean gains, thin-plate splines (`simple_methods`), DiffSound and SonicGauss (`avmsf.baselines`), files.
 - `plan_evaluation` (`plan`) makes an `Evaluation`; `objects` makes what its methods read of objects. `run_objects`
-  (`runner`) runs it in this process or on ray, into a `ResultsFolder` (`results`) that a stopped run goes on with;
+  (`runner`) runs it in this process or in others, into a `ResultsFolder` (`results`) that a stopped run goes on with;
   `tables` makes means, ratios to `knn3` and tables, with the paper's values (`published`), and `report` one report, as
   Markdown and as a page.
 

@@ -1,18 +1,15 @@
-"""Running an evaluation: all methods in all cases of one object after the other, or of several at a time by ray.
+"""Running an evaluation: all methods in all cases of one object after the other, or of several at a time.
 
 Each result is stored at once; what has results already is not computed again.
 """
 
 import hashlib
-import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,8 +17,9 @@ from torch import Tensor
 
 from avmsf._utils.caching import Given, Result, once
 from avmsf._utils.device import one_thread
+from avmsf._utils.parallel import run_tasks, workers_at
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import AvmsfError, EvaluationError
+from avmsf.errors import AvmsfError, EvaluationError, WorkerError
 from avmsf.evaluation.editing import Edited, Generated, score_edit
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import FieldMethod, RecordedMethod, method_named
@@ -325,92 +323,34 @@ def run_objects(
 ) -> None:
     """Evaluate all methods on the objects, except those with stored results.
 
-    `workers` is the number of parallel objects on this computer, `address` a ray cluster's or `auto`; its computers
-    must see data and results under the same paths. With one worker and no address, ray is not needed. Each object is
-    computed on one thread, so that values do not depend on the number of workers. Raises as `Evaluation.begin` and
-    `run_object`, and EvaluationError where ray is needed and not installed.
+    `workers` is the number of parallel objects on this computer, `address` a ray cluster's (see `workers_at`); its
+    computers must see data and results under the same paths. With one worker and no address, all are evaluated in this
+    process. Each object is computed on one thread, so that values do not depend on the number of workers. An object
+    whose processes end early is a failure. Raises as `Evaluation.begin`, `run_object` and `workers_at`.
     """
-    if workers < 1:
-        raise EvaluationError.expected("1 worker or more", workers, name="workers")
-    ray = _ray() if address is not None or workers > 1 else None
-    evaluation.begin(results)
-    if ray is not None:
-        with _cluster(ray, workers, address):
-            _run_remotely(ray, evaluation, identifiers, results, progress)
-        return
-    total = len(identifiers)
-    for done, identifier in enumerate(identifiers):
+    total, whole = len(identifiers), count(1)
 
-        def log(message: str, done: int = done) -> None:
-            progress(message, done, total)
+    def done(identifier: str, outcome: Exception | None) -> None:
+        if isinstance(outcome, WorkerError):
+            record = results.read(identifier) or ObjectRecord(identifier)
+            results.write(replace(record, failure=failure_of(outcome)))
+        elif outcome is not None:
+            raise outcome
+        progress(f"{identifier}: done", next(whole), total)
 
-        run_object(evaluation, identifier, results, log)
-        progress(f"{identifier}: done", done + 1, total)
-
-
-def _run_remotely(
-    ray: ModuleType, evaluation: Evaluation, identifiers: Sequence[str], results: ResultsFolder, progress: Progress
-) -> None:
-    # max_retries: a worker that was killed for memory would be killed again.
-    remote = ray.remote(num_cpus=1, max_retries=0)(_run_elsewhere)
-    shared = ray.put((evaluation, results, METRICS))
-    pending: dict[Any, str] = {remote.remote(shared, identifier): identifier for identifier in identifiers}
-    progress(f"{len(pending)} objects on ray", 0, len(identifiers))
-    try:
-        while pending:
-            # A time limit lets Ctrl-C through.
-            ready, _ = ray.wait(list(pending), num_returns=1, timeout=1.0)
-            for reference in ready:
-                identifier = pending.pop(reference)
-                try:
-                    ray.get(reference)
-                except ray.exceptions.RayError as error:
-                    cause = getattr(error, "cause", None)
-                    if isinstance(cause, Exception) and not isinstance(cause, ray.exceptions.RayError):
-                        raise cause from None
-                    got = f"one that ended early ({str(error).splitlines()[0]})"
-                    advice = "run the command again, with fewer --workers if memory ran out"
-                    raise EvaluationError.expected(
-                        "a worker process that finishes", got=got, name=identifier, advice=advice
-                    ) from error
-                progress(f"{identifier}: done", len(identifiers) - len(pending), len(identifiers))
-    finally:
-        for reference in pending:
-            ray.cancel(reference, force=True)
+    with workers_at(workers, address, raising=EvaluationError) as parallel:
+        evaluation.begin(results)
+        if workers > 1 or address is not None:
+            progress(f"{total} objects in parallel", 0, total)
+            act = partial(_run_elsewhere, (evaluation, results, METRICS))
+            run_tasks(act, {each: each for each in identifiers}, parallel, done)
+            return
+        for number, identifier in enumerate(identifiers):
+            run_object(evaluation, identifier, results, lambda message, number=number: progress(message, number, total))
+            done(identifier, None)
 
 
 def _run_elsewhere(shared: tuple[Evaluation, ResultsFolder, dict[str, MetricEntry]], identifier: str) -> None:
     evaluation, results, metrics = shared
     METRICS.update(metrics)
     run_object(evaluation, identifier, results)
-
-
-@contextmanager
-def _cluster(ray: ModuleType, workers: int, address: str | None) -> Iterator[None]:
-    local = {"num_cpus": workers, "include_dashboard": False, "address": "local"}
-    settings = local if address is None else {"address": address}
-    try:
-        ray.init(log_to_driver=False, logging_level="error", **settings)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        wanted, advice = "a cluster to connect to", "check that it runs and has this address"
-        if address is None:
-            wanted, advice = "ray to start on this computer", "use --workers 1, which needs no ray"
-        reason = " ".join(str(error).split())
-        raise EvaluationError.expected(wanted, address, got=reason, name="ray", advice=advice) from error
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-def _ray() -> ModuleType:
-    # One computer needs no authentication, and no usage is reported.
-    os.environ.setdefault("RAY_AUTH_MODE", "disabled")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    try:
-        import ray
-    except ImportError as error:
-        advice = "pip install 'avmsf[scale]', or omit --workers and --ray"
-        raise EvaluationError.expected("an installed package", name="ray", advice=advice) from error
-    return ray
