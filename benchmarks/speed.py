@@ -1,10 +1,14 @@
 """How long a training step, a whole fit, a rendered sound and a command take, and the memory of a step."""
 
+import os
+import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -14,6 +18,8 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.modal.extraction.extract import extract_modes
+from avmsf.simulate.recipe import SIM20
+from avmsf.simulate.simulation_folder import simulate_set
 from benchmarks.objects import IMPULSE, QUICK_FIT, STRUCK, shared_data
 from benchmarks.processes import apart, peak_gigabytes, processor_seconds, timed
 from benchmarks.records import Measurement, Record, Settings, records
@@ -92,6 +98,51 @@ def _commands(settings: Settings) -> Iterator[Record]:
         yield from records({"seconds": seconds, "over_import": seconds / taken["import"]}, object=each)
 
 
+def _many(settings: Settings) -> Iterator[Record]:
+    """Fields of ten simulated objects: ten commands in turn, one command of one worker, one of two workers.
+
+    The first ten of sim-20, with 8 impacts of .5 s and a mesh; default settings, no stage cached, each command on all
+    cores, each worker on one. speed: over one worker. agreement: part of the fields that are one worker's to the bit.
+    gigabytes: most memory of a process. megabytes: of ten fields with their records, and of the caches.
+    """
+    names = settings.some(list(SIM20)[:10], 2)
+    with tempfile.TemporaryDirectory() as name:
+        place, fields = Path(name), dict[str, list[bytes]]()
+        simulate_set({each: replace(SIM20[each], impacts=8, seconds=0.5, views=0) for each in names}, place / "sim")
+        captures, one = [place / "sim" / each for each in names], 0.0
+        for way in ("one worker", "two workers", "commands"):
+            output, cache = place / way, place / f"{way} cache"
+            more = ["--gain-model", "smooth"] if settings.quick else []
+            workers = 2 if way == "two workers" else 1
+            together = [*captures, "-o", output, "--cache", cache, "--workers", workers, *more]
+            apart = [
+                [each, "-o", output / f"{each.name}.safetensors", "--cache", cache / each.name, *more]
+                for each in captures
+            ]
+            before = processor_seconds()
+            _, taken = timed(partial(_fit, apart if way == "commands" else [together], cache))
+            worked = processor_seconds() - before
+            fields[way] = [(output / f"{each}.safetensors").read_bytes() for each in names]
+            one = one or taken
+            same = [a == b for a, b in zip(fields[way], fields["one worker"], strict=True)]
+            values = {"seconds": taken, "processor_seconds": worked, "speed": one / taken}
+            values["agreement"] = sum(same) / len(same)
+            values |= {"gigabytes": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9}
+            values |= {"megabytes": _megabytes(output), "cache_megabytes": _megabytes(cache)}
+            yield from records(values, object=way)
+
+
+def _fit(commands: list[list[object]], cache: Path) -> None:
+    """Run `avmsf fit` with the words of each command; tetrahedra are kept in the cache too."""
+    avmsf, environment = Path(sys.executable).with_name("avmsf"), os.environ | {"AVMSF_CACHE": f"{cache}/tetrahedra"}
+    for words in commands:
+        subprocess.run([str(avmsf), "fit", "--quiet", *map(str, words)], check=True, env=environment)
+
+
+def _megabytes(folder: Path) -> float:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 1e6
+
+
 def _seconds(command: list[str]) -> float:
     """Run a command and return the processor time that it took."""
     before = processor_seconds()
@@ -99,4 +150,10 @@ def _seconds(command: list[str]) -> float:
     return processor_seconds() - before
 
 
-PARTS: dict[str, Measurement] = {"step": _step, "render": _render, "quick": _quick, "commands": _commands}
+PARTS: dict[str, Measurement] = {
+    "step": _step,
+    "render": _render,
+    "quick": _quick,
+    "commands": _commands,
+    "many": _many,
+}

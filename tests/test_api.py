@@ -39,6 +39,7 @@ from avmsf.pipeline import PipelineConfig
 from factories.plate_capture import fill_plate
 from factories.plate_field import RATE, plate_impacts
 from factories.raising import raises, warns
+from factories.settings import sets
 
 NAMES = {
     *("Capture", "SoundField", "Surface"),
@@ -106,7 +107,7 @@ def test_fit_says_what_it_does_unless_that_is_turned_off(capfd):
 
 def test_fit_makes_the_field_that_the_command_makes(tmp_path):
     folder, output = fill_plate(tmp_path / "plate", surface=False), tmp_path / "field.safetensors"
-    assert main(["fit", str(folder), "--output", str(output), "--modes", "6", "--set", "fit.steps=5"]) == 0
+    assert main(["fit", str(folder), "--output", str(output), *sets("modes=6 fit.steps=5")]) == 0
     made = avmsf.fit(avmsf.read(str(folder)), config=PipelineConfig(modes=6, fit=FitConfig(steps=5)), progress=False)
     one, other = made.render([CONTACT]), avmsf.load(output).render([CONTACT])
     # Modes of two runs differ in their last digits.

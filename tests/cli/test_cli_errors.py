@@ -107,7 +107,7 @@ EARLY: dict[str, dict[str, Any]] = {
     "fit empty --until gaussians": {"file": "empty"},
     "fit empty --material glass": {"file": "empty"},
     "fit plate -o f.safetensors --device tpu": {"name": "device", "value": "tpu"},
-    "fit plate -o f.safetensors --modes 0": {"name": "modes", "value": 0},
+    "fit plate -o f.safetensors --set modes=0": {"name": "modes", "value": 0},
     "info newer.safetensors": {"file": "newer.safetensors"},
     "locate field.safetensors": {"name": "recordings", "value": 0},
     "suggest not-ours.safetensors": {"file": "not-ours.safetensors"},

@@ -74,5 +74,5 @@ def test_an_interruption_keeps_the_modes_once_they_are_found(tmp_path: Path, mon
     monkeypatch.setattr(extract, "extract_modes", refuse)
     # The modes that are kept are this method's alone.
     with pytest.raises(SoughtAgainError):
-        main([*words, "--extraction", "short-time"])
+        main([*words, "--set", "extraction=short-time"])
     assert main(words) == 0

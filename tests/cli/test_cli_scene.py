@@ -23,7 +23,7 @@ from factories.verbs import results_of
 Streams = pytest.CaptureFixture[str]
 LIFT = sets("lift.encoder=descriptors lift.points=1200")
 RENDERED = sets("views.rendered=48 views.count=18")
-MODES = ("--modes", "12")
+MODES = ("--set", "modes=12")
 FIT = TINY[: -len(MODES)]
 SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gain-model", "network")
 

@@ -68,7 +68,7 @@ def test_a_help_fits_on_one_screen(verb: str, capsys: Streams, monkeypatch: pyte
 @pytest.mark.parametrize(
     ("options", "needed", "words"),
     [
-        (FitOptions, ["mug"], "--preset paper --set time_zero=null --modes 5 --seed 3 --set fft_sizes=512,256"),
+        (FitOptions, ["mug"], "--preset paper --set time_zero=null --set modes=5 --seed 3 --set fft_sizes=512,256"),
         (SimulateOptions, [], "--set noise_db=None --set mesh=a.obj -o x mug-ceramic --impacts 5 --set hammer.mass=1"),
         (EvaluateOptions, ["farthest", "data"], "--set geometry=noisy --set body.wall=0"),
         (EditOptions, ["field", "-o", "new"], "--set prompt.generated=x.wav --set model_seconds=Infinity"),
@@ -104,7 +104,9 @@ def test_the_objects_of_a_set_stay_what_they_are(words: list[str], tmp_path: Pat
     assert made == replace(recipe, impacts=5)
 
 
-@pytest.mark.parametrize("words", [["--modes", "4", "--set", "modes=5"], ["--seed", "1", "--set", "fit.seed=2"]])
+@pytest.mark.parametrize(
+    "words", [["--gain-model", "smooth", "--set", "gain_model=visual"], ["--seed", "1", "--set", "fit.seed=2"]]
+)
 def test_a_setting_is_given_once(words: list[str]) -> None:
     with raises(AvmsfError, name=words[-1].partition("=")[0]):
         _ = FitOptions.parse(["mug", *words]).all_settings

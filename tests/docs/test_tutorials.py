@@ -25,10 +25,10 @@ PHOTOGRAPHS, PYTHON = "**With photographs**", "## Python"
 FEW_STEPS = sets("splat.steps=60 splat.start_points=800")
 FEW_VIEWS = sets("views.rendered=48 views.count=18")
 SMALL = {
-    "fit bowl.ply": ("--modes", "8", *sets("body.dofs=2000 body.wall=0.003")),
+    "fit bowl.ply": sets("modes=8 body.dofs=2000 body.wall=0.003"),
     "fit": (
         *(*FEW_STEPS, *FEW_VIEWS, *sets("lift.encoder=descriptors lift.symmetry=false")),
-        *("--gain-model", "smooth", "--modes", "8", "--set", "fit.steps=4"),
+        *("--gain-model", "smooth", *sets("modes=8 fit.steps=4")),
     ),
     "evaluate": sets("modes=8"),
     "evaluate shots": ("--methods", "knn3", "--counts", "3", "--starts", "1", *sets("modes=8")),

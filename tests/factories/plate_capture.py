@@ -13,8 +13,7 @@ PLATE = Plate(alpha=40.0)
 
 TINY = (
     *sets("fit.clusters=8 fit.width=16 fit.hidden=32 fit.layers=1 fit.fft_sizes=1024,256 fit.warmup_steps=12"),
-    *sets("fit.steps=6 fit.early=1024 fit.damping=shared"),
-    *("--modes", "12"),
+    *sets("fit.steps=6 fit.early=1024 fit.damping=shared modes=12"),
 )
 
 

@@ -69,7 +69,7 @@ def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
     own = CaptureSettings(seconds=1.0, time_zero="peak")
     assert own.starting(PipelineConfig().time_zero) == own
     assert replace(own, time_zero="onset").starting(PRESETS["paper"].time_zero) == own
-    onset = FitOptions.parse(["mug", "--output", "f", "--time-zero", "onset"]).all_settings.time_zero
+    onset = FitOptions.parse(["mug", "--output", "f", "--set", "time_zero=onset"]).all_settings.time_zero
     assert own.starting(onset) == replace(own, time_zero="onset")
 
 

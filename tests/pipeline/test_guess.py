@@ -23,6 +23,7 @@ from avmsf.pipeline.bodies import expect_no_recordings, guess_field
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from factories.made_modes import breathing_sphere
 from factories.raising import raises
+from factories.settings import sets
 from oracles.block import block
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.02, 0.012
@@ -147,7 +148,7 @@ def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):
 
 def test_a_mesh_and_a_material_give_a_field_from_the_command_line(tmp_path: Path):
     write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
-    words = ["fit", str(tmp_path), "--material", "steel", "--modes", "12", "--set", "body.dofs=6000"]
+    words = ["fit", str(tmp_path), "--material", "steel", *sets("modes=12 body.dofs=6000")]
     words += ["--output", str(tmp_path / "field.safetensors")]
     assert main(words) == 0
     found = load(tmp_path / "field.safetensors").bank.frequency

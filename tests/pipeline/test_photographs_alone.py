@@ -21,7 +21,7 @@ from factories.small_scene import SMALL_SPLAT, slab_views
 Streams = pytest.CaptureFixture[str]
 SMALL = (
     *SMALL_SPLAT,
-    *(*sets("lift.encoder=descriptors lift.points=600 lift.symmetry=false"), "--modes", "12"),
+    *sets("lift.encoder=descriptors lift.points=600 lift.symmetry=false modes=12"),
     *TINY[:-2],
 )
 
@@ -55,7 +55,7 @@ def test_the_thickness_of_a_wall_reaches_the_report(tmp_path: Path, capsys: Stre
     folder = tmp_path / "mug"
     shutil.copytree(EXAMPLE_FOLDER, folder)
     words = [*sets("splat.steps=100 splat.start_points=3000 lift.encoder=descriptors")]
-    words += [*sets("lift.symmetry=false fit.steps=2"), "--train-count", "12", "--modes", "32"]
+    words += [*sets("lift.symmetry=false fit.steps=2 modes=32"), "--train-count", "12"]
     bodies = [*sets("body.shapes=16 body.dofs=8000 body.supports=free")]
     assert main(["fit", str(folder), *words, *bodies, "--json"]) == 0
     made = json.loads(capsys.readouterr().out)

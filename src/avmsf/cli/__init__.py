@@ -4,7 +4,7 @@ What goes in are words; what comes out are files, text on the standard error and
 tables for people or with `--json` as one object. Each module of a verb has `Options`, a frozen dataclass of which tyro
 makes the command line, and `run(options)`, which imports what computes, calls the package and prints: start reading
 with `render`. `options` parses and checks before anything is loaded, `settings` reads `--set` and `--config`, `paths`
-says what files and folders have to be, `output` prints.
+says what files and folders have to be, `many` runs a verb for each of several inputs, `output` prints.
 """
 
 import _thread
@@ -25,8 +25,8 @@ from typing import Any
 
 import avmsf
 from avmsf._utils.text import printable
-from avmsf.cli.output import display, print_json, say
-from avmsf.errors import NO_MEMORY, AvmsfError, AvmsfWarning, lacks_memory
+from avmsf.cli.output import display, print_json, say, show_plainly
+from avmsf.errors import NO_MEMORY, AvmsfError, lacks_memory
 
 VERBS = {
     "check": "Check the recordings of a capture: levels, noise, clipping, onsets, second impacts and alignment.",
@@ -116,7 +116,7 @@ def _run(words: list[str]) -> int:
             options.check_inputs()
             goes_on = "; repeat the command to continue" if options.resumes else ""
             display.shown, display.verbose = not options.quiet, options.verbose
-            _show_plainly()
+            show_plainly()
             display.doing("loading")
             code: int = import_module(f"avmsf.cli.{words[0]}").run(options)
             return code
@@ -212,18 +212,3 @@ def _explain(words: list[str]) -> int:
     for name, sentence in {**VERBS, "--help": "Print this list.", "--version": "Print the version."}.items():
         print(textwrap.fill(sentence, width, initial_indent=f"  {name:{indent - 2}}", subsequent_indent=" " * indent))
     return 0
-
-
-def _show_plainly() -> None:
-    """Let what a user should know appear once, as a sentence, without Python's file, line and category."""
-    others, shown = warnings.showwarning, set[str]()
-
-    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-        if not issubclass(category, AvmsfWarning):
-            others(message, category, *where, **more)
-        elif str(message) not in shown:
-            shown.add(str(message))
-            print(f"note: {printable(str(message))}", file=sys.stderr)
-
-    warnings.simplefilter("always", AvmsfWarning)
-    warnings.showwarning = show

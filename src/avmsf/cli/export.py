@@ -1,8 +1,8 @@
-"""`avmsf export`: a field in the formats of other tools."""
+"""`avmsf export`: a field, or many, in the formats of other tools."""
 
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,9 +12,10 @@ import tyro
 from avmsf._utils.text import counted, format_number
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
-from avmsf.cli.options import Common, Flag, Int, Number, Unit, option_of
+from avmsf.cli.many import Many, run_many
+from avmsf.cli.options import Flag, Int, Number, Unit, option_of
 from avmsf.cli.output import next_step, note, print_result
-from avmsf.cli.paths import ContactTable, FieldFile, New, OtherCapture, PositionList, ShapeFile, arg
+from avmsf.cli.paths import ContactTable, FieldFiles, New, OtherCapture, PositionList, ShapeFile, arg
 from avmsf.errors import ExportError
 from avmsf.export.writing import POINTS, SUFFIXES, Axis, Format, Precision, check_free
 from avmsf.modal.config import PulseShape
@@ -55,16 +56,17 @@ _DEAD_DB = 40.0
 
 
 @dataclass(frozen=True)
-class Options(Common):
+class Options(Many):
     """Write a field for other tools: web page, glTF, Faust, samplers, modal analysis.
 
     web: a page that plays impacts, as a folder or one .html file. gltf: a .glb that any viewer shows, with the draft
     extension KHR_audio_rigid_bodies. faust: a .dsp with controls, or a .lib. wavs: sounds with a table and an SFZ
-    instrument. uff: the universal file format. avmsf-demo: the layout of the paper's demo.
+    instrument. uff: the universal file format. avmsf-demo: the layout of the paper's demo. Of several fields, -o is a
+    folder of their exports, --capture one of their captures.
     """
 
-    field: tyro.conf.Positional[FieldFile]
-    """Field file, as `avmsf fit` writes it."""
+    fields: tyro.conf.Positional[FieldFiles]
+    """Field files, as `avmsf fit` writes them."""
     to: Format
     """Format to write."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE|FOLDER")]
@@ -104,6 +106,35 @@ class Options(Common):
     precision: Annotated[Precision, arg("float16|float32")] = "float32"
     """avmsf-demo: number format of the gains."""
 
+    given = "fields"
+    alone = ("object", *_CONTACTS)
+
+    @property
+    def field(self) -> Path:
+        """The field, where there is one."""
+        return self.fields[0]
+
+    @property
+    def written(self) -> Path | None:
+        """The file or folder of `--output`."""
+        return self.output
+
+    def of(self, given: Path, output: Path) -> "Options":
+        """Return the options for one of many fields."""
+        capture = None if self.capture is None else self.capture / output.name
+        path = output.with_name(f"{output.name}{SUFFIXES.get(self.to, ('',))[0]}")
+        return replace(self, fields=(given,), output=path, capture=capture)
+
+    def read(self) -> Iterator[Path]:
+        """Return the files and folders on whose content the output depends."""
+        yield from super().read()
+        if self.capture is not None and (self.capture / CACHE / SURFACE).is_file():
+            yield self.capture / CACHE / SURFACE
+
+    def cells(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Return what the table of many shows of an export."""
+        return {"bytes": str(values.get("bytes", "")), "error": str(values.get("error", ""))}
+
     @property
     def contacts_given(self) -> bool:
         """Whether the contacts are given, and used by the format."""
@@ -112,6 +143,8 @@ class Options(Common):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
+        if len(self.fields) > 1:
+            return
         given = sum((bool(self.position), self.contact_table is not None, self.contacts is not None))
         if self.contacts_given and given > 1:
             wanted, advice = "contacts by one of --position, --contact-table and --contacts", "leave out the others"
@@ -134,6 +167,8 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
+    if len(options.fields) > 1:
+        return run_many("export", options, raising=ExportError)
     from avmsf.export.faust import contacts_path
     from avmsf.export.samples import INSTRUMENT
     from avmsf.export.write import WRITERS

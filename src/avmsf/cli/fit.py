@@ -1,4 +1,4 @@
-"""`avmsf fit`: a capture folder in, a field file out, or what a stage before it makes."""
+"""`avmsf fit`: a capture folder in, a field file out, or what a stage before it makes; of many, a folder of these."""
 
 import shlex
 from collections.abc import Mapping
@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from avmsf._utils.text import listed
+from avmsf._utils.text import format_number, listed
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings
+from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import (
     Configured,
     Device,
@@ -30,8 +31,7 @@ from avmsf.cli.settings import with_settings
 from avmsf.errors import EvaluationError, FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import GainModelName
-from avmsf.modal.config import ExtractionMethod
-from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset, TimeZero
+from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset
 
 if TYPE_CHECKING:
     from avmsf.evaluation.scores import Scores
@@ -54,22 +54,22 @@ _RENDER = "--position X Y Z -o impact.wav"
 
 
 @dataclass(frozen=True)
-class Options(Configured):
+class Options(Configured, Many):
     """Fit a sound field to a capture and write it to one file.
 
-    CAPTURE holds impacts.csv, the recordings that it names, and what shows the object: a mesh, photographs, a video or
-    Gaussians. A mesh is used before photographs. Without recordings, --material gives an approximate field. The output
-    of each stage is cached, and only what changed is computed again.
+    A capture holds impacts.csv, the recordings that it names, and a mesh, photographs, a video or Gaussians, of which a
+    mesh is used first. Without recordings, --material gives an approximate field. The output of each stage is cached.
+    Of several captures, -o is a folder: it gets a file of each, and a table.
     """
 
-    capture: tyro.conf.Positional[
+    captures: tyro.conf.Positional[
         Annotated[
-            Path,
-            tyro.conf.arg(metavar="CAPTURE"),
+            tuple[Path, ...],
+            arg("CAPTURE ..."),
             Existing("a capture folder, or a mesh with --material", ("a folder", "a mesh or Gaussians")),
         ]
     ]
-    """Capture folder, or with --material a mesh."""
+    """Capture folders, or with --material meshes."""
     output: Annotated[Path | None, arg("FILE", "-o")] = None
     """The field (.safetensors), by default in the cache; with --until .ply, .obj, .glb, .safetensors."""
     until: Annotated[Stage | None, arg("STAGE")] = None
@@ -83,29 +83,23 @@ class Options(Configured):
     material: Name = None
     """Approximate field without recordings: of ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
     train_fraction: Number = None
-    """Fit to this part of the contacts, score the others."""
+    """Fit to this part of contacts, score the others."""
     train_count: Int = None
-    """Fit to so many, spread contacts, score the others."""
-    start: int = 0
+    """Fit to so many, spread; score the others."""
+    start: Annotated[int, arg("INT")] = 0
     """Row of impacts.csv where this choice starts."""
     features: Annotated[
         Path | None,
         arg("FILE"),
         Existing("features, as avmsf fit --until features writes them", ("features",)),
     ] = None
-    """Features, in place of those of the folder's views."""
+    """Features in place of those of the views."""
     allow_missing_features: Flag = False
-    """With --preset paper: train without visual features where there are none."""
+    """paper: without image features if there are none."""
     without_shape: Flag = False
     """Fit to the positions of the contacts alone."""
     gain_model: Annotated[GainModelName | None, arg("NAME")] = None
     """auto (default), network (paper), smooth, thin-plate, symmetry, visual or elastic."""
-    extraction: Annotated[ExtractionMethod | None, arg("NAME")] = None
-    """high-resolution (default) or short-time (paper)."""
-    modes: Int = None
-    """Modes at most, by default 128."""
-    time_zero: Annotated[TimeZero | None, arg("onset|peak")] = None
-    """Start of the sounds, by default of capture.toml."""
     device: Device = None
     """For views and training, by default the GPU."""
     seed: Int = None
@@ -114,12 +108,39 @@ class Options(Configured):
     """paper: all settings as published; takes hours."""
 
     usual = PRESETS["default"]
+    given = "captures"
+    alone = ("features",)
+
+    @property
+    def capture(self) -> Path:
+        """The capture, where there is one."""
+        return self.captures[0]
+
+    @property
+    def written(self) -> Path | None:
+        """The file or folder of `--output`."""
+        return self.output
+
+    def of(self, given: Path, output: Path) -> "Options":
+        """Return the options for one of many captures."""
+        cache, plots = (None if each is None else each / output.name for each in (self.cache, self.plots))
+        path = output.with_name(f"{output.name}{_SUFFIXES[self.until][0]}")
+        return replace(self, captures=(given,), output=path, cache=cache, plots=plots)
+
+    def cells(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Return what the table of many shows of a field."""
+        error = values.get("scores", {}).get("field", {}).get("relative_stft")
+        return {
+            "modes": str(values.get("modes", "")),
+            "quality": values.get("quality") or "",
+            "relative STFT error": "" if error is None else format_number(error),
+        }
 
     @cached_property
     def all_settings(self) -> PipelineConfig:
         """The preset with the settings that are given."""
         seeds = ("fit.seed", "scene.views.seed", "scene.splat.seed", "scene.lift.seed")
-        options = {name: getattr(self, name) for name in ("gain_model", "extraction", "modes", "time_zero", "device")}
+        options = {name: getattr(self, name) for name in ("gain_model", "device")}
         options["allow_missing_features"] = self.allow_missing_features or None
         return with_settings(
             PRESETS[self.preset], self.set, self.config, {**options, **dict.fromkeys(seeds, self.seed)}
@@ -136,14 +157,18 @@ class Options(Configured):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        if self.output is not None:
+        one, config = len(self.captures) == 1, self.all_settings
+        if one and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
-        config = self.all_settings
         expect_device(config.device, raising=FitError)
-        settings = read_settings(self.capture, self.settings)
         if self.material is not None:
             material_named(self.material, option="--material")
         self._check_unused(config)
+        if one:
+            self._check_capture(read_settings(self.capture, self.settings))
+
+    def _check_capture(self, settings: CaptureSettings) -> None:
+        """Raise for a capture that is not there, or not whole."""
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
             expect_views(self.capture, settings)
         elif self.material is None:
@@ -183,6 +208,8 @@ class Options(Configured):
 
 def run(options: Options) -> int:
     """Fit, write, and print a summary."""
+    if len(options.captures) > 1:
+        return run_many("fit", options, raising=FitError)
     from avmsf._utils.device import TRAINABLE, usable_device
 
     usable_device(options.device, raising=FitError, kinds=TRAINABLE)

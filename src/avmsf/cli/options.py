@@ -131,7 +131,7 @@ class Configured(Common, ABC):
         # What has no default is not read.
         hints = get_type_hints(cls)
         needed: dict[str, Any] = {
-            each.name: each.name if hints[each.name] is str else Path(each.name)
+            each.name: {str: each.name, Path: Path(each.name)}.get(hints[each.name], (Path(each.name),))
             for each in fields(cls)
             if each.default is MISSING and each.default_factory is MISSING
         }

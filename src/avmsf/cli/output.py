@@ -4,12 +4,14 @@ import json
 import math
 import shlex
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from avmsf._utils.progress import ProgressDisplay
 from avmsf._utils.text import printable
+from avmsf.errors import AvmsfWarning
 
 
 class _Console(ProgressDisplay):
@@ -75,6 +77,21 @@ def print_result(text: str, values: Mapping[str, Any]) -> None:
     """Print a verb's result: as text, and with --json as values too."""
     show(text)
     print_json(values)
+
+
+def show_plainly() -> None:
+    """Let what a user should know appear once, as a sentence, without Python's file, line and category."""
+    others, shown = warnings.showwarning, set[str]()
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, AvmsfWarning):
+            others(message, category, *where, **more)
+        elif str(message) not in shown:
+            shown.add(str(message))
+            print(f"note: {printable(str(message))}", file=sys.stderr)
+
+    warnings.simplefilter("always", AvmsfWarning)
+    warnings.showwarning = show
 
 
 def _plain(value: Any) -> Any:

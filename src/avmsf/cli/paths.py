@@ -102,6 +102,11 @@ FieldFile = Annotated[
     tyro.conf.arg(metavar="FIELD.safetensors"),
     Existing("a sound field, as avmsf fit writes it", ("a sound field",)),
 ]
+FieldFiles = Annotated[
+    tuple[Path, ...],
+    arg("FIELD ..."),
+    Existing("sound fields, as avmsf fit writes them", ("a sound field",)),
+]
 CaptureFolder = Annotated[
     Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv", ("a folder",))
 ]

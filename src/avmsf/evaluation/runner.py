@@ -346,7 +346,11 @@ def run_objects(
             run_tasks(act, {each: each for each in identifiers}, parallel, done)
             return
         for number, identifier in enumerate(identifiers):
-            run_object(evaluation, identifier, results, lambda message, number=number: progress(message, number, total))
+
+            def log(message: str, number: int = number) -> None:
+                progress(message, number, total)
+
+            run_object(evaluation, identifier, results, log)
             done(identifier, None)
 
 

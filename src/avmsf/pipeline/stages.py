@@ -37,6 +37,8 @@ class Kept:
     """How long the stage took when it ran."""
     fresh: bool
     """Whether it ran now."""
+    values: Mapping[str, Any]
+    """What its function returned of plain values when it ran."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,9 @@ class Stage:
 
     name: str
     """Of its output in the folder."""
-    make: Callable[..., object]
-    """Receives the output's path, and those of the stages that it depends on; leaves it whole or not at all."""
+    make: Callable[..., Mapping[str, Any] | None]
+    """Receives the output's path, and those of the stages that it depends on; leaves it whole or not at all. What plain
+    values it returns are kept too."""
     inputs: tuple[str, ...] = ()
     """The stages that it depends on."""
     recipe: Callable[[], Mapping[str, Any]] = dict
@@ -63,8 +66,8 @@ class StageFolder:
     what it left in its checkpoint is there then, unless its recipe has changed meanwhile.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, option: str = "--cache") -> None:
+        self.folder, self.option = folder, option
 
     def lock(self, command: str, *, wait: float = WAIT) -> AbstractContextManager[None]:
         """Return a context in which no other process or thread makes or replaces a stage here.
@@ -72,7 +75,7 @@ class StageFolder:
         Hold it from the first stage until the last output is read: stages read each other's files. Raises
         FolderInUseError where another process, which is told `command`, holds it for longer than `wait` seconds.
         """
-        advice = ", or choose another folder by --cache"
+        advice = f", or choose another folder by {self.option}"
         return write_lock(self.folder, "stages", command=command, wait=wait, advice=advice, parents=True)
 
     def path(self, name: str) -> Path:
@@ -100,16 +103,16 @@ class StageFolder:
             if not same:
                 self.checkpoint(name).unlink(missing_ok=True)
         if current and (stage.usable is None or stage.usable(path)):
-            return Kept(path, known["digest"], float(known["seconds"]), fresh=False)
+            return Kept(path, known["digest"], float(known["seconds"]), fresh=False, values=known.get("values", {}))
         with self._explaining(name):
             _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
-        stage.make(path, *(kept.path for kept in inputs.values()))
+        values = stage.make(path, *(kept.path for kept in inputs.values())) or {}
         with self._explaining(name):
             digest, seconds = digest_of(path), time.monotonic() - begun
-            _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3)})
+            _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3), "values": values})
         discard(self.checkpoint(name))
-        return Kept(path, digest, seconds, fresh=True)
+        return Kept(path, digest, seconds, fresh=True, values=values)
 
     @contextmanager
     def _explaining(self, name: str) -> Iterator[None]:
@@ -123,7 +126,7 @@ class StageFolder:
             reason = cause.strerror or str(cause)
             path = self.path(name)
             raise CaptureError.expected(
-                "a readable and writable path", reason, file=path, advice=f"{way_out(cause)} by --cache"
+                "a readable and writable path", reason, file=path, advice=f"{way_out(cause)} by {self.option}"
             ) from cause
 
 
@@ -150,10 +153,15 @@ class Pipeline:
         return self[stage.name]
 
 
-def digest_of(path: Path) -> str:
-    """Return a digest of a file's content, or of the names and contents of all files in a folder."""
+def digest_of(path: Path, *, hidden: bool = True) -> str:
+    """Return a digest of a file's content, or of the names and contents of all files in a folder, or all not `hidden`.
+
+    Hidden is what has a name that begins with a dot, or lies in such a folder, as in that of a cache.
+    """
     if path.is_dir():
-        return digest_files((each for each in path.rglob("*") if each.is_file()), root=path)
+        inside = ((each, each.relative_to(path).parts) for each in path.rglob("*") if each.is_file())
+        shown = (each for each, parts in inside if hidden or not any(part.startswith(".") for part in parts))
+        return digest_files(shown, root=path)
     return digest_files([path], root=path.parent)
 
 

@@ -165,7 +165,7 @@ class ShortTime(ModeFinder):
 
 
 FINDERS: dict[ExtractionMethod, type[ModeFinder]] = {"high-resolution": HighResolution, "short-time": ShortTime}
-"""By the names that `--extraction` and `PipelineConfig.extraction` take."""
+"""By the names that `avmsf modes --extraction` and `PipelineConfig.extraction` take."""
 
 
 def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
