@@ -156,9 +156,11 @@ class Edits:
         source, known = self.materials.get(identifier), set(self.materials.values())
         found = []
         for target in (target for first, target in TRANSITIONS if first == source and target in known):
-            alike = [name for name, material in self.materials.items() if material == source]
-            others = [name for name, material in self.materials.items() if material == target]
-            goals = [others[alike.index(identifier) % len(others)]] if self.settings.model is None else PROMPTS[target]
+            sources = [name for name, material in self.materials.items() if material == source]
+            targets = [name for name, material in self.materials.items() if material == target]
+            goals = (
+                [targets[sources.index(identifier) % len(targets)]] if self.settings.model is None else PROMPTS[target]
+            )
             found += [replace(case, fold=f"{source} to {target}: {goal}", target=target, goal=goal) for goal in goals]
         if not found:
             pairs = ", ".join(f"{first} to {second}" for first, second in TRANSITIONS if second in known)

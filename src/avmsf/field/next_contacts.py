@@ -73,10 +73,8 @@ def suggest(
         count: Number of contacts; fewer come where fewer candidates have no recording.
         candidates: Places to choose from [candidates, 3], meters, on the surface; contacts of the fit are passed over.
             By default points spread over the surface that a hammer can strike from outside (`hammer_access`).
-        directions: Unit vectors [candidates, 3] along which candidates can be struck; by default straight into the
-            surface.
-        unseen: Take error and candidates of all of the surface of the field's body. A field made of photographs
-            otherwise has points where they show the object.
+        directions: Unit vectors [candidates, 3] of their impacts; by default straight into the surface.
+        unseen: Use all of the surface of the field's body, also where no photograph shows the object.
         progress: Whether a terminal shows that it works.
 
     Returns:
@@ -88,13 +86,7 @@ def suggest(
     """
     count = as_count(count, "count", raising=FitError)
     given = None if candidates is None else as_vectors(candidates, "candidates").double()
-    if isinstance(field.gain_field, ScaledGains):
-        wanted, advice = "a field as fitted", "give the unedited field"
-        raise FitError.expected(wanted, "edited", got="an edited one", name="field", advice=advice)
-    gains = fitted_mixture(field)
-    if unseen and gains.body is None:
-        wanted, advice = "a field with the object's surface", "leave unseen out, or give candidates"
-        raise FitError.expected(wanted, True, got="one without", name="unseen", advice=advice)
+    gains = _mixture_of(field, unseen)
     _expect_directions(directions, given)
     with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
@@ -126,6 +118,18 @@ def suggest(
         points,
         len(points) - len(pool) if given is None else 0,
     )
+
+
+def _mixture_of(field: SoundField, unseen: bool) -> MixtureGains:
+    """Return the gains of a field. Raises FitError for an edited field, and with `unseen` for one without a body."""
+    if isinstance(field.gain_field, ScaledGains):
+        wanted, advice = "a field as fitted", "give the unedited field"
+        raise FitError.expected(wanted, "edited", got="an edited one", name="field", advice=advice)
+    gains = fitted_mixture(field)
+    if unseen and gains.body is None:
+        wanted, advice = "a field with the object's surface", "leave unseen out, or give candidates"
+        raise FitError.expected(wanted, True, got="one without", name="unseen", advice=advice)
+    return gains
 
 
 class _ExpectedError:

@@ -106,15 +106,10 @@ def fit(
     with ProgressDisplay() as display:
         listener = display.listener if progress else ProgressListener()
         if material is not None:
-            if isinstance(source, Capture):
-                raise FitError.expected("a mesh or a folder with material=", "Capture", name="capture")
             if features is not None or config.gain_model not in (AUTO, Elastic.kind):
                 name = "gain_model" if features is None else "features"
                 raise FitError.expected("recordings", "material=, which needs none", name=name, advice="leave one out")
-            settings = settings_of(source) if isinstance(source, Path) else CaptureSettings()
-            views = isinstance(source, Path) and source.is_dir() and not is_mesh(find_surface(source, settings))
-            with _stage_folder(cache, source if views and isinstance(source, Path) else None) as stages:
-                return load(guess_in_stages(source, material, config, stages, settings=settings, listener=listener))
+            return _guess(source, material, config, cache, listener)
         if isinstance(source, Path):
             if source.is_file():
                 wanted = "a capture folder, or material=NAME with a mesh"
@@ -127,6 +122,21 @@ def fit(
         views = isinstance(pipeline_of(source, config, features, StageFolder(Path()), listener=listener), SceneStages)
         with _stage_folder(cache, source.folder if views else None) as stages:
             return load(fit_in_stages(source, config, stages, features=features, listener=listener).field)
+
+
+def _guess(
+    source: Capture | Surface | Path,
+    material: Material | str,
+    config: PipelineConfig,
+    cache: str | Path | None,
+    listener: ProgressListener,
+) -> SoundField:
+    if isinstance(source, Capture):
+        raise FitError.expected("a mesh or a folder with material=", "Capture", name="capture")
+    settings = settings_of(source) if isinstance(source, Path) else CaptureSettings()
+    views = isinstance(source, Path) and source.is_dir() and not is_mesh(find_surface(source, settings))
+    with _stage_folder(cache, source if views and isinstance(source, Path) else None) as stages:
+        return load(guess_in_stages(source, material, config, stages, settings=settings, listener=listener))
 
 
 def fit_in_stages(
