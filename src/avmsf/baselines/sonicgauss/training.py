@@ -132,17 +132,11 @@ def expect_sound(loudest: float, impacts: Impacts) -> None:
 
 
 def train(
-    parameters: Iterable[nn.Parameter],
-    loss: Loss,
-    clips: int,
-    config: TrainingConfig,
-    *,
-    seed: int,
-    log: Callable[[int, float], None] | None = None,
+    parameters: Iterable[nn.Parameter], loss: Loss, clips: int, config: TrainingConfig, *, seed: int
 ) -> list[float]:
     """Train in place on so many clips, in random order without repetition in each round, and return the losses.
 
-    `log` is called with the step and its loss. All chance starts at `seed`, that of dropout too.
+    All chance starts at `seed`, that of dropout too.
     """
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.AdamW(parameters, lr=config.rate, betas=(0.9, 0.95), weight_decay=1e-2)
@@ -156,7 +150,7 @@ def train(
     order = torch.empty(0, dtype=torch.int64)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        for step in range(config.steps):
+        for _ in range(config.steps):
             while len(order) < config.batch:
                 order = torch.cat([order, torch.randperm(clips, generator=generator)])
             rows, order = order[: config.batch], order[config.batch :]
@@ -166,6 +160,4 @@ def train(
             optimizer.step()
             schedule.step()
             losses.append(float(value.detach()))
-            if log is not None:
-                log(step + 1, losses[-1])
     return losses
