@@ -117,6 +117,13 @@ def test_units_are_the_international_ones(unit: str, meters: float) -> None:
     assert CaptureSettings(unit=unit).surface_meters == meters
 
 
+def test_a_unit_is_open_only_where_none_is_stated_and_gives_an_object_of_usual_size():
+    assert CaptureSettings().unit_ratios(8.0) == pytest.approx({"m": 1.0, "cm": 0.01, "in": 0.0254, "ft": 0.3048})
+    assert CaptureSettings().unit_ratios(0.02) == {"m": 1.0}
+    for stated in ({"unit": "cm"}, {"surface_unit": "m"}, {"views_unit": "mm"}):
+        assert list(CaptureSettings(**stated).unit_ratios(8.0).values()) == [1.0]
+
+
 def test_the_paper_s_three_seconds_are_kept_and_of_slow_recordings_as_many_samples() -> None:
     for settings, rate, seconds in (({}, 44100.0, 3.0), ({}, 96000.0, 3.0), ({"seconds": 2.0}, 400.0, 2.0)):
         assert CaptureSettings(**settings).kept_seconds(rate) == seconds

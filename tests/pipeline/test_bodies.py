@@ -10,6 +10,7 @@ import torch
 import trimesh
 
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, SurfaceBodies
@@ -17,6 +18,7 @@ from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import GainData, gain_data, gain_variance
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for
+from avmsf.field.probable_body import ProbableBody
 from avmsf.mesh.level_set import difference
 from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction
@@ -106,6 +108,19 @@ def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
     # Factors of the grid are 5 % apart.
     assert first["frequency_factor"] == pytest.approx(STIFFER, rel=0.06)
     assert first["weight"] > 10 * max(each["weight"] for each in others)
+
+
+def test_a_mesh_in_centimeters_is_said_to_be() -> None:
+    """Read in meters, it has frequencies a hundredth of the object's."""
+    slow = [replace(each, elastic=replace(each.elastic, frequency=each.elastic.frequency / 100)) for each in bodies()]
+    candidates = CandidateBodies(slow)
+    candidates.unit_ratios = CaptureSettings().unit_ratios(8.0)
+    report = MixtureEstimator(bodies=candidates).solve(case())[0].report
+    assert (report["bodies"][0]["body"], report["bodies"][0]["unit"]) == (bodies()[1].name, "cm")
+    assert report["bodies"][0]["frequency_factor"] == pytest.approx(STIFFER, rel=0.06)
+    found = ProbableBody.of(report)
+    assert found is not None
+    assert 'unit = "cm"' in found.warning
 
 
 def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> None:

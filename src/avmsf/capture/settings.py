@@ -14,6 +14,8 @@ from avmsf.errors import CaptureError
 SETTINGS, TABLE = "capture.toml", "impacts.csv"
 """Names of the files in a capture folder."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254, "ft": 0.3048}
+OBJECT_SIZES = (0.01, 5.0)
+"""Meters across of objects whose impacts are recorded."""
 USUAL_SECONDS = 3.0
 TIME_ZEROS = ("onset", "peak")
 NORMALIZATIONS = ("auto", "peak", "deconvolve", "none", "done")
@@ -28,7 +30,8 @@ class CaptureSettings:
     unit: str = "m"
     """Unit of the coordinates in impacts.csv: m, cm, mm, in or ft."""
     surface_unit: str | None = None
-    """Unit of the surface's coordinates; by default `unit`."""
+    """Unit of the surface's coordinates; by default `unit`. Where no unit is stated, or m alone as `unit`, a fit infers
+    from the frequencies whether it is another; stated here, it does not."""
     views_unit: str = "m"
     """Unit of the cameras' positions, where there are photographs."""
     surface: str | None = None
@@ -122,6 +125,16 @@ class CaptureSettings:
     def surface_meters(self) -> float:
         """Meters in one unit of the surface's coordinates."""
         return METRES[self.surface_unit or self.unit]
+
+    def unit_ratios(self, extent: float) -> dict[str, float]:
+        """Return the units that a surface `extent` meters across may be in, with the lengths of each over the present.
+
+        The present unit comes first. Others make it an object of usual size, and there are none where one is stated.
+        """
+        present, stated = self.surface_unit or self.unit, {self.unit, self.views_unit} != {"m"}
+        ratios = {unit: length / self.surface_meters for unit, length in METRES.items()}
+        usual = {unit: each for unit, each in ratios.items() if OBJECT_SIZES[0] <= each * extent <= OBJECT_SIZES[1]}
+        return {present: 1.0} | ({} if stated or self.surface_unit else usual)
 
     @property
     def views_meters(self) -> float:

@@ -16,7 +16,7 @@ from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text import listed, read_text
 from avmsf.capture.filenames import files_in, similar_name
 from avmsf.capture.issues import Issues
-from avmsf.capture.settings import METRES, TABLE, CaptureSettings
+from avmsf.capture.settings import METRES, OBJECT_SIZES, TABLE, CaptureSettings
 from avmsf.errors import CaptureError, CaptureWarning
 
 REQUIRED = ("file", "x", "y", "z")
@@ -309,8 +309,9 @@ def _is_missing(path: Path) -> bool:
 
 
 def fitting_units(written: float) -> str:
-    """Return advice with the units in which a coordinate would belong to an object of 1 cm to 5 m."""
-    fitting = [(unit, written * size) for unit, size in METRES.items() if 0.01 <= written * size <= 5]
+    """Return advice with the units in which a coordinate would belong to an object of `OBJECT_SIZES`, 1 cm to 5 m."""
+    low, high = OBJECT_SIZES
+    fitting = [(unit, written * size) for unit, size in METRES.items() if low <= written * size <= high]
     if not fitting:
         return "no unit fits an object of 1 cm to 5 m, so correct the row"
     choices = " or ".join(f'unit = "{unit}" ({meters:.3g} m)' for unit, meters in fitting)

@@ -102,8 +102,8 @@ class ObjectInputs:
 
     def bodies(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
-        held_at, cache = self.dataset.capture(identifier).settings.held_at, self.cache / identifier / "bodies"
-        return candidate_bodies(self._surface(identifier), self.body, held_at=held_at, cache=cache)
+        settings, cache = self.dataset.capture(identifier).settings, self.cache / identifier / "bodies"
+        return candidate_bodies(self._surface(identifier), self.body, settings=settings, cache=cache)
 
     def family(self, identifier: str) -> BodyFamily:
         """Return an object's bodies for DiffSound. Raises SceneError and SimulationError likewise."""

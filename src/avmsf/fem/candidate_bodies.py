@@ -101,6 +101,9 @@ class CandidateBodies:
     supports: Supports = "free"
     held_at: Sequence[Place] = ()
     """Points in meters at which the object was held, all of them, as a user says."""
+    unit_ratios: Mapping[str, float] = MappingProxyType({"m": 1.0})
+    """Units that the surface may be in, with the lengths that it then has over those that it was read with. The present
+    unit comes first."""
     searches_thickness: bool = False
     """Whether the thickness of the wall is not known, so that `with_thickness` is asked."""
     dofs: int = 0
@@ -124,6 +127,7 @@ class CandidateBodies:
     def digest(self) -> str:
         """Return a digest of the bodies."""
         digest = hashlib.sha256(f"{self.searches_thickness} {self.supports} {self.held_at} {self.dofs}".encode())
+        digest.update(str(dict(self.unit_ratios)).encode())
         for body in self.bodies:
             digest.update(body.name.encode())
             for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):
@@ -154,6 +158,7 @@ class SurfaceBodies(CandidateBodies):
         thicknesses: Sequence[float | None] | None = None,
         supports: Supports = "free",
         held_at: Sequence[Place] = (),
+        unit_ratios: Mapping[str, float] | None = None,
         count: int = 80,
         dofs: int = 40_000,
         material: Material = NOMINAL,
@@ -172,6 +177,7 @@ class SurfaceBodies(CandidateBodies):
         self.shape = None if isinstance(surface, Surface) else surface
         """The shape, where it is no surface."""
         self.supports, self.held_at, self.dofs = supports, tuple(held_at), dofs
+        self.unit_ratios = unit_ratios or self.unit_ratios
         self._surface, self._digest, self._log = surface, surface.digest(), log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)

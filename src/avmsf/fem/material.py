@@ -49,8 +49,8 @@ MATERIALS = {material.name: material for material in (CERAMIC, GLASS, WOOD, PLAS
 """The table that DiffSound simulates with, by name."""
 
 
-STIFFEST = max(MATERIALS.values(), key=lambda each: each.young / each.density)
-"""Of the table, relative to its density."""
+SOFTEST, *_, STIFFEST = sorted(MATERIALS.values(), key=lambda each: each.young / each.density)
+"""Of the table, relative to their density."""
 NOMINAL = Material("nominal", 2700.0, 7e10, 0.3, 0.0, 0.0)
 """What bodies are taken to be made of: near aluminium. Frequencies are to be scaled by one common factor, and shapes
 depend on Poisson's ratio alone, weakly."""
@@ -62,19 +62,16 @@ DISCREPANCY = 0.2
 mean square log ratio to the truth over 11 simulated walls from photographs (most are .82 to .94, one is 1.4)."""
 
 
-def largest_factor(*, searched: bool) -> float:
-    """Return the largest factor on the frequencies of a body of the material `NOMINAL` that can be a material's.
+def factor_range(*, thickness_known: bool = False) -> tuple[float, float]:
+    """Return the least and the largest factor on the frequencies of a body of `NOMINAL` that can be a material's.
 
-    That of the stiffest material of the table, relative to its density, times what makes frequencies of real bodies
-    differ from those of even ones (`MAX_FREQUENCY_ERROR`). Where the thickness of its wall is `searched`, one too thin
-    by the `DISCREPANCY` needs frequencies higher by up to as much.
+    A body's frequencies go with sqrt(E / rho): those of the table, with what makes frequencies of real bodies differ
+    from those of even ones (`MAX_FREQUENCY_ERROR`). Bending frequencies also go with the thickness, which may be off by
+    the `DISCREPANCY` unless it is known.
     """
-    uncertain = 1.0 + (DISCREPANCY if searched else 0.0)
-    return (
-        (1.0 + MAX_FREQUENCY_ERROR)
-        * uncertain
-        * math.sqrt(STIFFEST.young / STIFFEST.density * NOMINAL.density / NOMINAL.young)
-    )
+    uncertain = (1.0 + MAX_FREQUENCY_ERROR) * (1.0 if thickness_known else 1.0 + DISCREPANCY)
+    low, high = (math.sqrt(each.young / each.density * NOMINAL.density / NOMINAL.young) for each in (SOFTEST, STIFFEST))
+    return low / uncertain, high * uncertain
 
 
 def material_named(name: str, *, option: str = "material") -> Material:

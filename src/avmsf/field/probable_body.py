@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from avmsf._utils.text import like
-from avmsf.fem.material import MATERIALS, NOMINAL, STIFFEST, Material, largest_factor
+from avmsf.fem.material import MATERIALS, NOMINAL, STIFFEST, Material, factor_range
 from avmsf.fem.supports import FREE
 from avmsf.field.gains.elastic import FREQUENCY_ERRORS
 
@@ -28,6 +28,8 @@ class ProbableBody:
     """Young's modulus over density that the measured frequencies need, over that of aluminum."""
     support: str
     """How it was held."""
+    unit: str
+    """The unit that the frequencies say the surface is in; empty for the present one, or where none was inferred."""
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> "ProbableBody | None":
@@ -44,7 +46,8 @@ class ProbableBody:
             if searched:
                 low, high = (like(searched[each], 0.0, "origin.report.thickness") for each in ("low", "high"))
                 interval = low, high
-        return cls(like(best["body"], "", name), wall, interval, factor**2, like(best.get("support", FREE), "", name))
+        support, unit = (like(best.get(key, other), "", name) for key, other in (("support", FREE), ("unit", "")))
+        return cls(like(best["body"], "", name), wall, interval, factor**2, support, unit)
 
     def __str__(self) -> str:
         """Return all of it in words."""
@@ -80,14 +83,19 @@ class ProbableBody:
 
     @property
     def warning(self) -> str:
-        """Say that the body is stiffer than any material of the table; empty where it is not.
+        """Say that the surface's unit is another one, or the body stiffer than any material of the table; else empty.
 
-        With the margin of `largest_factor`, at which the search for a wall ends.
+        With the margin of `factor_range`, at which the search for a wall ends.
         """
+        if self.unit:
+            return (
+                f"The unit of the mesh is probably {self.unit}, by the frequencies of the modes: write "
+                f'unit = "{self.unit}" in capture.toml, or state the present unit there as surface_unit.'
+            )
         searched = self.wall_interval is not None
         # A search allows no larger factor: one that is within a step of the grid would have been larger.
         step = 1.0 + FREQUENCY_ERRORS[0] if searched else 1.0
-        if math.sqrt(self.stiffness_ratio) * step <= largest_factor(searched=searched):
+        if math.sqrt(self.stiffness_ratio) * step <= factor_range(thickness_known=not searched)[1]:
             return ""
         over = self._ratio / (STIFFEST.young / STIFFEST.density)
         wrong, measure = "body", "check the unit of the mesh"

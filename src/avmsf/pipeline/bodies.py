@@ -1,6 +1,6 @@
 """Bodies that an object's surface may enclose, and the field of one of a known material, without any recording."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -21,7 +21,6 @@ from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material, material_named
 from avmsf.fem.radiation import radiated_pressure
-from avmsf.fem.supports import Place
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import Origin, SoundField
@@ -45,19 +44,21 @@ def candidate_bodies(
     config: BodyConfig | None = None,
     *,
     impacts: Impacts | None = None,
-    held_at: Sequence[Place] = (),
+    settings: CaptureSettings | None = None,
     material: Material = NOMINAL,
     cache: Path | None = None,
     log: Callable[[str], None] | None = None,
 ) -> SurfaceBodies:
     """Return the bodies that a surface may enclose; their mode shapes are cached by content in `cache`.
 
-    `held_at` are points in meters at which the object was held. Raises SimulationError where no body can be computed,
-    with the name `wall` where `config` states one, and before any is FitError where the contacts of the `impacts` that
-    they are meant for do not lie on the surface, and CaptureError where `held_at` do not.
+    `settings` of the capture say where the object was held and which units the surface may be in. Raises
+    SimulationError where no body can be computed, with the name `wall` where `config` states one, and before any is
+    FitError where the contacts of the `impacts` that they are meant for do not lie on the surface, and CaptureError
+    where the points do not at which the object was held.
     """
-    config = BodyConfig() if config is None else config
-    seen = surface if isinstance(surface, Surface) else surface.as_seen()
+    config, settings = config or BodyConfig(), settings or CaptureSettings()
+    held_at, seen = settings.held_at, surface if isinstance(surface, Surface) else surface.as_seen()
+    extent = seen.vertices.amax(0) - seen.vertices.amin(0)
     if impacts is not None:
         expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
     expect_held(held_at, seen)
@@ -65,16 +66,16 @@ def candidate_bodies(
     try:
         bodies = SurfaceBodies(
             surface, thicknesses=None if wall is None else [wall or None], supports=config.supports,
-            held_at=held_at, count=config.shapes, dofs=config.dofs, material=material, cache=cache, log=log,
+            held_at=held_at, unit_ratios=settings.unit_ratios(float(extent.norm())), count=config.shapes,
+            dofs=config.dofs, material=material, cache=cache, log=log,
         )  # fmt: skip
         # What cannot be had shows now.
         _ = bodies.bodies
     except SimulationError as error:
         if wall is None or error.name != "surface":
             raise
-        extent = float((seen.vertices.amax(0) - seen.vertices.amin(0)).max())
         reasons = "; ".join(error.value) if isinstance(error.value, list) else str(error)
-        wanted = f"a wall thickness in meters that an object of {extent:.3g} m can have"
+        wanted = f"a wall thickness in meters that an object of {float(extent.max()):.3g} m can have"
         advice = "give it in meters, as 0.003 for 3 mm, or leave it out"
         if not wall:
             wanted, advice = "a closed mesh for 0, a solid body", "close the mesh, or give the wall thickness in meters"

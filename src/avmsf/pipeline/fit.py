@@ -181,9 +181,8 @@ def _fit_shape(
         listener.log("bodies: finite-element models of the object")
         cache = pipeline.folder.path(BODIES)
         return candidate_bodies(
-            shape.surface(), config.body, impacts=train, held_at=capture.settings.held_at, cache=cache,
-            log=listener.log,
-        )  # fmt: skip
+            shape.surface(), config.body, impacts=train, settings=capture.settings, cache=cache, log=listener.log
+        )
 
     estimator = once(
         lambda: estimator_for(

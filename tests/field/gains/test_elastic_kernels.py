@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from avmsf.fem.material import MATERIALS
 from avmsf.field.gains import elastic as module
 from avmsf.field.gains.elastic import (
     EQUAL_PRIOR,
@@ -86,7 +87,7 @@ def test_a_body_is_of_no_weight_for_what_it_does_not_have():
     assert float(shares.max()) < 0.05
 
 
-@pytest.mark.parametrize("factor", [0.3, 0.75, 1.0, 1.8])
+@pytest.mark.parametrize("factor", [0.3, 0.75, 1.0, 1.2])
 def test_a_factor_on_all_frequencies_is_found(factor):
     sites = impacts(12, seed=1)
     given = families(sites)
@@ -100,14 +101,28 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     assert abs(math.log(found / factor)) <= 0.01
 
 
-def test_no_factor_above_the_largest_is_considered():
+@pytest.mark.parametrize("factor", [0.067, 1.8])
+def test_no_factor_is_considered_that_no_material_has(factor):
+    """Of the table, with 5 % for frequencies of real bodies and 20 % for the thickness: plastic to ceramic."""
     sites = impacts(12, seed=1)
-    gains, others = measured(sites, factor=1.8), families(sites)[:-1]
-    body = Elastic(sites, SIZE, plate(), largest_factor=1.28)
-    weigh_factors([WeighedFamily.of(each, gains) for each in (*others, body)], gains)
-    weights = body.frequency_weights.reshape(len(FACTORS), -1).sum(1)
-    assert float(weights.sum()) == pytest.approx(1.0)
-    assert float(weights[FACTORS > 1.28].sum()) == 0.0
+    given, gains = families(sites), measured(sites, factor=factor)
+    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
+    (body,) = (each for each in given if isinstance(each, Elastic))
+    slowest, *_, fastest = sorted(math.sqrt(each.young / each.density / (7e10 / 2700)) for each in MATERIALS.values())
+    assert slowest / 1.05 / 1.2 <= body.factor <= fastest * 1.05 * 1.2
+
+
+@pytest.mark.parametrize(("ratio", "unit"), [(1.0, 0), (0.3048, 1), (0.0254, 2), (0.01, 3)])
+@pytest.mark.parametrize("factor", [0.75, 1.0])
+def test_the_unit_is_inferred_where_none_is_stated(ratio, unit, factor):
+    """A mesh in centimeters, read in meters, has frequencies a hundredth of the object's."""
+    sites = impacts(12, seed=1)
+    body, gains = Elastic(sites, SIZE, plate(), unit_ratios=(1.0, 0.3048, 0.0254, 0.01)), measured(sites)
+    gains = replace(gains, frequency=factor / ratio * gains.frequency)
+    weigh_factors([WeighedFamily.of(each, gains) for each in (*families(sites, elastic=False), body)], gains)
+    assert body.unit == unit
+    assert body.material_factor == pytest.approx(factor, rel=0.011)
+    assert body.factor == pytest.approx(factor / ratio, rel=0.011)
 
 
 def test_gains_tell_the_factor_where_frequencies_do_not():
@@ -155,12 +170,13 @@ def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
     assert torch.equal(prior, found[None, :, None].expand_as(prior))
 
 
-def test_the_factors_prior_is_a_density_of_the_log_factor():
-    density = frequency_log_prior().exp()[:: len(FREQUENCY_ERRORS)]
-    # Its terms leave out the 1 / sqrt(2 pi) that all have in common.
-    total = float(torch.trapezoid(density, torch.log(FACTORS))) / (2.0 * torch.pi) ** 0.5
-    assert total == pytest.approx(1.0, abs=0.01)
-    assert float(FACTORS[density.argmax()]) == pytest.approx(1.0)
+def test_the_factors_prior_is_a_probability_of_units_and_materials():
+    probability = frequency_log_prior(3).exp().reshape(3, len(FACTORS), -1).sum(2)
+    assert float(probability.sum()) == pytest.approx(1.0)
+    assert float(FACTORS[probability[0].argmax()]) == pytest.approx(1.0)
+    # Materials are as probable in all units, and each other unit is as probable as the next.
+    assert probability.sum(1).tolist() == pytest.approx([1 / 1.1, 0.05 / 1.1, 0.05 / 1.1])
+    assert torch.allclose(probability[0] / probability[2], torch.tensor(20.0, dtype=torch.float64))
 
 
 def test_categories_are_profiles_and_remainders_of_their_probability():

@@ -18,7 +18,7 @@ one or two impacts these tell which shape each mode is.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import ClassVar
@@ -28,6 +28,7 @@ from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
+from avmsf.fem.material import factor_range
 from avmsf.field.gains.kernels import KernelFamily, Sites, scaled, squared_exponential
 
 PERTURBATIONS = (0.003, 0.01, 0.03, 0.1, 0.3)
@@ -61,12 +62,15 @@ _IMPROBABLE = 1e-6
 probabilities by less than a thousandth."""
 _MARGIN = 0.1
 """Log frequency by which the range of measured modes is widened at both ends."""
-FACTORS = torch.exp(torch.arange(-300, 301, dtype=torch.float64) * 0.01)
-"""Factors on the nominal frequencies that are considered, in steps of the least error."""
+_LOWEST, _HIGHEST = (math.log(each) / FREQUENCY_ERRORS[0] for each in factor_range())
+FACTORS = torch.exp(torch.arange(math.ceil(_LOWEST), math.floor(_HIGHEST) + 1).double() * FREQUENCY_ERRORS[0])
+"""Factors on the nominal frequencies that materials can have, in steps of the least error."""
 _FACTOR_PRIOR = ((0.5, 0.0, 0.05), (0.15, -0.29, 0.1), (0.15, -1.4, 0.15), (0.2, 0.0, 0.8))
 """Probability, mean and standard deviation of the log factor, relative to aluminum. The square root of Young's modulus
 over density lies within 4 % for glass, ceramics, iron, steel and aluminum, at .75 of it for wood, at .22 to .29 of it
-for plastics; the last one is for a mesh of another scale."""
+for plastics; the last one is for what lies between them and for other thicknesses."""
+UNIT_ODDS = 0.05
+"""Probability of each other unit of the surface over the present one's, where none is stated."""
 
 
 class Elastic(KernelFamily):
@@ -74,14 +78,23 @@ class Elastic(KernelFamily):
 
     kind: ClassVar[str] = "elastic"
 
-    def __init__(self, reference: Sites, size: float, modes: ElasticModes, *, largest_factor: float = math.inf) -> None:
-        """Set up from the body's shapes and the largest factor on its frequencies that a material can explain."""
+    def __init__(
+        self, reference: Sites, size: float, modes: ElasticModes, *, unit_ratios: Sequence[float] = (1.0,)
+    ) -> None:
+        """Set up from the body's shapes.
+
+        `unit_ratios` are the possible true lengths over those that the shapes were computed with, which come first.
+        """
         super().__init__(reference, size)
-        self.largest_factor = largest_factor
+        ratios = torch.tensor(unit_ratios, dtype=torch.float64)[:, None]
+        self.factors = (FACTORS / ratios).flatten()
+        """Factors on the frequencies that are considered, of a body in each unit and of each material in a row."""
+        self.factor_log_prior = frequency_log_prior(len(ratios))
+        """Log probability of each pair in `frequency_weights` before any measurement."""
         # As a file keeps them, so that a field that was read renders what the saved one does.
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
-        self.frequency_weights = torch.softmax(frequency_log_prior(largest_factor), dim=0)
-        """Probability of each pair of `FACTORS` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
+        self.frequency_weights = torch.exp(self.factor_log_prior)
+        """Probability of each pair of `factors` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
         # Shared by the families that are taken of this one.
         self._latest: list[tuple[Sites, Float64[Tensor, "sites shapes"]]] = []
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
@@ -169,13 +182,13 @@ class Elastic(KernelFamily):
         Over the density of a frequency of which nothing is known; averaged over factors and errors by
         `frequency_weights`. `log_frequency` is that of frequencies in Hz.
         """
-        weights = self.frequency_weights.reshape(len(FACTORS), -1)
+        weights = self.frequency_weights.reshape(len(self.factors), -1)
         # A mode has its body's error or, as an exception, any.
         weights = (1.0 - _EXCEPTIONS) * weights + _EXCEPTIONS * weights.mean(1, keepdim=True)
         probable = torch.nonzero(weights.amax(1) > _IMPROBABLE * weights.max()).flatten()
         found = torch.full((len(self.modes), len(log_frequency)), -torch.inf, dtype=torch.float64)
         for rows in torch.split(probable, max(1, _MEMORY // found.numel())):
-            densities = self._densities(FACTORS[rows], log_frequency, log_frequency)
+            densities = self._densities(self.factors[rows], log_frequency, log_frequency)
             for logs, weight in zip(densities, weights[rows].T, strict=True):
                 found = torch.logaddexp(found, torch.logsumexp(logs + weight.log()[:, None, None], dim=0))
         return found
@@ -189,15 +202,25 @@ class Elastic(KernelFamily):
 
     @property
     def factor(self) -> float:
-        """The most probable factor on the nominal frequencies."""
-        return float(FACTORS[self.frequency_weights.reshape(len(FACTORS), -1).sum(1).argmax()])
+        """The most probable factor on the nominal frequencies, in the most probable unit."""
+        return self.material_factor * float(self.factors[self.unit * len(FACTORS)] / FACTORS[0])
+
+    @property
+    def unit(self) -> int:
+        """Row of the most probable one of the `unit_ratios`."""
+        return int(self._factor_weights.sum(1).argmax())
+
+    @property
+    def material_factor(self) -> float:
+        """The most probable factor that the body's material has in the most probable unit."""
+        return float(FACTORS[self._factor_weights[self.unit].argmax()])
 
     def match(
         self, log_frequency: Float64[Tensor, " modes"], modes: Int[Tensor, " some"] | None = None
     ) -> Float64[Tensor, "pairs shapes some"]:
         """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes."""
         chosen = log_frequency if modes is None else log_frequency[modes]
-        densities = torch.stack(list(self._densities(FACTORS, chosen, log_frequency)), dim=1)
+        densities = torch.stack(list(self._densities(self.factors, chosen, log_frequency)), dim=1)
         # A mode has its body's error or, as an exception, any.
         exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
         return torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception).flatten(0, 1)
@@ -221,6 +244,10 @@ class Elastic(KernelFamily):
         for error in FREQUENCY_ERRORS:
             yield square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
 
+    @property
+    def _factor_weights(self) -> Float64[Tensor, "units factors"]:
+        return self.frequency_weights.reshape(-1, len(FACTORS), len(FREQUENCY_ERRORS)).sum(2)
+
     @cached_property
     def _known(self) -> Float64[Tensor, "contacts shapes"]:
         """Components of the shapes along the reference impacts."""
@@ -240,14 +267,17 @@ class Elastic(KernelFamily):
         return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)
 
 
-def frequency_log_prior(largest: float = math.inf) -> Float64[Tensor, " pairs"]:
-    """Return the log density of the log factor of each pair in `Elastic.frequency_weights` before any measurement.
+def frequency_log_prior(units: int = 1) -> Float64[Tensor, " pairs"]:
+    """Return the log probability of each pair in `Elastic.frequency_weights` before any measurement.
 
-    Minus infinity for factors above the largest one.
+    The first of the `units` is the present one. In each the log factor of the material is distributed as a mixture of
+    normal distributions within the range of materials.
     """
     terms = [
         math.log(weight / deviation) - 0.5 * ((torch.log(FACTORS) - mean) / deviation).square()
         for weight, mean, deviation in _FACTOR_PRIOR
     ]
-    density = torch.logsumexp(torch.stack(terms), dim=0).masked_fill(largest < FACTORS, -torch.inf)
-    return density.repeat_interleave(len(FREQUENCY_ERRORS))
+    material = torch.log_softmax(torch.logsumexp(torch.stack(terms), dim=0), dim=0)
+    odds = torch.tensor([1.0] + [UNIT_ODDS] * (units - 1), dtype=torch.float64)
+    density = torch.log(odds / odds.sum())[:, None] + material - math.log(len(FREQUENCY_ERRORS))
+    return density.flatten().repeat_interleave(len(FREQUENCY_ERRORS))

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -15,7 +14,6 @@ from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, body_name
-from avmsf.fem.material import largest_factor
 from avmsf.fem.thickness import search_thickness
 from avmsf.field.config import AUTO, NETWORK, GainModelName
 from avmsf.field.gains.attention import SHARED, Attention
@@ -114,9 +112,8 @@ class MixtureEstimator(GainEstimator):
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         self._expect_inputs(data, groups)
         searched = bool(bodies) and self.bodies is not None and self.bodies.searches_thickness
-        # Of a wall that is too thin, shapes of high modes may fit as well as those of the right one.
-        largest = largest_factor(searched=True) if searched else math.inf
-        fit = Regression(data, self.kinds, sites_of(data, bodies), directional, groups, largest)
+        units = (self.bodies or CandidateBodies([])).unit_ratios
+        fit = Regression(data, self.kinds, sites_of(data, bodies), directional, groups, units)
         thickness = None
         if searched and self.bodies is not None:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.with_thickness)

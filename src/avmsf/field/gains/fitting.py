@@ -9,7 +9,7 @@ from jaxtyping import Bool, Complex128, Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.fem.updating import Matched
-from avmsf.field.gains.elastic import Elastic, frequency_log_prior
+from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.mixture import (
     NOISE_SHARES,
@@ -191,9 +191,7 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
             density = each.family.match(torch.log(measured.frequency), rows)
             single = torch.logsumexp(density + _shape(each, each.family)[:, rows], dim=1)
             both = torch.logaddexp(single, unknown[rows])
-            each.family.frequency_weights = torch.softmax(
-                both.sum(1) + frequency_log_prior(each.family.largest_factor), dim=0
-            )
+            each.family.frequency_weights = torch.softmax(both.sum(1) + each.family.factor_log_prior, dim=0)
 
 
 def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:

@@ -1,7 +1,7 @@
 """The gain model of some contacts and candidate bodies, and what the gains say of these bodies and contacts."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations
@@ -42,8 +42,10 @@ class Solution:
     model: MixtureGains
     rows: Int[Tensor, " rows"]
     bodies: Sequence[CandidateBody]
+    units: Sequence[str]
+    """The surface's most probable unit with each body; empty for the present one."""
     factors: Sequence[float]
-    """On the nominal frequencies of each body."""
+    """On the nominal frequencies of each body in its unit."""
     weights: Sequence[float]
     """Each body's posterior probability, mean over modes by their energy."""
 
@@ -64,9 +66,10 @@ class Solution:
                 "updating_nats": body.updated,
                 "refined": body.fine,
                 "weight": weight,
+                "unit": unit,
                 "frequency_factor": factor,
             }
-            for body, factor, weight in zip(self.bodies, self.factors, self.weights, strict=True)
+            for body, unit, factor, weight in zip(self.bodies, self.units, self.factors, self.weights, strict=True)
         ]
         return {"bodies": sorted(found, key=lambda each: -each["weight"])}
 
@@ -83,8 +86,8 @@ class Regression:
     """Whether directions are known, or a body says which way its surface faces."""
     groups: tuple[Group, ...]
     """Symmetries of the object's shape."""
-    largest_factor: float
-    """The largest factor on the frequencies of bodies."""
+    unit_ratios: Mapping[str, float]
+    """Units that the surface may be in, as `CandidateBodies` have them."""
 
     @cached_property
     def measured(self) -> MeasuredGains:
@@ -105,7 +108,7 @@ class Regression:
 
     def elastic(self, rows: Int[Tensor, " rows"], modes: ElasticModes) -> Elastic:
         """Return the family of these contacts and a body's modes."""
-        return Elastic(self.sites.take(rows), self._size, modes, largest_factor=self.largest_factor)
+        return Elastic(self.sites.take(rows), self._size, modes, unit_ratios=tuple(self.unit_ratios.values()))
 
     def __call__(
         self,
@@ -123,7 +126,11 @@ class Regression:
         parts = zip(model.families, (model.shares() @ share).tolist(), strict=True)
         weights = {id(family.modes): part for family, part in parts if isinstance(family, Elastic)}
         found = [weights.get(id(each.modes), 0.0) for each in elastic]
-        return Solution(model, rows, bodies, [each.factor for each in elastic], found)
+        units = ["", *list(self.unit_ratios)[1:]]
+        return Solution(
+            model, rows, bodies, [units[each.unit] for each in elastic],
+            [each.material_factor for each in elastic], found,
+        )  # fmt: skip
 
     def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[float]:
         """Return the log evidence of the gains of some contacts with each body by itself."""
