@@ -87,14 +87,14 @@ class Elastic(KernelFamily):
         """
         super().__init__(reference, size)
         ratios = torch.tensor(unit_ratios, dtype=torch.float64)[:, None]
-        self.factors = (FACTORS / ratios).flatten()
+        self.frequency_factors = (FACTORS / ratios).flatten()
         """Factors on the frequencies that are considered, of a body in each unit and of each material in a row."""
         self.factor_log_prior = frequency_log_prior(len(ratios))
         """Log probability of each pair in `frequency_weights` before any measurement."""
         # As a file keeps them, so that a field that was read renders what the saved one does.
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
         self.frequency_weights = torch.exp(self.factor_log_prior)
-        """Probability of each pair of `factors` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
+        """Probability of each pair of `frequency_factors` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
         # Shared by the families that are taken of this one.
         self._latest: list[tuple[Sites, Float64[Tensor, "sites shapes"]]] = []
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
@@ -182,13 +182,13 @@ class Elastic(KernelFamily):
         Over the density of a frequency of which nothing is known; averaged over factors and errors by
         `frequency_weights`. `log_frequency` is that of frequencies in Hz.
         """
-        weights = self.frequency_weights.reshape(len(self.factors), -1)
+        weights = self.frequency_weights.reshape(len(self.frequency_factors), -1)
         # A mode has its body's error or, as an exception, any.
         weights = (1.0 - _EXCEPTIONS) * weights + _EXCEPTIONS * weights.mean(1, keepdim=True)
         probable = torch.nonzero(weights.amax(1) > _IMPROBABLE * weights.max()).flatten()
         found = torch.full((len(self.modes), len(log_frequency)), -torch.inf, dtype=torch.float64)
         for rows in torch.split(probable, max(1, _MEMORY // found.numel())):
-            densities = self._densities(self.factors[rows], log_frequency, log_frequency)
+            densities = self._densities(self.frequency_factors[rows], log_frequency, log_frequency)
             for logs, weight in zip(densities, weights[rows].T, strict=True):
                 found = torch.logaddexp(found, torch.logsumexp(logs + weight.log()[:, None, None], dim=0))
         return found
@@ -203,7 +203,7 @@ class Elastic(KernelFamily):
     @property
     def factor(self) -> float:
         """The most probable factor on the nominal frequencies, in the most probable unit."""
-        return self.material_factor * float(self.factors[self.unit * len(FACTORS)] / FACTORS[0])
+        return self.material_factor * float(self.frequency_factors[self.unit * len(FACTORS)] / FACTORS[0])
 
     @property
     def unit(self) -> int:
@@ -220,7 +220,7 @@ class Elastic(KernelFamily):
     ) -> Float64[Tensor, "pairs shapes some"]:
         """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes."""
         chosen = log_frequency if modes is None else log_frequency[modes]
-        densities = torch.stack(list(self._densities(self.factors, chosen, log_frequency)), dim=1)
+        densities = torch.stack(list(self._densities(self.frequency_factors, chosen, log_frequency)), dim=1)
         # A mode has its body's error or, as an exception, any.
         exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
         return torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception).flatten(0, 1)
