@@ -10,7 +10,9 @@ from torch import Tensor
 
 from avmsf.capture import Impacts
 from avmsf.evaluation.scores import score
+from avmsf.evaluation.simple_methods import MeanWaveform, NearestRecording
 from avmsf.evaluation.splits import split
+from avmsf.evaluation.task import Sounds
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
@@ -31,13 +33,15 @@ _Case = tuple[Impacts, Impacts, FeatureField, MixtureEstimator]
 
 
 def _measure(settings: Settings, part: str) -> Iterator[Record]:
-    """Level of rendered over recorded sounds, and errors, at held-out contacts, by the residual noise.
+    """Level of rendered over recorded sounds, and errors, at held-out contacts, by the residual noise and its level.
 
     tail_db: in the last fifth of the sound, above 20 Hz; medians over contacts, then over objects. error: relative STFT
     error; l1_log: log-mel distance, nepers; means over contacts, then objects. trained: the residual's magnitudes
     follow the spectral loss, as in the paper; measured: they are fitted to the log spectra after training (the
     default). Both render Gaussian noise; low_fluctuation: as measured, rendered with noise of low fluctuation (the
-    default). Dampings are shared; all kernel families, on the plate no elastic one.
+    default). known_force: the same with each impact's force given, beneath which the background has its level; nearest,
+    knn: the nearest recording, and the mean of three. Dampings are shared; all kernel families, on the plate no elastic
+    one.
     """
     rows: dict[str, list[dict[str, float]]] = {}
     for name, case in _cases(part, settings):
@@ -57,17 +61,26 @@ def _compared(case: _Case, settings: Settings) -> Iterator[tuple[str, dict[str, 
     for name, rate in RATES.items():
         rated = replace(config, noise_rate=rate, residual_noise="gaussian")
         field = fit(train, features, modes, rated, gains=gains)
-        yield name, _scores(field, test)
+        yield name, _scores(_rendered(field, test), test)
     steady = replace(field.origin, config=replace(field.origin.config, residual_noise="low-fluctuation"))
-    yield "low_fluctuation", _scores(replace(field, origin=steady), test)
+    field = replace(field, origin=steady)
+    yield "low_fluctuation", _scores(_rendered(field, test), test)
+    if test.forces is not None:
+        yield "known_force", _scores(_rendered(field, test, test.forces) / test.forces[:, None], test)
+    aligned = modes.aligned(train)
+    for name, simple in {"nearest": NearestRecording(aligned), "knn": MeanWaveform(aligned)}.items():
+        yield name, _scores(simple.render(test.contacts), test)
 
 
-def _scores(field: SoundField, test: Impacts) -> dict[str, float]:
-    sounds = field.render(test.contacts, directions=test.directions)
+def _rendered(field: SoundField, test: Impacts, forces: Float[Tensor, " contacts"] | None = None) -> Sounds:
+    return field.render(test.contacts, directions=test.directions, forces=forces)
+
+
+def _scores(sounds: Sounds, test: Impacts) -> dict[str, float]:
     levels = [_tail_power(each, test.sample_rate) for each in (sounds, test.sounds)]
     found = score(sounds, test).mean()
     level = float((10 * torch.log10(levels[0] / levels[1])).median())
-    return {"tail_db": level, "error": found["relative_stft"], "l1_log": found["l1_log"]}
+    return {"tail_db": level, "error": found["relative_stft"]} | {key: found[key] for key in ("l1", "l1_log", "envelope")}
 
 
 def _tail_power(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> Float[Tensor, " contacts"]:
@@ -85,8 +98,9 @@ def _cases(part: str, settings: Settings) -> Iterator[tuple[str, _Case]]:
         yield part, (train, test, objects.STRUCK.features(), MixtureEstimator())
         return
     for name in settings.objects or settings.some(tuple(SIM20)) if part == "sim20" else (part,):
-        if part == "aircraft":
-            capture, count = objects.measured("aircraft_response", objects.settings_of("aircraft_response")), 15
+        if part in ("aircraft", "strikes"):
+            folder = {"aircraft": "aircraft_response", "strikes": "aircraft"}[part]
+            capture, count = objects.measured(folder, objects.settings_of(folder)), 15
         elif part == "mug":
             capture, count = objects.example_capture(), 12
         else:
@@ -95,7 +109,7 @@ def _cases(part: str, settings: Settings) -> Iterator[tuple[str, _Case]]:
             capture = replace(capture, impacts=replace(capture.impacts, sounds=full_scale))
         train, test = split(capture.impacts, count)
         gains, surface = MixtureEstimator(), objects.surface_of(capture)
-        if part == "aircraft" and not settings.quick:
+        if part in ("aircraft", "strikes") and not settings.quick:
             gains = objects.solid_estimator(surface, settings)
         elif not settings.quick:
             impacts = train if part == "sim20" else None
@@ -103,4 +117,6 @@ def _cases(part: str, settings: Settings) -> Iterator[tuple[str, _Case]]:
         yield name, (train, test, objects.features_of(capture), gains)
 
 
-PARTS: dict[str, Measurement] = {part: partial(_measure, part=part) for part in ("mug", "plate", "aircraft", "sim20")}
+PARTS: dict[str, Measurement] = {
+    part: partial(_measure, part=part) for part in ("mug", "plate", "aircraft", "strikes", "sim20")
+}

@@ -1,5 +1,6 @@
 """`avmsf render`: noise, levels, softer hammers and directions."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,15 @@ def test_without_noise_the_modes_are_rendered(path: Path, capsys: Streams, words
     # The sounds are float32, of peaks near 1.
     assert np.abs(noisy - modes - sounding(positional()).noise().numpy()).max() < 1e-6
     assert words or np.array_equal(modes, sounding(positional()).render(PLACE, noise=False)[0].numpy())
+
+
+def test_without_a_force_a_sound_is_as_the_recordings_on_average(tmp_path: Path, capsys: Streams) -> None:
+    field = sounding(positional())
+    field = replace(field, residual=replace(field.residual, force=50.0))
+    field.save(tmp_path / "field.safetensors")
+    for words, force in (((), None), (("--force", "3"), 3.0)):
+        sound = rendered(tmp_path / "field.safetensors", capsys, *words)[0]
+        assert np.array_equal(sound, field.render(PLACE, forces=force)[0].numpy())
 
 
 @pytest.mark.parametrize("level", [-30.0, -10.0, 20.0])

@@ -243,9 +243,25 @@ def test_noise_is_measured_after_training_or_trained():
     level = 0.01 * float(impacts.sounds.square().mean().sqrt())
     decibels = 20 * torch.log10(field.residual.magnitude / level)
     assert -1.0 < float(decibels.median()) < 3.0
-    trained = plate_fit(replace(SHORT, noise_rate=0.1)).residual.magnitude
+    residual = plate_fit(replace(SHORT, noise_rate=0.1)).residual
+    # Trained noise grows with the force, as the paper's.
+    assert (field.residual.force, residual.force) == (1.0, None)
+    trained = residual.magnitude
     # Adam moves each logarithm by about the rate at each of four steps.
     assert 0.02 < float(torch.log(trained / measured).abs().mean()) < 0.5
+
+
+def test_background_has_one_level_in_recordings_that_are_not_divided_by_their_forces():
+    impacts, forces = plate_impacts(), 2.0 ** (torch.arange(12) % 4)
+    level = 0.5 * float(impacts.sounds.square().mean().sqrt())
+    noise = level * torch.randn(impacts.sounds.shape, generator=torch.Generator().manual_seed(3))
+    train = replace(impacts, sounds=impacts.sounds + noise / forces[:, None], forces=forces)
+    field = plate_fit(replace(QUICK, warmup_steps=0, steps=1), train=train, gains=MixtureEstimator())
+    assert field.residual.force == pytest.approx(2.0**1.5)
+    decibels = 20 * torch.log10(field.residual.magnitude * field.residual.force / level)
+    # 12 recordings tell each of 33 bands to .4 dB. The plate's own noise, which here grows with the force, adds .05 dB.
+    assert abs(float(decibels.mean())) < 0.3
+    assert float(decibels.std()) < 1.0
 
 
 def test_warm_up_aims_at_the_gains_that_sines_can_express():
@@ -302,6 +318,8 @@ def test_recordings_that_cannot_be_fitted_are_refused():
         plate_fit(SHORT, train=replace(impacts, sounds=broken))
     with raises(FitError, name="modes", value=pytest.approx(2302.0, abs=1.0)):
         plate_fit(SHORT, train=replace(impacts, sample_rate=4000.0))
+    with raises(FitError, name="plate/003", value=0.0, row=2):
+        plate_fit(SHORT, train=replace(impacts, forces=torch.tensor([1.0, 2.0, 0.0]).repeat(4)))
     none = torch.zeros(0, dtype=torch.float64)
     empty = Extraction(ModalBank(none, none), torch.zeros(12, 0) + 0j, modes.residual)
     with raises(FitError, name="modes", value=0):

@@ -68,6 +68,8 @@ def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     save(field, tmp_path / "field.safetensors")
     known = load(tmp_path / "field.safetensors")
     assert torch.equal(known.render(test.contacts), field.render(test.contacts))
+    # What an impact adds grows with its force, as the modes do.
+    assert torch.equal(field.render(test.contacts, forces=4.0), 4.0 * field.render(test.contacts))
     # Longer than the recordings there is silence, as beyond their end nothing is known.
     assert torch.equal(known.render(test.contacts, samples=SAMPLES + 50)[:, :100], known.render(test.contacts)[:, :100])
 

@@ -73,12 +73,19 @@ def test_a_contacts_sound_does_not_depend_on_its_company(rows):
     torch.testing.assert_close(field().render(CONTACTS[rows]), sounds[rows], rtol=0, atol=1e-6 * loudest)
 
 
-def test_force_scales_all_of_the_sound():
-    sounds = field().render(CONTACTS)
-    assert torch.equal(field().render(CONTACTS, forces=4.0), 4.0 * sounds)
-    assert torch.equal(field().render(CONTACTS, forces=0.0), torch.zeros(40, 2400))
-    # Noise and modes alike, to float32.
-    torch.testing.assert_close(field().render(CONTACTS, forces=0.3), 0.3 * sounds, rtol=1e-6, atol=0)
+def test_force_scales_the_modes_and_leaves_the_background():
+    assert field().residual.force == 2.0
+    modes, noise = field().render(CONTACTS, noise=False), field().noise()
+    assert torch.equal(field().render(CONTACTS), modes + noise)
+    assert torch.equal(field().render(CONTACTS, forces=4.0), 4.0 * modes + 2.0 * noise)
+    assert torch.equal(field().render(CONTACTS, forces=0.0), (2.0 * noise).expand(40, -1))
+    forces = torch.linspace(0.1, 4.0, 40)
+    assert torch.equal(field().render(CONTACTS, forces=forces), forces[:, None] * modes + 2.0 * noise)
+
+
+def test_force_scales_noise_that_is_no_background():
+    trained = replace(field(), residual=replace(field().residual, force=None))
+    assert torch.equal(trained.render(CONTACTS, forces=4.0), 4.0 * trained.render(CONTACTS))
 
 
 def test_rendering_keeps_no_gradients_and_changes_no_chance():

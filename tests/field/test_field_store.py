@@ -81,6 +81,7 @@ def test_a_file_names_its_tensors_and_itself(tmp_path):
     assert record["sample_rate"] == 8000.0
     assert record["origin"]["capture"] == "a plate"
     assert record["origin"]["per_newton"] is True
+    assert record["background_force"] == field().residual.force == 2.0
 
 
 def test_a_loaded_field_needs_its_file_no_more(tmp_path):
@@ -183,6 +184,7 @@ def put(keys: str, *value: object) -> Change:
         (tensor("residual.magnitude", lambda each: each[None]), "residual.magnitude"),
         (tensor("residual.magnitude", torch.neg), "residual.magnitude"),
         (tensor("residual.magnitude", lambda each: each + 1e38), "residual.magnitude"),
+        *((put("background_force", force), "background_force") for force in (0.0, -1.0, "1", [])),
         (put("sizes.modes", 13), "gains.modes"),
         (put("gains.shape.width", 10**7), "gains.head.0.weight"),
         (put("gains.shape.spatial_damping", True), "gains.to_dampings.bias"),
@@ -215,6 +217,11 @@ def test_a_damaged_file_is_refused_with_what_is_wrong(tmp_path, change, name):
     with raises(FieldFileError, file="plate.safetensors") as caught:
         load(path)
     assert name in (..., caught.value.name)
+
+
+def test_the_noise_of_a_file_without_a_background_grows_with_the_force(tmp_path):
+    old = load(changed(tmp_path, put("background_force")))
+    assert torch.equal(old.render(CONTACTS, forces=4.0), 4.0 * old.render(CONTACTS))
 
 
 def test_what_could_not_be_read_back_is_not_written(tmp_path):

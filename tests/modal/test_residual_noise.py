@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from avmsf.modal.residual_noise import (
+    MEDIAN_LEVEL,
     PERIOD,
     estimate_residual,
     low_fluctuation_noise,
@@ -13,7 +14,7 @@ from avmsf.modal.residual_noise import (
     shape_noise,
     white_sequence,
 )
-from oracles.fluctuation import fluctuation
+from oracles.fluctuation import FFT_SIZES, fluctuation
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -120,6 +121,14 @@ def test_the_sequence_fluctuates_half_as_much_as_gaussian_noise():
     assert float(fluctuation(white_sequence())) < 0.25
     # Closed form: E|m / median - 1| of the Rayleigh distribution is .4456; 2^17 samples tell it to about .5 %.
     assert float(fluctuation(torch.randn(PERIOD, generator=seeded(1)))) == pytest.approx(0.4456, abs=0.004)
+
+
+def test_the_median_magnitude_of_the_sequence_is_that_of_gaussian_noise_at_its_level():
+    for size in FFT_SIZES:
+        window = torch.hann_window(size)
+        magnitudes = torch.fft.rfft(MEDIAN_LEVEL * white_sequence().unfold(0, size, size // 4) * window)[:, 1:-1].abs()
+        median = float((window.square().sum() * math.log(2)).sqrt())
+        assert float(magnitudes.median()) == pytest.approx(median, rel=0.01)
 
 
 def test_the_sequence_is_white_at_its_level():

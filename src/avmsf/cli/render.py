@@ -40,8 +40,8 @@ class Options(Common):
     """Table of contacts, in which a direction may be empty."""
     unit: Unit = "m"
     """Unit of the coordinates; the field is in meters."""
-    force: float = 1.0
-    """Peak force, newtons; relative where the field knows no forces."""
+    force: Number = None
+    """Peak force, newtons; relative where the field knows no forces. Without it, as the recordings on average."""
     contact_time: float = 0.0
     """Of a softer hammer of the same impulse, seconds: .002 for felt."""
     pulse: PulseShape = "half-sine"
@@ -66,7 +66,7 @@ class Options(Common):
         if self.direction and len(self.direction) != len(self.position):
             wanted = f"one for each of {len(self.position)} --position"
             raise OutputError.expected(wanted, len(self.direction), name="--direction")
-        if not 0 < self.force < math.inf:
+        if self.force is not None and not 0 < self.force < math.inf:
             advice = "--direction says which way it acts"
             raise OutputError.expected("a finite force above 0", self.force, name="--force", advice=advice)
         if not 0 <= self.contact_time <= MAX_CONTACT_SECONDS:
@@ -85,7 +85,7 @@ def run(options: Options) -> int:
     paths = _paths(options.output, contacts.names)
     field = load(options.field)
     expect_on_object(contacts, field)
-    if options.force != 1 and not field.origin.per_newton:
+    if options.force not in (None, 1) and not field.origin.per_newton:
         note(f"the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
         note(f"the wav files have {round(field.sample_rate)} Hz for {field.sample_rate:g} Hz")

@@ -46,7 +46,7 @@ class SampledField:
     gains: Complex64[Tensor, "points modes"]
     """Amplitudes of the sines, and of the cosines times i, in the unit of the training sounds."""
     noise: Float32[Tensor, " samples"]
-    """Residual noise: the realization that `SoundField.render` adds."""
+    """Residual noise: the realization that `SoundField.render` adds without forces; here it grows with the force."""
     sample_rate: float
     """Samples per second of the training sounds, Hz."""
     per_newton: bool = False

@@ -111,7 +111,7 @@ class FitConfig:
     """What its training starts from: the recordings without the modes, or their lowest-energy segments (paper)."""
     residual_noise: Literal["low-fluctuation", "gaussian"] = "low-fluctuation"
     """Noise that is filtered to the residual's spectrum when the field is rendered: a fixed sequence whose spectrogram
-    hardly fluctuates, 2 dB below a recording's noise, or a random draw at its level (paper)."""
+    hardly fluctuates, 1.7 dB below a recording's noise, or a random draw at its level (paper)."""
     seed: int = 0
     """Seed of the random numbers: initial weights, noise in training, and rendered Gaussian noise."""
 

@@ -112,12 +112,19 @@ def fingerprint(data: GainData, estimator: GainEstimator) -> str:
 
 
 def _with_noise(field: SoundField, train: Impacts) -> SoundField:
-    """Return a field with the noise that its modes leave of the recordings, unless it was trained or is not wanted."""
+    """Return a field with the background that its modes leave of the recordings, unless noise is trained or not wanted.
+
+    In a recording that is not divided by its force, the background has one level: it is measured in all together.
+    """
     config, bins = field.origin.config, len(field.residual.magnitude)
     if not config.residual or config.noise_rate or not config.steps:
         return field
     modes = field.render(train.contacts, directions=train.directions, noise=False)
-    return replace(field, residual=estimate_residual(train.sounds, modes, bins=bins))
+    forces = torch.ones(len(train)) if train.forces is None else train.forces
+    average = float(forces.log().mean().exp())
+    relative = (forces / average)[:, None]
+    found = estimate_residual(relative * train.sounds, relative * modes, bins=bins)
+    return replace(field, residual=replace(found, force=average))
 
 
 def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundField:
@@ -143,7 +150,7 @@ def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundFi
     errors = {kind: torch.stack([error(each + added) for each in modes]) for kind, added in residuals.items()}
     best = min(errors, key=lambda kind: float(errors[kind].mean(1).min()))
     if best == "recordings":
-        field = replace(field, residual=Residual(field.residual.magnitude, recordings))
+        field = replace(field, residual=replace(field.residual, recordings=recordings))
     chosen = smallest_within_error(errors[best])
     field = replace(field, gain_field=replace(gains, spread_share=_SPREAD_SHARES[chosen]))
     reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}

@@ -22,7 +22,7 @@ from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ForcePulse, ModalBank
-from avmsf.modal.residual_noise import Residual, low_fluctuation_noise, shape_noise
+from avmsf.modal.residual_noise import MEDIAN_LEVEL, Residual, low_fluctuation_noise, shape_noise
 from avmsf.modal.synthesis import synthesize
 
 _BATCH = 32
@@ -204,37 +204,40 @@ class SoundField:
         """Return the sound of an impact at each position.
 
         The noise is the same at every contact and in every call, so that a contact's sound depends on nothing else.
-        Modes that are not `audible` are silent. The noise grows with the force as the modes do, which is a
-        simplification: recorded background noise does not depend on the force of an impact.
+        Modes that are not `audible` are silent. Background noise does not grow with the force (`Residual.force`); what
+        the nearest recordings have in addition to their modes does, as does the noise of the paper's residual.
 
         Args:
             positions: [contacts, 3], object frame, meters.
             directions: Unit vectors [contacts, 3] of the impacts. One of [0, 0, 0] is unknown, as in tables of
                 contacts: the impact goes straight into the surface, as all do without `directions`.
             forces: One for all or one for each, in newtons where the recordings were divided by theirs, else relative
-                to an average one of them; by default 1.
+                to an average one of them. By default sounds are as the training recordings on average, divided by the
+                force where these were.
             samples: Length of the sounds, by default that of the training sounds.
             pulse: What a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
                 it is, and leaves the noise as it is.
             noise: Whether the residual noise is added to the modes.
 
         Returns:
-            Sounds [contacts, samples] at `sample_rate`, in the unit of the training sounds.
+            Sounds [contacts, samples] at `sample_rate`: with `forces` as recorded, else in the unit of the training
+            sounds.
         """
         contacts, ways = self._impacts(positions, directions)
         length = self.samples if samples is None else as_count(samples, "samples")
         recorded = noise and self.residual.recordings is not None
-        added = self.noise(length) if noise and not recorded else torch.zeros(length)
+        background = self.noise(length) if noise and not recorded else torch.zeros(length)
         parts = [torch.zeros(0, length)]
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             way = None if ways is None else ways[rows]
             modes = self.modal_sounds(self.known(contacts[rows], directions=way), length)
             sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
-            parts.append(sounds + (self._recorded(contacts[rows], way, length) if recorded else added))
+            parts.append(sounds + self._recorded(contacts[rows], way, length) if recorded else sounds)
         sounds = torch.cat(parts)
         if forces is None:
-            return sounds
-        return as_numbers(forces, "forces", count=len(contacts)).to(sounds)[:, None] * sounds
+            return sounds + background
+        given, constant = as_numbers(forces, "forces", count=len(contacts)).to(sounds)[:, None], self.residual.force
+        return given * sounds + (given if constant is None else constant) * background
 
     def _impacts(
         self, positions: ArrayLike, directions: ArrayLike | None
@@ -272,14 +275,15 @@ class SoundField:
         return torch.nn.functional.pad(found, (0, samples - found.shape[1]))
 
     def noise(self, samples: int | None = None) -> Float[Tensor, " samples"]:
-        """Return the residual noise of an impact of force 1; `samples` as in `render`.
+        """Return the residual noise that `render` adds without forces; `samples` as there.
 
         Of the kind that the fit's configuration names: a fixed sequence of low fluctuation, or a Gaussian draw
         (paper, eq. 6), which differs with `samples`.
         """
         length = self.samples if samples is None else as_count(samples, "samples")
         if self.origin.config.residual_noise == "low-fluctuation":
-            return low_fluctuation_noise(self.residual.magnitude, samples=length)
+            level = 1.0 if self.residual.force is None else MEDIAN_LEVEL
+            return level * low_fluctuation_noise(self.residual.magnitude, samples=length)
         generator = torch.Generator().manual_seed(self.origin.config.seed)
         return shape_noise(self.residual.magnitude, contacts=1, samples=length, generator=generator)[0]
 

@@ -3,7 +3,7 @@
 Tensors are named by the path of their field: `bank.frequency`, `phase`, `gains.points`. The header's metadata
 holds under the key `avmsf` a record:
 
-{"format": 8, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300,
+{"format": 8, "version": "0.1.0", "sample_rate": 44100.0, "samples": 132300, "background_force": 12.5 or null,
  "sizes": {"modes": 43, "bins": 1025, "recordings": [8, 132300]},
  "gains": {"kind": "attention", the gain model's record},
  "alignment": null or {"modes": 32, "names": [...], "keys": [...]},
@@ -12,6 +12,7 @@ holds under the key `avmsf` a record:
 """
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -82,7 +83,7 @@ def load(path: str | Path) -> SoundField:
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         gains,
         tensors["phase"],
-        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings")),
+        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings"), _background_force(record)),
         float(record["sample_rate"]),
         record["samples"],
         origin,
@@ -110,6 +111,7 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
     if samples > MAX_SAMPLES:
         raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
+    _ = _background_force(record)
     skeleton = _skeleton(record)
     origin = dict(like(record["origin"], {}, "origin"))
     read = Origin(
@@ -132,6 +134,16 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
             got = f"{low:.3g} to {high:.3g}"
             raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=FIELD.advice)
     return read
+
+
+def _background_force(record: Mapping[str, Any]) -> float | None:
+    """Return the force of `Residual.force`; None for files of versions before 0.9, whose noise grows with the force."""
+    if (given := record.get("background_force")) is None:
+        return None
+    force: float = like(given, 1.0, "background_force")
+    if not 0.0 < force < math.inf:
+        raise RecordError.expected("a force above 0, or null", force, name="background_force")
+    return force
 
 
 def _skeleton(record: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -168,6 +180,7 @@ def _record(field: SoundField) -> dict[str, Any]:
     return {
         "sample_rate": field.sample_rate,
         "samples": field.samples,
+        "background_force": field.residual.force,
         "sizes": {
             "modes": len(field.bank),
             "bins": len(field.residual.magnitude),
@@ -184,7 +197,7 @@ def _record(field: SoundField) -> dict[str, Any]:
 
 def _tensors(field: SoundField) -> dict[str, Tensor]:
     named = {f"bank.{name}": each for name, each in vars(field.bank).items()} | {"phase": field.phase}
-    named |= {f"residual.{name}": each for name, each in vars(field.residual).items() if each is not None}
+    named |= {f"residual.{name}": each for name, each in vars(field.residual).items() if isinstance(each, Tensor)}
     if field.alignment is not None:
         named |= {_ALIGNMENT + name: tensor for name, tensor in field.alignment.tensors().items()}
     return named | {_GAINS + name: tensor for name, tensor in field.gain_field.tensors().items()}

@@ -20,6 +20,8 @@ PERIOD = 131_072
 """Samples after which the sequence repeats: 3 s at 44.1 kHz."""
 FILE = "low_fluctuation_noise.npy"
 """The sequence that the package contains, in float16."""
+MEDIAN_LEVEL = 1.054
+"""Factor on the sequence with which the median of its STFT magnitudes is that of Gaussian noise of variance one."""
 
 
 @cache
@@ -32,7 +34,7 @@ def white_sequence() -> Float[Tensor, " samples"]:
 
     It is white. Its level is such that its STFT magnitudes are near the median of those of Gaussian white noise of
     variance one; its root mean square is .78, because the median of a Rayleigh distribution is below its root mean
-    square (sqrt(ln 2) = .83) and because the magnitudes are on average a little below it.
+    square (sqrt(ln 2) = .83) and because the magnitudes are a little below it, by `MEDIAN_LEVEL` at their median.
     """
     with files(__package__).joinpath(FILE).open("rb") as file:
         return torch.from_numpy(np.load(file).astype(np.float32))
@@ -60,10 +62,13 @@ class Residual:
 
     magnitude: Float[Tensor, " bins"]
     """Standard deviation of the white noise that each band is cut from (bins evenly spaced from 0 Hz to half the
-    sample rate), so that all ones is white noise of unit variance. Not negative."""
+    sample rate), so that all ones is white noise of unit variance. Not negative. In the unit of the recordings."""
     recordings: Float[Tensor, "contacts samples"] | None = None
     """The training recordings without their modes, if their mean over the nearest ones predicts a contact left out
     better than noise does; else None."""
+    force: float | None = None
+    """Force of the impact whose recording has noise of this magnitude, where it is background: whatever the force is,
+    background has one level in a recording that is not divided by it. None where noise grows with the force (paper)."""
 
 
 def shape_noise(

@@ -135,6 +135,10 @@ def _expect_fitting(train: Impacts, modes: Extraction) -> None:
         advice = "give the direction in which the hammer moves, or zeros if unknown"
         given = train.directions[row].tolist()
         raise FitError.expected("a finite direction", given, row=row, name=train.names[row], advice=advice)
+    if train.forces is not None and not bool((train.forces > 0.0).all()):
+        row = int((train.forces > 0.0).int().argmin())
+        force, name = float(train.forces[row]), train.names[row]
+        raise FitError.expected("a force above 0", force, row=row, name=name, advice="give peak forces, or none at all")
     if float(train.sounds.abs().max()) == 0.0:
         raise FitError.expected("sound", "silence", name="train", advice="check the channel")
     advice = "extract the modes from the recordings that the field is fitted to"
