@@ -80,7 +80,8 @@ def _scores(sounds: Sounds, test: Impacts) -> dict[str, float]:
     levels = [_tail_power(each, test.sample_rate) for each in (sounds, test.sounds)]
     found = score(sounds, test).mean()
     level = float((10 * torch.log10(levels[0] / levels[1])).median())
-    return {"tail_db": level, "error": found["relative_stft"]} | {key: found[key] for key in ("l1", "l1_log", "envelope")}
+    others = {name: found[name] for name in ("l1", "l1_log", "envelope")}
+    return {"tail_db": level, "error": found["relative_stft"], **others}
 
 
 def _tail_power(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> Float[Tensor, " contacts"]:
