@@ -68,8 +68,8 @@ def _compared(case: _Case, settings: Settings) -> Iterator[tuple[str, dict[str, 
     if test.forces is not None:
         yield "known_force", _scores(_rendered(field, test, test.forces) / test.forces[:, None], test)
     aligned = modes.aligned(train)
-    for name, simple in {"nearest": NearestRecording(aligned), "knn": MeanWaveform(aligned)}.items():
-        yield name, _scores(simple.render(test.contacts), test)
+    yield "nearest", _scores(NearestRecording(aligned).render(test.contacts), test)
+    yield "knn", _scores(MeanWaveform(aligned).render(test.contacts), test)
 
 
 def _rendered(field: SoundField, test: Impacts, forces: Float[Tensor, " contacts"] | None = None) -> Sounds:
