@@ -75,7 +75,7 @@ def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:
 
 def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_open() -> None:
     page = (Path(__file__).parents[2] / "docs" / "paper-map.md").read_text(encoding="utf-8")
-    table = page.partition("## The paper's form of each stage")[2].partition("\n\n`evaluate`")[0]
+    table = page.partition("## The paper's form of each stage")[2].partition("\n\nIn `evaluate`")[0]
     words = [word for options in re.findall(r"`(--[^`]*)`", table.partition("|---|")[2]) for word in options.split()]
     found, paper = FitOptions.parse(["mug", *words]).all_settings, PRESETS["paper"]
     silent = {name: getattr(paper.fit, name) for name in ("width", "hidden", "layers", "warmup_rate")}
