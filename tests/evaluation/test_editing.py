@@ -1,20 +1,24 @@
 """Edits as an experiment: what counts as heard of them, their distances, and the table of methods on a dataset."""
 
 import json
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from avmsf.datasets import CaptureCollection
 from avmsf.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
 from avmsf.datasets.realimpact import SELF_INTERSECTING
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.editing import PROMPTS, REALIMPACT_26, audible_modes, spectral_distance
+from avmsf.evaluation.editing import PROMPTS, REALIMPACT_26, Edits, audible_modes, spectral_distance
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
+from avmsf.evaluation.registry import EditProtocolSettings
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.modes import ModalBank
 from factories.made_audio import save_audio
 from factories.made_clap import save_clap
@@ -94,6 +98,12 @@ def test_edits_go_towards_recordings_of_the_new_material_and_physics_has_its_fre
     assert apart * np.sqrt(32) == pytest.approx(np.log2(np.sqrt(72e9 / 2700 * 750 / 11e9)), abs=0.015)
     assert (folder / "figures" / "umap ceramic to wood.png").exists()
     assert json.loads((folder / "summary.json").read_text())["methods"]["unedited"].keys() >= {"umap", "spectral"}
+
+
+def test_models_and_embeddings_do_not_go_to_other_processes(tmp_path: Path) -> None:
+    edits = Edits(CaptureCollection(tmp_path), EditProtocolSettings(), HighResolution(), tmp_path)
+    vars(edits)["model"] = lambda: "is not pickled"
+    assert pickle.loads(pickle.dumps(edits)).model is None
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ reference, at equal level. Higher is better: `clap`, the cosine of the sounds an
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -107,6 +107,10 @@ class Edits:
     cache: Path
     """Keeps the modes of all objects with known materials."""
     seed: int = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Other processes make their own models and embeddings.
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @cached_property
     def materials(self) -> dict[str, str]:
