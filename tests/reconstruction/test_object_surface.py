@@ -81,6 +81,16 @@ def test_a_thin_plate_seen_from_both_sides_keeps_its_thickness() -> None:
     assert mesh.volume == pytest.approx(np.prod(sides), rel=0.2)
 
 
+def test_views_that_alone_look_through_a_channel_keep_their_masks() -> None:
+    length, width, height = 0.12, 0.05, 0.03
+    sides = [((0.0, 0.0, -height / 2), (length, width, WALL))]
+    sides += [((0.0, at * (width - WALL) / 2, 0.0), (length, WALL, height + WALL)) for at in (-1, 1)]
+    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for at, size in sides]
+    shape = _shape(trimesh.util.concatenate(boxes))
+    assert shape.report.rejected == ()
+    assert mesh_of(shape.solid()).volume < 0.6 * length * width * (height + WALL)
+
+
 def test_wrong_masks_are_found_and_left_out() -> None:
     mesh = cup(wall=WALL)
     views = list(views_of(mesh))

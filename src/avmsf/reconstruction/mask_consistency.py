@@ -18,8 +18,9 @@ WRONG_FRACTION = 0.05
 _MAX_LEFT_OUT = 0.002
 """Part of the consensus that a right mask leaves out in most views (median over 20 objects with 72 views: 0)."""
 _MAX_LEFT_OUT_ALONE = 0.15
-"""Part of the consensus that only a wrong mask leaves out. One view in twelve, which alone saw under a dish, leaves out
-.096; of the other objects' right masks none leaves out more than .07."""
+"""Part of the consensus that a mask which shows nothing beyond it leaves out if it is wrong, unless depth has nothing
+there either. One view in twelve, which alone saw under a dish, leaves out .096; of the other objects' right masks none
+leaves out more than .07; one along a channel, which alone looks through it, most of it."""
 _MAX_BEYOND = 0.01
 """Part of a mask beyond the consensus from which on it is wrong. Right masks of the 20 objects have .0000; nine in ten
 mirrored ones have .015 and more, unless the object looks the same from there."""
@@ -57,12 +58,18 @@ def edge_offset(views: Sequence[View], outlines: Sequence[Outline]) -> float:
     return float((weight * pixels).sum() / weight.sum())
 
 
-def consistent_masks(views: Sequence[View], outlines: Sequence[Outline], grid: Grid) -> Bool[np.ndarray, " views"]:
+def consistent_masks(
+    views: Sequence[View],
+    outlines: Sequence[Outline],
+    depths: Sequence[Float32[np.ndarray, "height width"]],
+    grid: Grid,
+) -> Bool[np.ndarray, " views"]:
     """Return which masks agree with the consensus of all, on a grid around the object.
 
     The consensus is what all but 5 % of the masks keep. A right mask may leave out a part of it that few other views
-    could see, but shows nothing beyond it; one that does both is wrong, and one that leaves out much.
-    At least half of the masks agree, for a wrong one leaves out more than the median.
+    could see, but shows nothing beyond it; one that does both is wrong, and one that leaves out much in which its view
+    has `depths`, meters, in most pixels: 0 where nothing is. At least half of the masks agree, for a wrong one leaves
+    out more than the median.
     """
     values = hull_distance(outlines, grid, rank=round(WRONG_FRACTION * len(outlines)))
     solid = values > 0
@@ -75,9 +82,14 @@ def consistent_masks(views: Sequence[View], outlines: Sequence[Outline], grid: G
     # Half a cell larger, for cells are coarse.
     values = np.maximum(values + 0.5 * np.float32(grid.spacing), -grid.spacing)
     tracer = MeshTracer(closed_surface(values, grid))
-    beyond = np.array([_beyond(view, each, tracer) for view, each in zip(views, outlines, strict=True)])
+    seen = [torch.isfinite(tracer.depth(view.camera)).numpy() for view in views]
+    beyond = np.array([_part(~there, each.inside > 1) for each, there in zip(outlines, seen, strict=True)])
     shown = beyond > max(_MAX_BEYOND, _MIN_MEDIAN_RATIO * float(np.median(beyond)))
-    return ~(inconsistent & (shown | (cut > _MAX_LEFT_OUT_ALONE)))
+    # Outermost pixels are the background's in part.
+    filled = [
+        _part(depth > 0, there & (each.inside < -1)) for depth, each, there in zip(depths, outlines, seen, strict=True)
+    ]
+    return ~(inconsistent & (shown | ((cut > _MAX_LEFT_OUT_ALONE) & (np.array(filled) > 0.5))))
 
 
 def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) -> float:
@@ -85,8 +97,6 @@ def _left_out(outline: Outline, grid: Grid, solid: Bool[np.ndarray, "x y z"]) ->
     return float((distance[solid] < -0.5 * grid.spacing).mean())
 
 
-def _beyond(view: View, outline: Outline, tracer: MeshTracer) -> float:
-    """Return the part of a mask, without its outermost pixel, in which a view does not see a surface."""
-    inside = outline.inside > 1
-    seen = torch.isfinite(tracer.depth(view.camera)).numpy()
-    return float((inside & ~seen).sum() / max(int(inside.sum()), 1))
+def _part(found: Bool[np.ndarray, "height width"], among: Bool[np.ndarray, "height width"]) -> float:
+    """Return the part of some pixels in which something is found; 0 of none."""
+    return float((found & among).sum() / max(int(among.sum()), 1))

@@ -1,6 +1,7 @@
 """From masks and depth of many views to an object's shape."""
 
 from collections.abc import Sequence
+from itertools import compress
 
 import numpy as np
 import torch
@@ -59,9 +60,9 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     offset = edge_offset(masked, outlines)
     outlines = [outline.moved_in(offset) for outline in outlines]
     rough = Grid.around(*_rough(masked, outlines), cells=_COARSE_CELLS, finest=_MAX_REFINEMENT, margin=2)
-    right = consistent_masks(masked, outlines, rough)
-    kept = [view for view, each in zip(masked, right, strict=True) if each]
-    outlines = [outline for outline, each in zip(outlines, right, strict=True) if each]
+    maps = [depth_map(view.camera).detach().cpu().float().numpy() for view in masked]
+    right = consistent_masks(masked, outlines, maps, rough)
+    kept, outlines, maps = list(compress(masked, right)), list(compress(outlines, right)), list(compress(maps, right))
     low, high = _box(hull_distance(outlines, rough, rank=0) > -rough.spacing, rough, len(kept))
     grid = Grid.around(low, high, cells=cells, finest=_MAX_REFINEMENT, margin=_MARGIN_CELLS)
     hull = _hull(outlines, grid)
@@ -69,7 +70,6 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     diagonal = float(np.linalg.norm(high - low))
     hull, untouched = fair_hull(hull, outlines, grid, diagonal)
     cameras = [view.camera for view in kept]
-    maps = (depth_map(camera).detach().cpu().float().numpy() for camera in cameras)
     # At the outline a pixel's depth is the background's in part.
     depths = [np.where(view.foreground, depth, np.float32(0.0)) for view, depth in zip(kept, maps, strict=True)]
     free, view_counts = free_space(depths, cameras, hull, grid, diagonal)
