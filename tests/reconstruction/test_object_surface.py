@@ -91,6 +91,15 @@ def test_views_that_alone_look_through_a_channel_keep_their_masks() -> None:
     assert mesh_of(shape.solid()).volume < 0.6 * length * width * (height + WALL)
 
 
+def test_a_shallow_dome_is_as_thin_at_its_rim_as_in_the_middle() -> None:
+    # A sphere's cap of 60 mm radius and 18 mm height.
+    angle, radius = np.linspace(0.0, np.arctan2(0.06, 0.082), 24), 0.1017
+    outer, inner = (r * np.stack([np.sin(angle), np.cos(angle)], axis=1) for r in (radius, radius - WALL))
+    dome = trimesh.creation.revolve(np.concatenate([inner, outer[::-1]]), sections=96)
+    mesh = mesh_of(_shape(dome).shell(WALL))
+    assert mesh.volume == pytest.approx(abs(dome.volume), rel=0.1)
+
+
 def test_wrong_masks_are_found_and_left_out() -> None:
     mesh = cup(wall=WALL)
     views = list(views_of(mesh))

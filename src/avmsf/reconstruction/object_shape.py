@@ -160,7 +160,8 @@ class ObjectShape:
         deep = inside & (self._depth > thickness)
         label, _ = ndimage.label(inside & (self._depth > thickness + margin))
         joined = np.unique(label[ndimage.binary_dilation(seen) & (label > 0)])
-        start = (seen & deep) | np.isin(label, joined[joined > 0])
+        # A lid covers nothing but a cavity, shallow parts along its rim too.
+        start = ((seen | self._lids) & deep) | np.isin(label, joined[joined > 0])
         if not start.any():
             return None
         away = ndimage.distance_transform_edt(~start).astype(np.float32) * np.float32(self.grid.spacing)
