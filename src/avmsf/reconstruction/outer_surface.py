@@ -79,9 +79,8 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     supposed = not hollow.any()
     if supposed:
         hollow = _unobserved_cavities(seen, untouched > _MIN_TOUCH_DISTANCE * diagonal)
-    outer = seen
-    if not supposed:
-        outer = np.where(_covered(hollow > 0, (bound > 0) & (seen <= 0)), np.maximum(seen, bound), seen)
+    # Beside cavities that were seen, what depth carves is its scatter.
+    outer = seen if supposed else bound
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
     return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, ShapeReport(rejected, offset, unseen))
 
@@ -168,14 +167,6 @@ def _closed(
     areas = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).numpy()
     hidden = ~known[surface.faces.numpy()].any(axis=1)
     return np.minimum(seen, bound), bound, float(areas[hidden].sum() / areas.sum())
-
-
-def _covered(hollow: Bool[np.ndarray, "x y z"], free: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """Return the cells that lids cover: cavities, the shallow parts beside them, and a margin."""
-    if hollow.any():
-        label, _ = ndimage.label(free)
-        hollow = np.isin(label, np.unique(label[hollow]))
-    return ndimage.binary_dilation(hollow, iterations=_MIN_HALF_WIDTH_CELLS)
 
 
 def _hollows(
