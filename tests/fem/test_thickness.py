@@ -28,7 +28,8 @@ def searched(
     def evidence(known: Sequence[CandidateBody]) -> list[float]:
         return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
 
-    def make(wall: float) -> CandidateBody | None:
+    def make(wall: float, *, closed: bool) -> CandidateBody | None:
+        assert not closed
         asked.append(wall)
         return walled(wall) if made else None
 
@@ -75,6 +76,26 @@ def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable()
     found, thickness, asked = searched(lambda log: 0.0, filled=10.0, walls=(None, *GRID))
     assert (thickness, asked) == (None, [])
     assert [body.thickness for body in found] == [None]
+
+
+def test_of_open_and_closed_walls_those_like_the_most_probable_one_are_searched() -> None:
+    asked: list[bool] = []
+
+    def make(wall: float, *, closed: bool) -> CandidateBody:
+        asked.append(closed)
+        return replace(bodies()[0], thickness=wall, closed=closed)
+
+    def evidence(known: Sequence[CandidateBody]) -> list[float]:
+        true = {False: 0.0011, True: 0.0029}
+        return [normal(true[body.closed], 0.2)(math.log(body.thickness)) - 20.0 * (not body.closed) for body in known]
+
+    both = [make(wall, closed=closed) for closed in (False, True) for wall in GRID]
+    asked.clear()
+    found, thickness = search_thickness(both, evidence, make)
+    assert thickness.median == pytest.approx(0.0029, rel=0.03)
+    assert asked
+    assert all(asked)
+    assert all(body.closed for body in found)
 
 
 def test_other_thicknesses_are_tried_where_a_body_cannot_be_had() -> None:

@@ -258,10 +258,15 @@ def box(inset: float, *, above: float = 0.0) -> Surface:
 
 @dataclass(frozen=True, eq=False)
 class Cup:
-    """A cup of flat sides whose wall is unknown; walls above `most` leave nothing of its cavity."""
+    """A cup of flat sides whose wall is unknown; walls above `most` leave nothing of its cavity.
+
+    It may be shut where views did not see that it `opens`.
+    """
 
     most: float = 0.02
     thickness_range: tuple[float, float] | None = (0.006, 0.018)
+    opens: bool = True
+    shut: bool = False
 
     def as_seen(self) -> Surface:
         return box(0.0)
@@ -269,10 +274,13 @@ class Cup:
     def digest(self) -> str:
         return f"{self}"
 
+    def closed(self) -> "Cup | None":
+        return None if self.opens else replace(self, shut=True)
+
     def shell(self, thickness: float, *, faces: int) -> Surface:
         if thickness > self.most:
             raise SceneError("nothing is left of the cavity")
-        return difference(self.as_seen(), box(thickness, above=0.01))
+        return difference(self.as_seen(), box(thickness, above=-thickness if self.shut else 0.01))
 
 
 @pytest.mark.slow
@@ -285,6 +293,22 @@ def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
     # Of panels that bend, frequencies go with the thickness, 1.32 here; panels between thicker walls are
     # smaller, and coarse elements too stiff, more so in thinner walls.
     assert 1.2 < lowest[1] / lowest[0] < 1.6
+
+
+@pytest.mark.slow
+def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
+    found = SurfaceBodies(Cup(opens=False), count=6, dofs=4000)
+    walls = found.bodies[1:]
+    assert [body.closed for body in walls] == 5 * [False] + 5 * [True]
+    for cup, box in zip(walls[:5], walls[5:], strict=True):
+        assert cup.thickness == box.thickness
+        # A lid stiffens the sides.
+        assert float(cup.elastic.frequency[0]) < 0.8 * float(box.elastic.frequency[0])
+    assert walls[5].name == "closed wall of 6 mm"
+    made = found.with_thickness(0.007, closed=True)
+    assert (made.thickness, made.closed) == (0.007, True)
+    assert found.refined(made).fine
+    assert found.refined(made).closed
 
 
 def test_walls_that_cannot_be_had_are_left_out() -> None:

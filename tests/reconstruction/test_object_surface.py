@@ -150,6 +150,16 @@ def test_the_wall_around_a_supposed_cavity_is_a_tube(block: ObjectShape, wall: f
     assert mesh.volume == pytest.approx(np.pi * 0.05 * (0.03**2 - (0.03 - wall) ** 2), rel=0.1)
 
 
+def test_a_supposed_cavity_may_be_closed_all_round(block: ObjectShape, cup_shape: ObjectShape) -> None:
+    wall = 0.004
+    mesh = mesh_of(block.closed().shell(wall))
+    assert mesh.is_watertight
+    assert mesh.euler_number == 4
+    within = np.pi * (0.03 - wall) ** 2 * (0.05 - 2 * wall)
+    assert mesh.volume == pytest.approx(np.pi * 0.03**2 * 0.05 - within, rel=0.1)
+    assert cup_shape.closed() is None
+
+
 def test_views_do_not_bound_the_wall_of_a_supposed_cavity(block: ObjectShape, cup_shape: ObjectShape) -> None:
     assert block.thickness_range == pytest.approx((0.0025 * block.diagonal, 0.06 * block.diagonal))
     # Into an open cup of a wall of 4 mm they do see.

@@ -67,6 +67,10 @@ class HollowShape(Protocol):
         """Return the closed surface of what was seen, both sides of walls included."""
         ...
 
+    def closed(self) -> "HollowShape | None":
+        """Return the shape whose wall goes all round its cavity, without an opening; None where there can be none."""
+        ...
+
     def shell(self, thickness: float, *, faces: int) -> Surface:
         """Return the closed surface of a wall, meters thick, behind the outer side. Raises SceneError without one.
 

@@ -74,11 +74,13 @@ class CandidateBody:
     """Where it is held; None for a free body."""
     updated: float | None = None
     """Log evidence (nats) that it gained by departures of its stiffness and density; None without."""
+    closed: bool = False
+    """Whether its wall goes all round a cavity without an opening, as it may where no view sees into one."""
 
     @property
     def name(self) -> str:
         """What it is, for people."""
-        parts = [body_name(self.thickness), "" if self.support is None else self.support.name]
+        parts = [self.closed * "closed " + body_name(self.thickness), "" if self.support is None else self.support.name]
         parts.append("" if self.updated is None else "stiffness and density updated")
         return ", ".join(filter(None, parts))
 
@@ -120,8 +122,8 @@ class CandidateBodies:
         """Return the modes of a body on any support, with few elements; None where they cannot be computed."""
         return None
 
-    def with_thickness(self, thickness: float) -> CandidateBody | None:
-        """Return the body with a wall of a thickness, meters; None where that fails."""
+    def with_thickness(self, thickness: float, *, closed: bool = False) -> CandidateBody | None:
+        """Return the body with a wall of a thickness, meters, open or closed; None where that fails."""
         return None
 
     def digest(self) -> str:
@@ -181,7 +183,7 @@ class SurfaceBodies(CandidateBodies):
         self._surface, self._digest, self._log = surface, surface.digest(), log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)
-        self._coarse_only = set[tuple[float | None, Support | None]]()
+        self._coarse_only, self._is_closed = set[tuple[float | None, Support | None]](), False
         self._solved, self.solid = once(self._solve), once(self._make_solid)
         self._walls, self._remeshing = once(lambda dofs: wall_solids(self.checked, dofs)), Lock()
 
@@ -227,6 +229,8 @@ class SurfaceBodies(CandidateBodies):
         Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned,
         which was good enough to choose by, and `log` is called with the reason.
         """
+        if body.closed and self._closed is not None:
+            return self._closed.refined(body)
         key = body.thickness, body.support
         if body.fine or key in self._coarse_only:
             return body
@@ -245,6 +249,8 @@ class SurfaceBodies(CandidateBodies):
         Of tetrahedra that are few enough to choose by; `refined` makes the chosen body fine, without a check of its
         convergence. `log` is called with the reason for None.
         """
+        if body.closed and self._closed is not None:
+            return self._closed.held(body)
         patches = patches_about(self.held_at) or None
         try:
             solid = self.solid(body.thickness, self._coarse_dofs)
@@ -253,11 +259,13 @@ class SurfaceBodies(CandidateBodies):
             self._log(f"{body.name}: no supports tested: {error}")
             return None
 
-    def with_thickness(self, thickness: float) -> CandidateBody | None:
+    def with_thickness(self, thickness: float, *, closed: bool = False) -> CandidateBody | None:
         """Return the body with a wall of this thickness, meters, coarse as of several; None if that fails.
 
         `log` is called with the reason.
         """
+        if closed and self._closed is not None:
+            return self._closed.with_thickness(thickness)
         try:
             return self._body(thickness, fine=False)
         except SimulationError as error:
@@ -295,9 +303,29 @@ class SurfaceBodies(CandidateBodies):
             raise SimulationError.expected(wanted_body, reasons, got=got, name=name, advice=advice)
         for reason in reasons:
             self._log_refused(reason)
+        if self._closed is not None:
+            try:
+                bodies += self._closed.bodies
+            except SimulationError as error:
+                self._log_refused(f"closed walls: {error}")
         if len(bodies) == 1:
             bodies = [self.refined(bodies[0])]
         return tuple(bodies), MappingProxyType({thickness: str(error) for thickness, error in refused.items()})
+
+    @cached_property
+    def _closed(self) -> "SurfaceBodies | None":
+        """The same walls without an opening, where no view sees into one."""
+        shape = None if self.shape is None or self._is_closed else self.shape.closed()
+        walls = self._guesses() if self._thicknesses is None else self._thicknesses
+        walls = [wall for wall in walls if wall is not None]
+        if shape is None or not walls:
+            return None
+        made = SurfaceBodies(
+            shape, thicknesses=walls, supports=self.supports, held_at=self.held_at, count=self._count, dofs=self.dofs,
+            material=self._material, cache=self._cache, log=self._log,
+        )  # fmt: skip
+        made._is_closed = True
+        return made
 
     def _guesses(self) -> list[float | None]:
         """Return the thicknesses to try; None for what the surface encloses."""
@@ -318,13 +346,13 @@ class SurfaceBodies(CandidateBodies):
         if not fine and self.dofs > self._coarse_dofs:
             try:
                 modes = self.modes(thickness, dofs=self._coarse_dofs, perturbed=False)
-                return CandidateBody(thickness, modes, fine=False)
+                return CandidateBody(thickness, modes, fine=False, closed=self._is_closed)
             except SimulationError as error:
                 # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
                 if self.shape is not None:
                     raise
                 self._log(f"retrying with more tetrahedra ({error})")
-        return CandidateBody(thickness, self._converged(thickness))
+        return CandidateBody(thickness, self._converged(thickness), closed=self._is_closed)
 
     def _converged(self, thickness: float | None) -> ElasticModes:
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""

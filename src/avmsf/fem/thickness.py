@@ -51,25 +51,26 @@ class ThicknessPosterior:
 def search_thickness(
     bodies: Sequence[CandidateBody],
     evidence: Callable[[Sequence[CandidateBody]], Sequence[float]],
-    with_wall: Callable[[float], CandidateBody | None],
+    with_wall: Callable[..., CandidateBody | None],
 ) -> tuple[list[CandidateBody], ThicknessPosterior | None]:
     """Return the bodies that are not improbable, the most probable one first, and the posterior of the thickness.
 
     `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body with a wall
-    of a thickness in meters, None where that fails, and another thickness is tried then. There is no posterior where a
-    body without a wall is the most probable one, or where fewer than two thicknesses are known.
+    of a thickness in meters, `closed` or not, None where that fails, and another thickness is tried then. Of open and
+    closed walls only those like the most probable one are searched. There is no posterior where a body without a wall
+    is the most probable one, or where fewer than two thicknesses are known.
     """
     found, failed = dict(zip(bodies, evidence(bodies), strict=True)), list[float]()
     thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - TOLERANCES.max_extension
     for _ in range(TOLERANCES.max_bodies):
-        walls = _walls(found)
-        if len(walls) < 2 or max(found, key=found.__getitem__).thickness is None:
+        walls, best = _walls(found), max(found, key=found.__getitem__)
+        if len(walls) < 2 or best.thickness is None:
             break
         known, values = np.log([wall for wall, _ in walls]), np.array([each for _, each in walls])
         wall = _next(known, values, np.log(failed), thinnest=thinnest)
         if wall is None:
             break
-        body = with_wall(wall)
+        body = with_wall(wall, closed=best.closed)
         if body is None:
             failed.append(wall)
             continue
@@ -84,8 +85,10 @@ def search_thickness(
 
 
 def _walls(found: dict[CandidateBody, float]) -> list[tuple[float, float]]:
-    """Return the thicknesses, from thin to thick, and their log evidence."""
-    return sorted((body.thickness, each) for body, each in found.items() if body.thickness is not None)
+    """Return the thicknesses of walls as open as the most probable one, from thin to thick, and their log evidence."""
+    walls = [body for body in found if body.thickness is not None]
+    closed = max(walls, key=found.__getitem__).closed if walls else False
+    return sorted((body.thickness, found[body]) for body in walls if body.thickness and body.closed == closed)
 
 
 def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnest: float) -> float | None:

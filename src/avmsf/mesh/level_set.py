@@ -98,7 +98,10 @@ def difference(surface: Surface, cut: Surface) -> Surface:
         status = left.status().name
         message = f"expected two closed surfaces, got {status}; make the shape on finer cells"
         raise SceneError(message, name="surface", value=status)
-    mesh = max(left.decompose(), key=lambda part: float(part.volume()), default=left).to_mesh()
+    parts = left.decompose()
+    largest = max(parts, key=lambda part: float(part.volume()), default=left)
+    # The surface of a cavity without an opening is a part by itself, turned inwards.
+    mesh = (largest ^ left if any(part.volume() < 0 for part in parts) else largest).to_mesh()
     vertices, faces = np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts)
     return Surface(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
 

@@ -1,7 +1,7 @@
 """An object's shape on a grid: its outer side, its cavities, and the bodies that it may be."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -89,6 +89,15 @@ class ObjectShape:
     def _as_seen(self) -> Surface:
         return self._enclose(self.seen, self.grid, 2 * MAX_FACES)
 
+    def closed(self) -> "ObjectShape | None":
+        """Return the shape around a cavity without an opening, where one is supposed; None where nothing is so thick.
+
+        Bottles are such bodies, but for a mouth too narrow to be seen into.
+        """
+        within = np.where(self.outer > 0, distance_from(self.outer) * np.float32(self.grid.spacing), np.float32(0.0))
+        deep = within > _MIN_HALF_THICKNESS * self.diagonal
+        return replace(self, hollow=deep.astype(np.int32)) if self.supposed and deep.any() else None
+
     def shell(self, thickness: float, *, faces: int = MAX_FACES) -> Surface:
         """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
 
@@ -121,7 +130,7 @@ class ObjectShape:
         inside = self.outer > 0
         skin = inside & ~ndimage.binary_erosion(inside)
         if self.supposed:
-            lids = self.hollow > 0
+            lids = skin & (self.hollow > 0)
         else:
             lids = skin & (self.seen <= 0) & ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
         slopes = np.stack([-each for each in np.gradient(ndimage.gaussian_filter(self.outer, 1.5))], axis=-1)
