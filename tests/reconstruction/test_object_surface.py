@@ -49,6 +49,20 @@ def test_a_cup_has_one_cavity_as_deep_as_it_is_though_depth_lies_behind_the_surf
     assert mesh_of(shape.solid()).volume == pytest.approx(np.pi * RADIUS**2 * HEIGHT, rel=0.05)
 
 
+def test_depth_that_errs_beside_a_cavity_dents_no_wall() -> None:
+    # Depth of a band around the middle lies 3 mm behind what the masks show.
+    deep, inner = RADIUS - 0.003, RADIUS - 2 * WALL
+    outline = [(0, 0), (RADIUS, 0), (RADIUS, 0.02), (deep, 0.02), (deep, 0.04), (RADIUS, 0.04), (RADIUS, HEIGHT)]
+    dented = trimesh.creation.revolve(
+        np.array([*outline, (inner, HEIGHT), (inner, 2 * WALL), (0, 2 * WALL)]), sections=96
+    )
+    shape = object_surface(views_of(cup(wall=2 * WALL)), depth_of(dented), cells=CELLS)
+    assert int(shape.hollow.max()) == 1
+    points = mesh_of(shape.solid()).vertices
+    radii = np.linalg.norm(points[np.abs(points[:, 2] - 0.03) < 0.005, :2], axis=1)
+    assert float(np.median(radii)) == pytest.approx(RADIUS, abs=0.0007)
+
+
 @pytest.mark.parametrize("wall", [0.0007, 0.002, 0.004, 0.008])
 def test_a_shell_is_as_thick_as_asked_for_though_cells_are_wider(cup_shape: ObjectShape, wall: float) -> None:
     assert cup_shape.grid.spacing > 0.001
@@ -92,12 +106,21 @@ def test_views_that_alone_look_through_a_channel_keep_their_masks() -> None:
 
 
 def test_a_shallow_dome_is_as_thin_at_its_rim_as_in_the_middle() -> None:
-    # A sphere's cap of 60 mm radius and 18 mm height.
-    angle, radius = np.linspace(0.0, np.arctan2(0.06, 0.082), 24), 0.1017
-    outer, inner = (r * np.stack([np.sin(angle), np.cos(angle)], axis=1) for r in (radius, radius - WALL))
-    dome = trimesh.creation.revolve(np.concatenate([inner, outer[::-1]]), sections=96)
-    mesh = mesh_of(_shape(dome).shell(WALL))
-    assert mesh.volume == pytest.approx(abs(dome.volume), rel=0.1)
+    wide, high, wall = 0.06, 0.011, 0.003
+    radius = (wide**2 + high**2) / (2 * high)
+    low = radius - high
+
+    def turned(hole: float) -> trimesh.Trimesh:
+        """Return the dome, hollow within a distance from its axis."""
+        outer, inner = np.linspace(0.0, wide, 24), np.linspace(0.0, hole, 12)
+        within = np.stack([inner, np.sqrt((radius - wall) ** 2 - inner**2) - low], axis=1)
+        around = np.stack([outer, np.sqrt(radius**2 - outer**2) - low], axis=1)
+        return trimesh.creation.revolve(np.concatenate([within, [(hole, 0.0)], around[::-1]]), sections=96)
+
+    dome = turned(np.sqrt((radius - wall) ** 2 - low**2))
+    # Depth shows the middle of its cavity alone, as that of Gaussians does.
+    shape = object_surface(views_of(dome), depth_of(turned(0.025)), cells=CELLS)
+    assert mesh_of(shape.shell(wall)).volume == pytest.approx(abs(dome.volume), rel=0.1)
 
 
 def test_wrong_masks_are_found_and_left_out() -> None:

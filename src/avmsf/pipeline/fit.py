@@ -1,6 +1,7 @@
 """From a capture to a field in one call: its shape, from a mesh or from views, its modes, and its gains."""
 
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -179,10 +180,12 @@ def _fit_shape(
 
     def bodies() -> CandidateBodies:
         listener.log("bodies: finite-element models of the object")
-        cache = pipeline.folder.path(BODIES)
-        return candidate_bodies(
+        cache, begun = pipeline.folder.path(BODIES), time.monotonic()
+        made = candidate_bodies(
             shape.surface(), config.body, impacts=train, settings=capture.settings, cache=cache, log=listener.log
         )
+        listener.ready(BODIES, time.monotonic() - begun)
+        return made
 
     estimator = once(
         lambda: estimator_for(
@@ -195,8 +198,6 @@ def _fit_shape(
     )
 
     def find_modes(path: Path) -> None:
-        # First: what is wrong with the object's shape shows in less time than the modes take.
-        estimator()
         listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
         extract_once(train, method, path, needed=True)
 
@@ -224,6 +225,9 @@ def _fit_shape(
         values |= {"body": asdict(config.body), "fit": asdict(config.fit), "settings": asdict(capture.settings)}
         return {**recorded, **values, "surface": shape.surface_digest}
 
+    if not pipeline.folder.path(MODES).exists():
+        # First: what is wrong with the object's shape shows in less time than the modes take.
+        estimator()
     found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
     field = pipeline.add(Stage(FIELD, fit_gains, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
     surface = pipeline.made.get(SURFACE)
