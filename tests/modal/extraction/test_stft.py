@@ -71,6 +71,23 @@ def test_a_mode_must_show_in_half_the_recordings(showing: int, expected: int):
     assert len(find(torch.stack(sounds))) == expected
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_chance_brings_hardly_a_mode_about(seed: int):
+    """Clicks of decaying noise are full of local maxima, of which half of the recordings always have one nearby."""
+    generator = torch.Generator().manual_seed(seed)
+    clicks = 0.1 * torch.randn(8, 8000, generator=generator) * torch.exp(-10.0 * torch.arange(8000) / RATE)
+    assert len(find(clicks)) <= 2
+    modes = find(clicks + torch.stack([tone(1000.0, 20.0) + tone(3000.0, 15.0)] * 8), count=100).frequency
+    assert len(modes) <= 4
+    for frequency in (1000.0, 3000.0):
+        assert float((modes - frequency).abs().min()) < 1.0
+
+
+def test_a_single_recording_has_nothing_to_agree_with():
+    sounds = torch.stack([tone(1000.0, 20.0) + tone(3000.0, 15.0)])
+    assert find(sounds).frequency.tolist() == pytest.approx([1000.0, 3000.0], abs=0.1)
+
+
 def test_the_strongest_are_kept():
     sounds = torch.stack([sum(tone(1000.0 * k, 20.0, gain=0.5**k) for k in range(1, 6))] * 2)
     pitches = find(sounds, count=2).frequency.tolist()

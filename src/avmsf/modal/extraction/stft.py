@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Complex, Float, Float64, Int
+from scipy.special import bdtrc
 from torch import Tensor
 
 from avmsf.modal.modes import ModalBank
@@ -65,6 +66,8 @@ class Lines:
     frequency: Float64[Tensor, "contacts bins"]
     """From the slope of the narrow-band signal's phase, Hz."""
     sample_rate: float
+    bin_width: float
+    """Distance of neighboring bins, Hz."""
 
     @classmethod
     def of(
@@ -98,13 +101,21 @@ class Lines:
         center = numbers.double() * (sample_rate / fft_size)
         turns = sample_rate / hop
         frequency = center + torch.remainder(advance - center + turns / 2, turns) - turns / 2
-        return cls(torch.where((peak <= latest_peak) & ringing, gain, 0.0), damping, frequency, sample_rate)
+        return cls(
+            torch.where((peak <= latest_peak) & ringing, gain, 0.0),
+            damping,
+            frequency,
+            sample_rate,
+            sample_rate / fft_size,
+        )
 
     def modes(self, count: int) -> ModalBank:
         """Return up to `count` modes, the strongest of those that the recordings agree on.
 
-        In each recording a bin is a candidate when its gain is a local maximum over bins. A mode's damping is the mean
-        over the recordings that show it, its frequency likewise. Strength is the mean fitted gain.
+        In each recording a bin is a candidate when its gain is a local maximum over bins. A mode is where the
+        frequencies of candidates, in half of the recordings or more, lie closer together than chance alone would bring
+        them anywhere (`_expected_by_chance`). Its damping is the mean over the recordings that show it, its frequency
+        likewise. Strength is the sum of the fitted gains.
         """
         gain = self.gain
         adjacent = torch.nn.functional.pad(gain, (1, 1))
@@ -115,23 +126,62 @@ class Lines:
         return self._agreed(candidate, count)
 
     def _agreed(self, candidate: Bool[Tensor, "contacts bins"], count: int) -> ModalBank:
-        once = candidate.to(torch.float64)
-        near = once + _neighbors(once)
-        shown, votes = near.clamp_max(1.0).sum(0), near.sum(0)
-        before, after = (torch.nn.functional.pad(votes, sides) for sides in ((1, 0), (0, 1)))
-        best = (votes >= before[:-1]) & (votes > after[1:])
-        bins = torch.nonzero(best & (shown >= max(1.0, _CONSENSUS * len(candidate)))).flatten()
+        contacts, bins = torch.nonzero(candidate, as_tuple=True)
+        pitch, decay, gain = (each[contacts, bins] for each in (self.frequency, self.damping, self.gain))
+        nearest, distance = _nearest(pitch, contacts, len(candidate))
+        distance = torch.where(distance <= self.bin_width, distance, math.inf)
+        expected, reach = _expected_by_chance(distance, density=len(pitch) / (len(candidate) * self.sample_rate / 2))
+        free = torch.ones_like(pitch, dtype=torch.bool)
+        modes = list[tuple[float, float, float]]()
+        for row in torch.argsort(expected).tolist():
+            if expected[row] >= 1.0:
+                break
+            if free[row]:
+                # Of two modes in one bin the bin shows one.
+                free &= (pitch - pitch[row]).abs() > self.bin_width
+                members = nearest[row][distance[row] <= reach[row]]
+                weight = gain[members] / gain[members].sum()
+                frequency = float((weight * pitch[members]).sum())
+                modes.append((frequency, float(decay[members].mean()), float(gain[members].sum())))
+        audible = [mode for mode in modes if 0 < mode[0] < self.sample_rate / 2]
+        strongest = sorted(sorted(audible, key=lambda mode: -mode[2])[:count])
+        table = torch.tensor(strongest, dtype=torch.float64).reshape(-1, 3)
+        return ModalBank(table[:, 0].clone(), table[:, 1].clone())
 
-        def mean(values: Float64[Tensor, "contacts bins"], weight: Float64[Tensor, "contacts bins"]) -> Tensor:
-            total, share = ((part + _neighbors(part)).sum(0)[bins] for part in (weight * values, weight))
-            return total / share
 
-        pitch, decay = mean(self.frequency, once * self.gain), mean(self.damping, once)
-        strength = mean(self.gain, once) * shown[bins]
-        audible = torch.nonzero((pitch > 0) & (pitch < self.sample_rate / 2)).flatten()
-        strongest = audible[torch.argsort(strength[audible], descending=True)[:count]]
-        order = strongest[torch.argsort(pitch[strongest])]
-        return ModalBank(pitch[order], decay[order])
+def _nearest(
+    pitch: Float64[Tensor, " candidates"], contacts: Int[Tensor, " candidates"], count: int
+) -> tuple[Int[Tensor, "candidates contacts"], Float64[Tensor, "candidates contacts"]]:
+    """Return the candidate of each recording that is nearest to each candidate, and their distance, Hz."""
+    rows = torch.zeros(len(pitch), count, dtype=torch.int64)
+    distance = torch.full((len(pitch), count), math.inf, dtype=torch.float64)
+    for contact in torch.unique(contacts).tolist():
+        own = torch.nonzero(contacts == contact).flatten()
+        distance[:, contact], best = (pitch[:, None] - pitch[own]).abs().min(1)
+        rows[:, contact] = own[best]
+    return rows, distance
+
+
+def _expected_by_chance(
+    distance: Float64[Tensor, "candidates contacts"], *, density: float
+) -> tuple[Float64[Tensor, " candidates"], Float64[Tensor, " candidates"]]:
+    """Return how many frequencies in all would be agreed on by chance as well as each candidate's, and how far it is.
+
+    Candidates of noise lie anywhere, `density` a hertz and recording. That k or more of the other recordings have one
+    within a distance is then binomial; taken is the k, of half of all recordings or more, that chance explains least,
+    with the distance of the kth. The probability times the numbers of candidates and of choices of k is what chance is
+    expected to bring about anywhere. A single recording has nothing to agree with: all of its candidates are modes.
+    """
+    candidates, count = distance.shape
+    if count == 1 or not candidates:
+        return torch.zeros(candidates, dtype=torch.float64), torch.zeros(candidates, dtype=torch.float64)
+    others = torch.arange(max(1, math.ceil(_CONSENSUS * count) - 1), count)
+    # Each is at distance 0 of itself.
+    reach = distance.sort(1).values[:, others]
+    near = -torch.expm1(-2.0 * density * reach)
+    chance = torch.from_numpy(bdtrc(others.numpy() - 1, count - 1, near.numpy()))
+    least, best = chance.min(1)
+    return least * len(others) * candidates, reach.gather(1, best[:, None])[:, 0]
 
 
 def _regress(
@@ -168,8 +218,3 @@ def _regress(
     gain = torch.where(count >= 3, torch.exp(mean_level - slope * mean_time), 0.0)
     turn = (signals[..., 1:] * signals[..., :-1].conj() * used[..., 1:]).sum(-1)
     return gain, -slope, torch.angle(turn).to(torch.float64) / (2 * math.pi * step), peak.to(torch.float64) * step
-
-
-def _neighbors(values: Float64[Tensor, "contacts bins"]) -> Float64[Tensor, "contacts bins"]:
-    padded = torch.nn.functional.pad(values, (1, 1))
-    return padded[:, :-2] + padded[:, 2:]
