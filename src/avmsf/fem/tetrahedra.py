@@ -9,7 +9,7 @@ import hashlib
 import importlib.util
 import io
 import os
-import subprocess
+import signal
 import sys
 import tempfile
 import zipfile
@@ -57,8 +57,8 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
 
     `detail` is the length of the tetrahedra's edges over the body's size, the diagonal of the box around it, where
     nothing asks for shorter ones; the solid's surface keeps within a 25th of that length of the mesh. Takes some
-    seconds to a minute. Raises SimulationError where pytetwild fails or takes more than `timeout`
-    seconds, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
+    seconds to a minute. Raises SimulationError where pytetwild fails or takes more than `timeout` seconds of the
+    processor, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
     """
     expect_detail(detail)
     mesh = weld(surface)
@@ -119,7 +119,7 @@ def _tetrahedralize(points: np.ndarray, faces: np.ndarray, detail: float, timeou
         job, result, log = (Path(name) / file for file in ("job.npz", "result.npz", "log"))
         np.savez(
             job, points=points, faces=faces.astype(np.uint32), edge=detail, envelope=TOLERANCES.envelope * detail,
-            library=found.submodule_search_locations[0],
+            library=found.submodule_search_locations[0], seconds=timeout,
         )  # fmt: skip
         # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
         command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
@@ -129,14 +129,14 @@ def _tetrahedralize(points: np.ndarray, faces: np.ndarray, detail: float, timeou
                 command, stdout=output, stderr=output, env=os.environ | {"OMP_NUM_THREADS": "1"}, cwd=name
             )
         try:
-            child.wait(timeout)
-        except subprocess.TimeoutExpired as error:
-            raise SimulationError.expected(
-                f"tetrahedra of {len(faces)} triangles within {timeout:g} s", timeout, got="none", name="timeout",
-                advice="simplify the mesh, or use a larger detail or fewer degrees of freedom",
-            ) from error  # fmt: skip
+            child.wait()
         finally:
             end_child(child)
+        if child.returncode == -signal.SIGPROF:
+            raise SimulationError.expected(
+                f"tetrahedra of {len(faces)} triangles within {timeout:g} s of the processor", timeout, got="none",
+                name="timeout", advice="simplify the mesh, or use a larger detail or fewer degrees of freedom",
+            )  # fmt: skip
         if child.returncode != 0 or not result.is_file():
             last = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:] or ["no message"]
             got, advice = f"{child.returncode} ({last[0][:200]})", "simplify the mesh, or change detail or its dofs"
