@@ -101,40 +101,37 @@ def _commands(settings: Settings) -> Iterator[Record]:
 def _many(settings: Settings) -> Iterator[Record]:
     """Fields of ten simulated objects: ten commands in turn, one command of one worker, one of two workers.
 
-    The first ten of sim-20, with 8 impacts of .5 s and a mesh; default settings, no stage cached, each command on all
-    cores, each worker on one. speed: over one worker. agreement: part of the fields that are one worker's to the bit.
-    gigabytes: most memory of a process. megabytes: of ten fields with their records, and of the caches.
+    The first ten of sim-20, with 8 impacts of .5 s and a mesh; default settings, one thread each, no stage cached; the
+    commands make the tetrahedra that all have. speed: over one worker. agreement: part of the fields that are one
+    worker's to the bit. gigabytes: most memory of a process. megabytes: of ten fields with records, and of the caches.
     """
     names = settings.some(list(SIM20)[:10], 2)
     with tempfile.TemporaryDirectory() as name:
-        place, fields = Path(name), dict[str, list[bytes]]()
+        place, fields, found = Path(name), dict[str, list[bytes]](), dict[str, dict[str, float]]()
         simulate_set({each: replace(SIM20[each], impacts=8, seconds=0.5, views=0) for each in names}, place / "sim")
-        captures, one = [place / "sim" / each for each in names], 0.0
-        for way in ("one worker", "two workers", "commands"):
-            output, cache = place / way, place / f"{way} cache"
-            more = ["--gain-model", "smooth"] if settings.quick else []
-            workers = 2 if way == "two workers" else 1
+        captures, more = [place / "sim" / each for each in names], ["--gain-model", "smooth"] * settings.quick
+        for way, workers in (("commands", 0), ("one worker", 1), ("two workers", 2)):
+            output, cache, before = place / way, place / f"{way} cache", processor_seconds()
             together = [*captures, "-o", output, "--cache", cache, "--workers", workers, *more]
             apart = [
                 [each, "-o", output / f"{each.name}.safetensors", "--cache", cache / each.name, *more]
                 for each in captures
             ]
-            before = processor_seconds()
-            _, taken = timed(partial(_fit, apart if way == "commands" else [together], cache))
-            worked = processor_seconds() - before
+            _, taken = timed(partial(_fit, [together] if workers else apart, place))
             fields[way] = [(output / f"{each}.safetensors").read_bytes() for each in names]
-            one = one or taken
-            same = [a == b for a, b in zip(fields[way], fields["one worker"], strict=True)]
-            values = {"seconds": taken, "processor_seconds": worked, "speed": one / taken}
-            values["agreement"] = sum(same) / len(same)
+            values = {"seconds": taken, "processor_seconds": processor_seconds() - before}
             values |= {"gigabytes": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9}
-            values |= {"megabytes": _megabytes(output), "cache_megabytes": _megabytes(cache)}
-            yield from records(values, object=way)
+            found[way] = values | {"megabytes": _megabytes(output), "cache_megabytes": _megabytes(cache)}
+    for way, values in found.items():
+        same = [a == b for a, b in zip(fields[way], fields["one worker"], strict=True)]
+        compared = {"speed": found["one worker"]["seconds"] / values["seconds"], "agreement": sum(same) / len(same)}
+        yield from records(values | compared, object=way)
 
 
-def _fit(commands: list[list[object]], cache: Path) -> None:
-    """Run `avmsf fit` with the words of each command; tetrahedra are kept in the cache too."""
-    avmsf, environment = Path(sys.executable).with_name("avmsf"), os.environ | {"AVMSF_CACHE": f"{cache}/tetrahedra"}
+def _fit(commands: list[list[object]], place: Path) -> None:
+    """Run `avmsf fit` with the words of each command, on one thread and with tetrahedra of its own."""
+    avmsf, environment = Path(sys.executable).with_name("avmsf"), os.environ | {"AVMSF_CACHE": str(place)}
+    environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     for words in commands:
         subprocess.run([str(avmsf), "fit", "--quiet", *map(str, words)], check=True, env=environment)
 

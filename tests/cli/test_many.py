@@ -136,8 +136,9 @@ def test_fields_of_many_are_those_of_each(
     if place[0] == "--ray":
         pytest.importorskip("ray")
     results, _ = results_of(capsys, *fit(captures, tmp_path / "many", *SMOOTH, *place))
-    error = results["results"]["a"]["scores"]["field"]["relative_stft"]
-    assert float(table_of(tmp_path / "many")["a"]["relative STFT error"]) == pytest.approx(error, rel=0.01)
+    found, row = results["results"]["a"], table_of(tmp_path / "many")["a"]
+    assert float(row["relative STFT error"]) == pytest.approx(found["scores"]["field"]["relative_stft"], rel=0.01)
+    assert float(row["by leave-one-out"]) == pytest.approx(found["report"]["quality"]["error"], rel=0.01)
     for name, content in fields_one_by_one(captures, tmp_path / "alone", *SMOOTH).items():
         assert (tmp_path / "many" / name).read_bytes() == content
 

@@ -129,12 +129,12 @@ class Options(Configured, Many):
 
     def cells(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Return what the table of many shows of a field."""
-        error = values.get("scores", {}).get("field", {}).get("relative_stft")
-        return {
-            "modes": str(values.get("modes", "")),
-            "quality": values.get("quality") or "",
-            "relative STFT error": "" if error is None else format_number(error),
+        errors = {
+            "by leave-one-out": values.get("report", {}).get("quality", {}).get("error"),
+            "relative STFT error": values.get("scores", {}).get("field", {}).get("relative_stft"),
         }
+        shown = {head: "" if error is None else format_number(error) for head, error in errors.items()}
+        return {"modes": str(values.get("modes", "")), **shown}
 
     @cached_property
     def all_settings(self) -> PipelineConfig:
