@@ -252,17 +252,21 @@ def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are
     monkeypatch.setattr(module, "candidate_bodies", bodies)
     settings = FitConfig(steps=2, fft_sizes=(1024, 256))
     config = PipelineConfig(body=BodyConfig(wall=0.004, shapes=8, dofs=1000), fit=settings, modes=6)
-    folder = StageFolder(tmp_path / "cache")
+    folder, told = StageFolder(tmp_path / "cache"), list[str]()
+    listener = ProgressListener(ready=lambda name, seconds: told.append(name))
 
     def run(failure: Exception | None = None) -> bool:
         """Return whether the field was made now."""
         failures[:] = [failure]
-        return module.fit_in_stages(capture, config, folder).stages["field.safetensors"].fresh
+        made = module.fit_in_stages(capture, config, folder, listener=listener)
+        return made.stages["field.safetensors"].fresh
 
     assert run(SimulationError("3.1 GB are free"))
     assert not run(SimulationError("2.9 GB are free"))
+    assert "bodies" not in told
     assert run()
     assert load(folder.path("field.safetensors")).origin.report["unavailable"] == {}
+    assert "bodies" in told
     assert not run()
     # Bodies were not asked for.
     assert failures == [None]
