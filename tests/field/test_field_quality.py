@@ -1,5 +1,6 @@
 """What a fit says of its own quality, and which residual it takes."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -56,6 +57,11 @@ def test_repeats_at_a_position_do_not_count_as_independent():
     assert twice.standard_error == pytest.approx(once.standard_error, rel=0.1)
 
 
+def earlier(field):
+    """Return a field as versions wrote it that knew no background."""
+    return replace(field, residual=replace(field.residual, force=None))
+
+
 def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     train, test = parted(with_clicks(strikes(20)))
     field = fitted(train)
@@ -68,8 +74,12 @@ def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     save(field, tmp_path / "field.safetensors")
     known = load(tmp_path / "field.safetensors")
     assert torch.equal(known.render(test.contacts), field.render(test.contacts))
-    # What an impact adds grows with its force, as the modes do.
-    assert torch.equal(field.render(test.contacts, forces=4.0), 4.0 * field.render(test.contacts))
+    # What an impact adds grows with its force, as the modes do. A mean of three has a third of the background's power.
+    (plain, full), noise = ([each.render(test.contacts) for each in (earlier(field), field)]), field.noise()
+    torch.testing.assert_close(full - plain, math.sqrt(2 / 3) * noise.expand(len(test), -1), rtol=0, atol=1e-6)
+    expected = 0.5 * plain + math.sqrt(1 - 0.25 / 3) * noise
+    torch.testing.assert_close(field.render(test.contacts, forces=0.5), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(field.render(test.contacts, forces=4.0), 4.0 * plain)
     # Longer than the recordings there is silence, as beyond their end nothing is known.
     assert torch.equal(known.render(test.contacts, samples=SAMPLES + 50)[:, :100], known.render(test.contacts)[:, :100])
 

@@ -19,7 +19,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.data import GainData, gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
 from avmsf.field.gains.model import Gains
 from avmsf.field.header import SUPPORTING
 from avmsf.field.next_contacts import suggest
@@ -27,7 +27,7 @@ from avmsf.field.quality import FieldQuality, PlaceErrors, smallest_within_error
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.trainer import GainEstimator, Progress, Trainer
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.residual_noise import Residual, estimate_residual
+from avmsf.modal.residual_noise import Residual, estimate_residual, missing_background
 
 _MIN_PLACES = 4
 """Places below which leaving one out says nothing of the field of all."""
@@ -145,6 +145,8 @@ def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundFi
     residuals = {"noise": field.noise(samples)}
     if field.origin.config.residual:
         residuals["recordings"] = (recordings[rows] * signs[..., None]).mean(1)
+        if field.residual.force is not None:
+            residuals["recordings"] += missing_background(torch.ones(()), NEIGHBORS) * residuals["noise"]
     modes = [field.modal_sounds(gains.left_out_estimate(share), samples) for share in _SPREAD_SHARES]
     error = PlaceErrors(train, places, field.origin.config)
     errors = {kind: torch.stack([error(each + added) for each in modes]) for kind, added in residuals.items()}

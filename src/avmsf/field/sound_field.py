@@ -14,7 +14,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import PositionWarning
 from avmsf.field.config import FitConfig
-from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
 from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.header import SUPPORTING
 from avmsf.field.positions import expect_near, off_surface, off_surface_gains
@@ -22,7 +22,7 @@ from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ForcePulse, ModalBank
-from avmsf.modal.residual_noise import MEDIAN_LEVEL, Residual, low_fluctuation_noise, shape_noise
+from avmsf.modal.residual_noise import MEDIAN_LEVEL, Residual, low_fluctuation_noise, missing_background, shape_noise
 from avmsf.modal.synthesis import synthesize
 
 _BATCH = 32
@@ -205,7 +205,8 @@ class SoundField:
 
         The noise is the same at every contact and in every call, so that a contact's sound depends on nothing else.
         Modes that are not `audible` are silent. Background noise does not grow with the force (`Residual.force`); what
-        the nearest recordings have in addition to their modes does, as does the noise of the paper's residual.
+        the nearest recordings have in addition to their modes does, as does the noise of the paper's residual. Where
+        their mean is rendered, noise is added as far as the background in it is too weak.
 
         Args:
             positions: [contacts, 3], object frame, meters.
@@ -225,8 +226,9 @@ class SoundField:
         """
         contacts, ways = self._impacts(positions, directions)
         length = self.samples if samples is None else as_count(samples, "samples")
-        recorded = noise and self.residual.recordings is not None
-        background = self.noise(length) if noise and not recorded else torch.zeros(length)
+        recorded, average = noise and self.residual.recordings is not None, self.residual.force
+        stationary = noise and not (recorded and average is None)
+        background = self.noise(length) if stationary else torch.zeros(length)
         parts = [torch.zeros(0, length)]
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             way = None if ways is None else ways[rows]
@@ -234,10 +236,13 @@ class SoundField:
             sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
             parts.append(sounds + self._recorded(contacts[rows], way, length) if recorded else sounds)
         sounds = torch.cat(parts)
-        if forces is None:
-            return sounds + background
-        given, constant = as_numbers(forces, "forces", count=len(contacts)).to(sounds)[:, None], self.residual.force
-        return given * sounds + (given if constant is None else constant) * background
+        usual = average or 1.0
+        given = as_numbers(usual if forces is None else forces, "forces", count=len(contacts))[:, None].to(sounds)
+        if average is None:
+            return given * (sounds + background)
+        if recorded:
+            background = missing_background(given / average, NEIGHBORS) * background
+        return sounds + background if forces is None else given * sounds + average * background
 
     def _impacts(
         self, positions: ArrayLike, directions: ArrayLike | None

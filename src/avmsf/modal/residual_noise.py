@@ -101,6 +101,15 @@ def low_fluctuation_noise(magnitude: Float[Tensor, " bins"], *, samples: int) ->
     return period.repeat(math.ceil(samples / len(sequence)))[:samples]
 
 
+def missing_background(forces: Float[Tensor, "*contacts"], recordings: int) -> Float[Tensor, "*contacts"]:
+    """Return the factor on background noise that completes it where the mean of some recordings is added.
+
+    `forces` are relative to `Residual.force`. The mean of recordings with independent backgrounds has a background of
+    their power over their number, which grows with the square of the force.
+    """
+    return (1.0 - forces.square() / recordings).clamp_min(0.0).sqrt()
+
+
 def interpolated(magnitude: Float[Tensor, " bins"], frequencies: int) -> Float[Tensor, " frequencies"]:
     """Return the magnitude at evenly spaced frequencies from 0 Hz to half the sample rate, linear between bins."""
     place = torch.linspace(0, len(magnitude) - 1, frequencies, device=magnitude.device)
