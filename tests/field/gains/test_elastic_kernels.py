@@ -175,8 +175,8 @@ def test_the_factors_prior_is_a_probability_of_units_and_materials():
     assert float(probability.sum()) == pytest.approx(1.0)
     assert float(FACTORS[probability[0].argmax()]) == pytest.approx(1.0)
     # Materials are as probable in all units, and each other unit is as probable as the next.
-    assert probability.sum(1).tolist() == pytest.approx([1 / 1.1, 0.05 / 1.1, 0.05 / 1.1])
-    assert torch.allclose(probability[0] / probability[2], torch.tensor(20.0, dtype=torch.float64))
+    assert probability.sum(1).tolist() == pytest.approx([1 / 1.002, 0.001 / 1.002, 0.001 / 1.002])
+    assert torch.allclose(probability[0] / probability[2], torch.tensor(1000.0, dtype=torch.float64))
 
 
 def test_categories_are_profiles_and_remainders_of_their_probability():
