@@ -9,6 +9,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.extract import extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
 RATE, SAMPLES, CONTACTS = 16000.0, 16000, 8
@@ -61,3 +62,18 @@ def test_a_doublet_that_all_recordings_share_does_not_shift():
     bank = HighResolution().find(sounds, RATE)
     assert len(bank) == len(FREQUENCY)
     assert HighResolution().find_shifts(sounds, bank, RATE) is None
+
+
+def test_poles_that_move_along_damping_as_much_as_along_frequency_do_not_shift():
+    """As poles do that stand for several unresolved modes."""
+    generator = torch.Generator().manual_seed(7)
+    draws = torch.randn(2, 2, CONTACTS, len(FREQUENCY), generator=generator, dtype=torch.float64)
+    gains, moves = torch.complex(draws[0], draws[1])
+    found = []
+    for damping in (DAMPING, DAMPING + 0.2 * DAMPING * moves.real):
+        frequency = FREQUENCY + 0.2 * DAMPING * moves.imag / (2 * math.pi)
+        sounds = synthesize(gains, frequency, damping, samples=SAMPLES, sample_rate=RATE)
+        sounds = sounds + NOISE * torch.randn(sounds.shape, generator=generator, dtype=torch.float64)
+        found.append(HighResolution().find_shifts(sounds, ModalBank(FREQUENCY, DAMPING), RATE))
+    assert found[0] is not None
+    assert found[1] is None

@@ -9,10 +9,11 @@ In the band around poles that lie close together, the discrete Fourier transform
 
 D is analytic in s, so the poles that one recording has of its own follow from complex least squares by variable
 projection (Golub and Pereyra, Inverse Problems 19, 2003): one step moves frequency and damping. Their prior is normal,
-around the mean pole moved by what all modes of the recording shift alike, with one relative standard deviation for all
-modes. How many modes a band has, and whether they shift, is decided by the Bayesian information criterion (Schwarz,
-Annals of Statistics 6, 1978); a shift counts as the part of a parameter that the recording determines and the prior
-does not.
+around the mean pole moved by what all modes of the recording shift alike, with one relative variance for all modes, by
+Fisher's scoring. How many modes a band has, and whether they have poles of their own, is decided by the Bayesian
+information criterion (Schwarz, Annals of Statistics 6, 1978); a shift counts as the part of a parameter that the
+recording determines and the prior does not. A pole that stands for several unresolved modes moves in damping as much as
+in frequency: that is no shift.
 """
 
 import math
@@ -20,7 +21,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import torch
-from jaxtyping import Complex, Complex128, Float, Float64, Int64
+from jaxtyping import Bool, Complex, Complex128, Float, Float64, Int64
+from scipy.stats import f as f_distribution
 from torch import Tensor
 
 from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains
@@ -48,9 +50,12 @@ class Tolerances:
     """Most poles in a band: all of their subsets are tried."""
     pitched: float = 0.1
     """Largest half-power width of a pole that may shift, over its frequency."""
-    least: float = 0.1
+    level: float = 0.01
+    """Of the F test that a pole moves along frequency more than along damping. A pole that stands for several
+    unresolved modes moves along both."""
+    least: float = 0.05
     """Radians that a mode turns by its shift while it falls to 1/e, standard deviation: with fewer, gains at common
-    poles are as good. Most captures of a fixed sensor have .04 to .09, and fields there were worse with shifts."""
+    poles are as good."""
 
 
 _TOLERANCES = Tolerances()
@@ -60,7 +65,7 @@ _FREE_ITERATIONS = 2
 """Steps of them before the prior counts, whose center is not known yet."""
 _MIN_SHIFT = 1e-6
 """Least relative standard deviation of the prior."""
-_PASSES = 3
+_PASSES = 5
 """Rounds over all bands, each with the shifts of the round before as the prior."""
 
 
@@ -111,7 +116,7 @@ def find_shifts(
     """Return the poles of each recording's own, of modes that several poles of `bank` may be one of.
 
     Without those that explain less than `significance` times the energy that they would of noise, mean over the
-    sounds. None where most of the energy is in modes whose frequencies shift by little or nothing.
+    sounds. None where most of the energy is in modes whose frequencies do not shift.
     """
     if len(sounds) < 2:
         return None
@@ -127,7 +132,11 @@ def find_shifts(
         energy = torch.cat([each.energy.expand_as(each.mean.real) / len(each.mean) for each in bands])
         moves = poles.imag / mean.imag - 1.0
         drift = torch.stack([_median(each, energy) for each in moves])
-        shift = float(_median((moves - drift[:, None]).square().mean(0).sqrt(), energy).clamp_min(_MIN_SHIFT))
+        variance = _median(torch.cat([each.variance for each in bands]), energy)
+        shift = float(variance.sqrt().clamp_min(_MIN_SHIFT))
+        shifting = torch.cat([each.shifting for each in bands])
+    if energy[shifting].sum() < 0.5 * energy.sum():
+        return None
     order = torch.argsort(mean.imag)
     found = ModalBank(mean.imag / (2 * math.pi), -mean.real).take(order)
     noise = background_power(search.sounds, found, sample_rate)
@@ -143,14 +152,19 @@ class _Found:
     mean: Complex128[Tensor, " modes"]
     poles: Complex128[Tensor, "*contacts modes"]
     gains: Complex128[Tensor, "contacts modes"]
+    variance: Float64[Tensor, " modes"]
+    """Of the relative shifts beside the drift."""
     energy: Float64[Tensor, ""]
     """Of all of its modes in all recordings, up to a factor that is the same for all bands."""
 
     @property
-    def settled(self) -> Float64[Tensor, ""]:
-        """The energy of its modes that hardly turn by their shift while they fall to 1/e."""
-        turn = (self.poles.imag - self.mean.imag).expand_as(self.gains.real).square().mean(0).sqrt() / -self.mean.real
-        return self.energy * (turn < _TOLERANCES.least).double().mean()
+    def shifting(self) -> Bool[Tensor, " modes"]:
+        """Which of its modes vary in frequency, and more than in damping."""
+        moved = (self.poles - self.mean).expand_as(self.gains)
+        frequency, damping = moved.imag.square().mean(0), moved.real.square().mean(0)
+        freedom = len(moved) - 1
+        above = frequency > damping * float(f_distribution.isf(_TOLERANCES.level, freedom, freedom))
+        return above & (frequency > (_TOLERANCES.least * self.mean.real).square())
 
 
 class _Search:
@@ -164,13 +178,16 @@ class _Search:
         """What the bands' modes, as they are known so far, leave of the sounds."""
         energy = (gains.abs().square() / bank.damping).sum(0)
         groups = sorted(_groups(bank), key=lambda rows: -float(energy[rows].sum()))
-        self.known = [_Found(poles[rows], poles[rows], gains[:, rows], energy[rows].sum()) for rows in groups]
-        self.common = [each.mean for each in self.known]
+        self.common = [poles[rows] for rows in groups]
+        self.known = [
+            _Found(common, common, gains[:, rows], torch.zeros_like(common.real), energy[rows].sum())
+            for rows, common in zip(groups, self.common, strict=True)
+        ]
 
     def bands(self, shift: float, drift: Float64[Tensor, " contacts"]) -> list[_Found] | None:
         """Return what each band holds, with a prior of the shifts: standard deviation and center, relative.
 
-        None as soon as half of the energy is in modes that hardly shift.
+        None as soon as half of the energy is in modes of common poles.
         """
         half, settled = 0.5 * sum(float(each.energy) for each in self.known), 0.0
         for row, common in enumerate(self.common):
@@ -180,10 +197,10 @@ class _Search:
                 continue
             sounds = self.left + _rung(before.poles, before.gains, self.samples, self.rate)
             band = _Band.of(sounds, common, self.rate).without_mirrored(before.poles, before.gains)
-            mean, poles = band.own_poles(common, shift, drift)
-            self.known[row] = found = _Found(mean, poles, band.gains(poles), before.energy)
+            mean, poles, variance = band.own_poles(common, shift, drift)
+            self.known[row] = found = _Found(mean, poles, band.gains(poles), variance, before.energy)
             self.left = sounds - _rung(poles, found.gains, self.samples, self.rate)
-            settled += float(found.settled)
+            settled += float(found.energy) * (found.poles.ndim == 1)
             if settled >= half:
                 return None
         return self.known
@@ -231,16 +248,18 @@ class _Band:
 
     def own_poles(
         self, common: Complex128[Tensor, " poles"], shift: float, drift: Float64[Tensor, " contacts"]
-    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "*contacts modes"]]:
-        """Return the mean poles of the modes in the band and each recording's own, or the common ones for both."""
+    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "*contacts modes"], Float64[Tensor, " modes"]]:
+        """Return the mean poles of the modes in the band, each recording's own, or the common ones for both, and the
+        variance of the relative shifts.
+        """
         count, contacts = len(common), len(self.spectra)
-        found = common, common
+        found = common, common, torch.zeros_like(common.real)
         best = self._criterion(self._left(common.expand(contacts, -1)), 2 * count * (contacts + 1))
         for modes in range(1, count + 1):
-            mean, poles, free = self._fit(self._start(common, modes), shift, drift)
+            mean, poles, variance, free = self._fit(self._start(common, modes), shift, drift)
             criterion = self._criterion(self._left(poles), 2 * modes * (contacts + 1) + free)
             if criterion < best:
-                best, found = criterion, (mean, poles)
+                best, found = criterion, (mean, poles, variance)
         return found
 
     def _criterion(self, left: Float64[Tensor, " contacts"], parameters: float | int) -> float:
@@ -257,8 +276,9 @@ class _Band:
 
     def _fit(
         self, poles: Complex128[Tensor, "contacts modes"], shift: float, drift: Float64[Tensor, " contacts"]
-    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "contacts modes"], float]:
-        """Return the mean poles, those of most posterior probability, and their number of free parameters.
+    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "contacts modes"], Float64[Tensor, " modes"], float]:
+        """Return the mean poles, those of most posterior probability, the variance of their relative shifts, and their
+        number of free parameters.
 
         Gauss-Newton steps for all recordings at once, each damped after Levenberg and Marquardt by itself.
         """
@@ -294,7 +314,11 @@ class _Band:
             better = after < before
             poles = torch.where(better[:, None], moved, poles)
             trust = torch.where(better, trust / 5, trust * 10).clamp(1e-6, 1e3)
-        return mean, poles, 2 * float((information / (information + 1.0 / variance)).sum())
+        determined = information / (information + 1.0 / variance)
+        # One step of Fisher's scoring for the variance of what is known with the variance 1 / information.
+        moved = ((poles - center).abs() / variance).square() - information * (1.0 - determined).square()
+        found = moved.sum(0) / (determined / variance).square().sum(0) / mean.imag.square()
+        return mean, poles, found.clamp_min(0.0), 2 * float(determined.sum())
 
     def _atoms(
         self, poles: Complex128[Tensor, "contacts modes"]
