@@ -54,7 +54,7 @@ def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams)
 def test_the_thickness_of_a_wall_reaches_the_report(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "mug"
     shutil.copytree(EXAMPLE_FOLDER, folder)
-    words = [*sets("splat.steps=100 splat.start_points=3000 lift.encoder=descriptors")]
+    words = [*sets("splat.steps=400 splat.start_points=3000 lift.encoder=descriptors")]
     words += [*sets("lift.symmetry=false fit.steps=2 modes=32"), "--train-count", "12"]
     bodies = [*sets("body.shapes=16 body.dofs=8000 body.supports=free")]
     assert main(["fit", str(folder), *words, *bodies, "--json"]) == 0

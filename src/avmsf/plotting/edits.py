@@ -107,7 +107,7 @@ def _count(axes: Axes, drawn: list[tuple[str, ModeLevels, str]]) -> None:
         axes.stairs(np.histogram(places, edges)[0], 2.0 ** (edges / _BANDS), color=color, fill=True, alpha=0.35)
 
 
-Move: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
+Move: TypeAlias = tuple[Sequence[float], Sequence[float]]
 """Where an edited object's modes lie in an embedding before and after the edit."""
 Curve: TypeAlias = Sequence[tuple[int, float]]
 """Steps of an edit and its CLAP score after each; step 0 is the object as it was."""
