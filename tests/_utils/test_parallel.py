@@ -70,6 +70,22 @@ def test_tasks_return_and_raise_in_processes_of_one_thread() -> None:
     assert len({os.getpid(), found["a"][1], found["c"][1]}) == 3
 
 
+class UnreadableError(Exception):
+    def __init__(self, one: str, other: str) -> None:
+        super().__init__(one)
+
+
+def unreadable(_: int) -> None:
+    raise UnreadableError("one", "other")
+
+
+def test_an_error_that_cannot_be_pickled_costs_its_task_alone() -> None:
+    found = run(unreadable, {"a": 1}) | run(told, {"b": 1})
+    assert isinstance(found["a"], WorkerError)
+    assert "UnreadableError" in str(found["a"])
+    assert found["b"][0] == 1
+
+
 @pytest.mark.slow
 def test_a_cluster_of_ray_runs_tasks_alike() -> None:
     pytest.importorskip("ray")

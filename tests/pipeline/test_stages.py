@@ -32,7 +32,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import CACHE, BodyConfig, PipelineConfig
 from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.stages import Pipeline, Stage, StageFolder, digest_files
+from avmsf.pipeline.stages import Pipeline, Stage, StageFolder, digest_files, digest_of
 from avmsf.simulate import recipe
 from factories.plate_capture import fill_plate
 from factories.plate_field import plate_extraction, plate_features, plate_impacts
@@ -323,3 +323,16 @@ def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path
         fit_in_stages(capture, PipelineConfig("smooth", modes=4), StageFolder(tmp_path / "cache"))
     assert refused.value.value["command"] == "avmsf fit mug"
     assert sorted(each.name for each in (tmp_path / "cache").iterdir()) == ["stages.lock"]
+
+
+def test_a_folder_behind_a_link_counts_for_the_digest_once(tmp_path: Path) -> None:
+    folder, elsewhere = tmp_path / "capture", tmp_path / "views"
+    folder.mkdir()
+    elsewhere.mkdir()
+    (elsewhere / "1.png").write_bytes(b"1")
+    (folder / "views").symlink_to(elsewhere)
+    (elsewhere / "back").symlink_to(folder)
+    before = digest_of(folder)
+    assert digest_of(folder) == before
+    (elsewhere / "1.png").write_bytes(b"2")
+    assert digest_of(folder) != before

@@ -198,7 +198,13 @@ def _work(answer: connection.Connection, content: bytes) -> None:
     # Ctrl-C is the parent's, which ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end_with_parent, args=(nobody_waits,), daemon=True).start()
-    answer.send(_outcome(*pickle.loads(content)))
+    outcome = _outcome(*pickle.loads(content))
+    try:
+        pickle.loads(pickle.dumps(outcome))
+    except Exception as error:
+        found = f"{type(outcome).__name__}, which cannot be sent from the process that made it ({error})"
+        outcome = WorkerError.expected("a result or an error that can be pickled", got=found, name="worker")
+    answer.send(outcome)
 
 
 def _outcome(act: Callable[[Argument], Result], argument: Argument) -> Result | Exception:

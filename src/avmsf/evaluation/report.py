@@ -226,7 +226,7 @@ def _write_edits(records: Sequence[ObjectRecord], folder: Path) -> Iterator[Path
     curves: dict[str, list[Curve]] = {}
     for each in outcomes:
         if each.report.get("clap"):
-            curves.setdefault(each.method, []).append(each.report["clap"])
+            curves.setdefault(each.method, []).append([(step, score) for step, score in each.report["clap"]])
     if curves:
         figure = draw_clap_curves(curves, title="CLAP score of the previews and the prompt")
         yield _write_figure(figure, folder, "clap")

@@ -6,6 +6,7 @@ made, after those that it depends on, when it is first asked for, unless a `Stag
 
 import hashlib
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -159,10 +160,20 @@ def digest_of(path: Path, *, hidden: bool = True) -> str:
     Hidden is what has a name that begins with a dot, or lies in such a folder, as in that of a cache.
     """
     if path.is_dir():
-        inside = ((each, each.relative_to(path).parts) for each in path.rglob("*") if each.is_file())
+        inside = ((each, each.relative_to(path).parts) for each in _files_in(path))
         shown = (each for each, parts in inside if hidden or not any(part.startswith(".") for part in parts))
         return digest_files(shown, root=path)
     return digest_files([path], root=path.parent)
+
+
+def _files_in(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and in those inside it, also behind symbolic links, each folder once."""
+    seen = {folder.resolve()}
+    for inside, folders, names in os.walk(folder, followlinks=True):
+        new = {name: Path(inside, name).resolve() for name in sorted(folders)}
+        folders[:] = [name for name, place in new.items() if place not in seen]
+        seen.update(new.values())
+        yield from (each for name in names if (each := Path(inside, name)).is_file())
 
 
 def digest_files(paths: Iterable[Path], *, root: Path) -> str:
