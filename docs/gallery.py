@@ -13,9 +13,9 @@ import avmsf
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.simulation import simulate_object
 
-OBJECTS = (("mug", "ceramic"), ("plate", "steel"), ("bowl", "wood"))
+OBJECTS = (("mug", "ceramic"),)
 """Kinds and materials."""
-SECONDS, PEAK = 1.5, 0.5
+SECONDS, PEAK = 0.5, 0.5
 
 
 def main(folder: Path) -> None:
