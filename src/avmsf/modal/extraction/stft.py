@@ -157,8 +157,12 @@ def _nearest(
     distance = torch.full((len(pitch), count), math.inf, dtype=torch.float64)
     for contact in torch.unique(contacts).tolist():
         own = torch.nonzero(contacts == contact).flatten()
-        distance[:, contact], best = (pitch[:, None] - pitch[own]).abs().min(1)
-        rows[:, contact] = own[best]
+        own = own[torch.argsort(pitch[own])]
+        above = torch.searchsorted(pitch[own], pitch).clamp_max(len(own) - 1)
+        below = (above - 1).clamp_min(0)
+        sides = torch.stack([own[below], own[above]])
+        distance[:, contact], best = (pitch[sides] - pitch).abs().min(0)
+        rows[:, contact] = sides.gather(0, best[None])[0]
     return rows, distance
 
 
