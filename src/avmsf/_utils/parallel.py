@@ -143,7 +143,7 @@ class _Processes(Workers):
 
     def outcome(self, task: _Task) -> Any:
         try:
-            return task.answer.recv()
+            return pickle.loads(task.answer.recv_bytes())
         except (EOFError, OSError):  # OSError: it ended while it answered.
             task.process.join()
             raise _ended_early(ending_of(task.process.exitcode or 0)) from None
@@ -200,11 +200,12 @@ def _work(answer: connection.Connection, content: bytes) -> None:
     threading.Thread(target=end_with_parent, args=(nobody_waits,), daemon=True).start()
     outcome = _outcome(*pickle.loads(content))
     try:
-        pickle.loads(pickle.dumps(outcome))
+        sent = pickle.dumps(outcome)
+        pickle.loads(sent)
     except Exception as error:
         found = f"{type(outcome).__name__}, which cannot be sent from the process that made it ({error})"
-        outcome = WorkerError.expected("a result or an error that can be pickled", got=found, name="worker")
-    answer.send(outcome)
+        sent = pickle.dumps(WorkerError.expected("a result or an error that can be pickled", got=found, name="worker"))
+    answer.send_bytes(sent)
 
 
 def _outcome(act: Callable[[Argument], Result], argument: Argument) -> Result | Exception:
