@@ -16,7 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
-from typing import Literal, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
@@ -153,6 +153,9 @@ class SurfaceBodies(CandidateBodies):
     reason where only memory, time or the mesher stood against it.
     """
 
+    walls_are_closed: ClassVar[bool] = False
+    """Whether walls go all round their cavities."""
+
     def __init__(
         self,
         surface: Surface | HollowShape,
@@ -183,7 +186,7 @@ class SurfaceBodies(CandidateBodies):
         self._surface, self._digest, self._log = surface, surface.digest(), log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)
-        self._coarse_only, self._is_closed = set[tuple[float | None, Support | None]](), False
+        self._coarse_only = set[tuple[float | None, Support | None]]()
         self._solved, self.solid = once(self._solve), once(self._make_solid)
         self._walls, self._remeshing = once(lambda dofs: wall_solids(self.checked, dofs)), Lock()
 
@@ -315,17 +318,15 @@ class SurfaceBodies(CandidateBodies):
     @cached_property
     def _closed(self) -> "SurfaceBodies | None":
         """The same walls without an opening, where no view sees into one."""
-        shape = None if self.shape is None or self._is_closed else self.shape.closed()
+        shape = None if self.shape is None or self.walls_are_closed else self.shape.closed()
         walls = self._guesses() if self._thicknesses is None else self._thicknesses
         walls = [wall for wall in walls if wall is not None]
         if shape is None or not walls:
             return None
-        made = SurfaceBodies(
+        return _ClosedBodies(
             shape, thicknesses=walls, supports=self.supports, held_at=self.held_at, count=self._count, dofs=self.dofs,
             material=self._material, cache=self._cache, log=self._log,
         )  # fmt: skip
-        made._is_closed = True
-        return made
 
     def _guesses(self) -> list[float | None]:
         """Return the thicknesses to try; None for what the surface encloses."""
@@ -346,13 +347,13 @@ class SurfaceBodies(CandidateBodies):
         if not fine and self.dofs > self._coarse_dofs:
             try:
                 modes = self.modes(thickness, dofs=self._coarse_dofs, perturbed=False)
-                return CandidateBody(thickness, modes, fine=False, closed=self._is_closed)
+                return CandidateBody(thickness, modes, fine=False, closed=self.walls_are_closed)
             except SimulationError as error:
                 # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
                 if self.shape is not None:
                     raise
                 self._log(f"retrying with more tetrahedra ({error})")
-        return CandidateBody(thickness, self._converged(thickness), closed=self._is_closed)
+        return CandidateBody(thickness, self._converged(thickness), closed=self.walls_are_closed)
 
     def _converged(self, thickness: float | None) -> ElasticModes:
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
@@ -418,6 +419,12 @@ class SurfaceBodies(CandidateBodies):
     def _log_refused(self, reason: str) -> None:
         """Log why a body cannot be had, where there are others; without an error's advice."""
         self._log(f"not a candidate body: {reason.partition('; ')[0].replace(': wall: expected', ': expected')}")
+
+
+class _ClosedBodies(SurfaceBodies):
+    """Bodies around a cavity without an opening."""
+
+    walls_are_closed = True
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
