@@ -244,7 +244,8 @@ class _Band:
     def gains(self, poles: Complex128[Tensor, "*contacts modes"]) -> Complex128[Tensor, "contacts modes"]:
         """Return gains c of Im(c exp(s t)), which has the spectrum c D(s) / 2i beside the mirrored one."""
         atoms = self._atoms(poles.expand(len(self.spectra), -1))[0]
-        return 2j * torch.linalg.lstsq(atoms, self.spectra[..., None]).solution[..., 0]
+        # By singular values: the default driver starts its pivots from what memory holds, which changes its rounding.
+        return 2j * torch.linalg.lstsq(atoms, self.spectra[..., None], driver="gelsd").solution[..., 0]
 
     def own_poles(
         self, common: Complex128[Tensor, " poles"], shift: float, drift: Float64[Tensor, " contacts"]
