@@ -1,14 +1,23 @@
 """Records of measurements: printed as Markdown tables, stored as JSON lines, one file a part."""
 
+import inspect
 import json
 import math
+import os
+import platform
 import re
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, TypeAlias, TypeVar
 
+NAMES = (
+    *("align", "baselines", "evaluation", "extract", "gains", "physics", "proof", "residual", "robustness", "scene"),
+    *("speed", "step", "studio", "suggest", "surface", "tasks"),
+)
 REPOSITORY = Path(__file__).resolve().parents[1]
 MEASURED = ("src", "benchmarks", "tests/oracles", "tests/factories")
 """Folders whose commits count: what is measured, and what measures."""
@@ -34,6 +43,8 @@ KINDS: dict[str, tuple[str, Better]] = {
     **dict.fromkeys(("coverage90", "planes", "triangles", "true", "known", "uncertainty", "named"), ("", "")),
 }
 """Unit, and which way is better, by a word of a value's name; of a name without any: no unit, the lower the better."""
+DASH = "–"
+"""What tables show in place of a value that is not known."""
 _Item = TypeVar("_Item")
 
 
@@ -55,6 +66,8 @@ class Settings:
     """Folder that keeps the Gaussians fitted to these objects."""
     weights: Path | None = None
     """File of the weights of sonicgauss-small."""
+    results: Path | None = None
+    """Folder that keeps the objects and unfinished results of `evaluation`."""
     device: str = "cpu"
     """What the steps of `step` are taken on."""
 
@@ -78,9 +91,21 @@ class Record:
     seed: int = 0
     commit: str = ""
     note: str = ""
+    machine: str = ""
+    """Processor and versions that it was measured with."""
 
 
 Measurement: TypeAlias = Callable[[Settings], Iterator[Record]]
+
+
+def parts_of(name: str) -> dict[str, Measurement]:
+    """Return the parts of a benchmark by name."""
+    return import_module(f"benchmarks.{name}").PARTS
+
+
+def described(measure: Measurement) -> str:
+    """Return what a part measures."""
+    return inspect.getdoc(getattr(measure, "func", measure)) or ""
 
 
 def records(
@@ -113,6 +138,15 @@ def code_commit() -> str:
     return last.stdout.strip() + "+" * bool(changed.stdout.strip())
 
 
+def machine() -> str:
+    """Return the processor, its cores, and the versions of Python and of what computes."""
+    cpu = Path("/proc/cpuinfo")
+    found = re.search(r"model name\s*: (.+)", cpu.read_text()) if cpu.exists() else None
+    versions = (f"{each} {version(each)}" for each in ("torch", "numpy"))
+    processor = found[1] if found else platform.processor()
+    return ", ".join([processor, f"{os.cpu_count()} cores", f"Python {platform.python_version()}", *versions])
+
+
 def stored(path: Path) -> list[Record]:
     """Return the records of a file; none where it does not exist."""
     if not path.exists():
@@ -130,33 +164,38 @@ def store(found: Sequence[Record], path: Path) -> None:
     part.replace(path)
 
 
-def markdown(found: Sequence[Record]) -> str:
-    """Return tables of records: one for all groups with the same columns, a row for each group and object."""
-    rows: dict[tuple[str, str], dict[str, Record]] = {}
+def markdown(found: Sequence[Record], columns: Sequence[str] = ()) -> str:
+    """Return a table of these columns, or one for all groups with the same; a row for each group and object of a part.
+
+    Names are those below the part's.
+    """
+    rows: dict[str, dict[str, Record]] = {}
     for each in found:
-        group, _, column = each.name.rpartition(".")
-        rows.setdefault((group, each.object), {})[column] = each
-    tables: dict[tuple[str, ...], list[tuple[tuple[str, str], dict[str, Record]]]] = {}
+        group, _, column = each.name.split(".", 2)[2].rpartition(".")
+        rows.setdefault(", ".join(filter(None, (group, each.object))), {})[column] = each
+    tables: dict[tuple[str, ...], dict[str, dict[str, Record]]] = {}
     for label, row in rows.items():
-        tables.setdefault(tuple(row), []).append((label, row))
-    return "\n\n".join("\n".join(_table(columns, lines)) for columns, lines in tables.items())
+        tables.setdefault(tuple(columns or row), {})[label] = row
+    return "\n\n".join("\n".join(_table(each, lines)) for each, lines in tables.items())
 
 
-def _table(columns: Sequence[str], rows: Sequence[tuple[tuple[str, str], dict[str, Record]]]) -> Iterator[str]:
-    noted = any(record.note for _, row in rows for record in row.values())
-    first = rows[0][1]
+def _table(columns: Sequence[str], rows: Mapping[str, Mapping[str, Record]]) -> Iterator[str]:
+    known = {each: row[each] for row in rows.values() for each in columns if each in row}
+    noted = any(record.note for row in rows.values() for record in row.values())
     arrows = {"lower": " ↓", "higher": " ↑", "": ""}
-    heads = [f"{each}{', ' * bool(first[each].unit)}{first[each].unit}{arrows[first[each].better]}" for each in columns]
+    firsts = [(each, known[each]) for each in columns]
+    heads = [f"{each}{', ' * bool(first.unit)}{first.unit}{arrows[first.better]}" for each, first in firsts]
     yield "| " + " | ".join(["", *heads, *["note"] * noted]) + " |"
     yield "|---" * (1 + len(heads) + noted) + "|"
-    for label, row in rows:
+    for label, row in rows.items():
         notes = ["; ".join(dict.fromkeys(each.note for each in row.values() if each.note))] * noted
-        yield (
-            "| "
-            + " | ".join([", ".join(filter(None, label)), *(_text(row[each].value) for each in columns), *notes])
-            + " |"
-        )
+        values = [in_digits(row[each].value) if each in row else DASH for each in columns]
+        yield "| " + " | ".join([label, *values, *notes]) + " |"
 
 
-def _text(value: float) -> str:
-    return "–" if not math.isfinite(value) else f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
+def in_digits(value: float) -> str:
+    """Return a value in three digits, whole numbers and large ones in theirs, without a 0 before the point."""
+    if not math.isfinite(value):
+        return DASH
+    text = f"{value:.0f}" if abs(value) >= 1e3 or value == round(value) else f"{value:#.3g}"
+    return re.sub(r"^(-?)0\.", r"\1.", text).removesuffix(".")
