@@ -59,13 +59,6 @@ def test_tensors_are_the_tables_to_the_last_bit(tmp_path: Path, shared: bool) ->
     assert written.size == sum(path.stat().st_size for path in (tmp_path / "page").rglob("*") if path.is_file())
 
 
-def test_fewer_contacts_are_kept_with_a_word(tmp_path: Path) -> None:
-    written = make_bundle(struck_table(shared=False, points=50), limit=10).write(tmp_path / "page")
-    assert tensors(tmp_path / "page")["damping"].shape == (10, 40)
-    (remark,) = written.remarks
-    assert "10 of the field's 50" in remark
-
-
 def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
     sounds = 3.0 * torch.randn(2, 500, generator=torch.Generator().manual_seed(0))
     contacts = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)

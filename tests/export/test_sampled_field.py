@@ -62,14 +62,6 @@ def test_the_formula_holds_in_plain_sums():
     torch.testing.assert_close(sound, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
-def test_modes_above_half_the_rate_are_left_out():
-    sound_field = replace(sounding("positional"), sample_rate=2700.0)
-    table = SampledField.of(sound_field)
-    assert table.frequency.tolist() == BANK.frequency[:3].tolist()
-    expected = sound_field.render(table.points[:3])
-    torch.testing.assert_close(table.render(torch.arange(3)), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
-
-
 @pytest.mark.parametrize("scaled", [False, True])
 def test_normals_of_an_elastic_model_are_its_bodys(scaled):
     table = SampledField.of(sounding("elastic", scaled=scaled))

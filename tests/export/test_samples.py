@@ -117,17 +117,6 @@ def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path, layers, orde
     assert len(written.remarks) == 1 + (order != [0, 1, 2])
 
 
-@pytest.mark.parametrize("count", [86, 127])
-def test_every_layer_has_a_velocity(tmp_path, count):
-    write_grid(
-        table(), tmp_path / "grid", contacts=1, layers=[Layer(0.1 + each) for each in range(count)], seconds=0.01
-    )
-    found = rows(tmp_path / "grid")
-    struck = [v for row in found for v in range(int(row["velocity_low"]), int(row["velocity_high"]) + 1)]
-    assert struck == list(range(1, 128))
-    assert all(int(row["velocity_low"]) <= int(row["velocity_high"]) for row in found)
-
-
 @pytest.mark.parametrize(
     ("settings", "name", "value"),
     [

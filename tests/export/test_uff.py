@@ -2,7 +2,6 @@
 
 import math
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -106,14 +105,6 @@ def test_one_damping_a_mode_is_said_to_be_a_mean(tmp_path):
     mode = sets(tmp_path / "thing.unv", 55)[1]
     expected = float((energy * field.damping).sum(0)[1] / energy.sum(0)[1])
     assert mode["modal_damp_vis"] * 2 * math.pi * mode["freq"] == pytest.approx(expected, rel=2e-5)
-
-
-def test_the_same_field_gives_the_same_file(tmp_path, monkeypatch):
-    plain = time.strftime
-    for name, when in (("a.uff", 0.0), ("b.uff", 1e9)):
-        monkeypatch.setattr("time.strftime", lambda form, *_, when=when: plain(form, time.gmtime(when)))
-        write_universal(table(), tmp_path / name)
-    assert (tmp_path / "a.uff").read_bytes() == (tmp_path / "b.uff").read_bytes()
 
 
 def test_what_cannot_be_written_is_refused(tmp_path, monkeypatch):
