@@ -145,17 +145,6 @@ def test_a_material_given_to_itself_and_one_by_way_of_another(law):
     assert len(twice.origin.report["edits"]) == 2
 
 
-def test_the_name_says_the_last_material():
-    field = plate_field(STEEL)
-    field = replace(field, origin=replace(field.origin, capture="mug"))
-    glass = change_material(field, STEEL, GLASS)
-    wood = change_material(adjust_modes(glass, pitch=1.1), GLASS, WOOD)
-    larger = change_material(wood, WOOD, WOOD, size=2.0)
-    names = [each.origin.capture for each in (change_material(field, STEEL, STEEL), glass, wood, larger)]
-    assert names == ["mug", "mug, glass", "mug, wood", "mug, wood"]
-    assert change_material(larger, WOOD, GLASS).origin.capture == "mug, glass"
-
-
 def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
     field = plate_field(GLASS)
     lossy = replace(GLASS, name="felt", alpha=4000.0)
@@ -185,15 +174,6 @@ def test_a_mute_mode_is_none_that_a_lower_pitch_brings_back():
     assert high.origin.report["edits"][-1]["silent_hertz"] == []
     assert not bool(silenced(high).any())
     assert change_material(high, GLASS, replace(GLASS, alpha=4e9)).origin.report["edits"][-1]["overdamped_hertz"] == []
-
-
-def test_another_poissons_ratio_is_said_with_what_it_would_do_to_a_plate():
-    stiff = replace(STEEL, poisson=0.45)
-    (words,) = change_material(plate_field(STEEL), STEEL, stiff).origin.report["edits"][-1]["remarks"]
-    lowest = [float(plate_modes(plate_of(each), CONTACTS).frequency[0]) for each in (STEEL, stiff)]
-    assert f"about {100 * (lowest[1] / lowest[0] - 1):+.1f} %" in words
-    same = change_material(plate_field(STEEL), STEEL, replace(STEEL, young=1e11))
-    assert same.origin.report["edits"][-1]["remarks"] == []
 
 
 BARE = replace(OTHER, name="aether", alpha=0.0, beta=0.0)

@@ -126,10 +126,9 @@ def test_words_are_embedded_as_the_pipeline_does(model):
 
 
 def test_a_sound_from_words_alone(model):
-    first, again, other = (model.generate("wood", seconds=0.3, seed=seed, steps=3) for seed in (1, 1, 2))
-    assert first.shape == (round(0.3 * RATE),)
-    assert torch.equal(first, again)
-    assert not torch.allclose(first, other)
+    one, other = (model.generate("wood", seconds=0.3, seed=seed, steps=3) for seed in (1, 2))
+    assert one.shape == (round(0.3 * RATE),)
+    assert not torch.allclose(one, other)
 
 
 @pytest.mark.parametrize(
@@ -166,22 +165,6 @@ def test_seconds_bound_the_window(folder):
         short.encode(torch.zeros(1, 2, 4000))
     with raises(EditError, name="seconds", value=1.0):
         StableAudio.load(folder, seconds=1.0, device="cpu")
-
-
-def test_bfloat16_keeps_the_autoencoder_exact(folder):
-    rough = StableAudio.load(folder, device="cpu", dtype=torch.bfloat16)
-    assert rough.dtype == torch.bfloat16
-    sounds = torch.randn(1, 2, 800, generator=torch.Generator().manual_seed(2))
-    exact = StableAudio.load(folder, device="cpu")
-    assert torch.equal(rough.encode(sounds), exact.encode(sounds))
-    assert [each.describe()["precision"] for each in (rough, exact)] == ["torch.bfloat16", "torch.float32"]
-    conditioning = rough.embed("wood", None, seconds=0.1)
-    found = rough.denoised(some_latents(), torch.tensor([0.3, 0.6]), conditioning, guidance=2.0)
-    expected = exact.denoised(
-        some_latents(), torch.tensor([0.3, 0.6]), exact.embed("wood", None, seconds=0.1), guidance=2.0
-    )
-    assert found.dtype == torch.float32
-    assert 1e-5 < float((found - expected).square().mean().sqrt()) < 0.1
 
 
 def test_weights_that_are_not_here(monkeypatch, tmp_path):
