@@ -1,7 +1,7 @@
 """Every method by its name: what all renderers have in common, and what each is known to give."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ from avmsf.evaluation.methods import (
     NETWORK,
     PAPER_GRID,
     FieldMethod,
-    Grid,
     RecordedMethod,
+    candidates,
     method_named,
     random_modes,
 )
@@ -64,7 +64,7 @@ def tiny(method: Any) -> Any:
         return replace(method, fit=partial(method.fit, config=config))
     if isinstance(method, FieldMethod):
         if method.grid is not None:
-            method = replace(method, grid=Grid((4, 8), (1e-2,), (2,), (1.0,), ("shared",)))
+            method = replace(method, grid={"clusters": (4, 8), "learning_rate": (1e-2,), "steps": (2,)})
         config = method.pipeline.fit
         kept = {
             name: getattr(config, name)
@@ -273,12 +273,11 @@ def test_without_initialization_no_mode_of_the_recordings_leaks_in():
 
 
 def test_the_papers_grid_has_all_its_combinations():
-    candidates = list(PAPER_GRID.candidates(TINY))
-    names = ("clusters", "learning_rate", "steps", "early_weight", "damping")
-    assert len(candidates) == len({tuple(getattr(each, name) for name in names) for each in candidates}) == 162
-    assert {each.warmup_steps for each in candidates} == {TINY.warmup_steps}
+    configs = candidates(PAPER_GRID, TINY)
+    assert len(configs) == len({repr(asdict(each)) for each in configs}) == 162
+    assert {each.warmup_steps for each in configs} == {TINY.warmup_steps}
     # Adam has one rate in the paper.
-    for each in candidates:
+    for each in configs:
         assert each.warmup_rate == each.correction_rate == each.noise_rate == each.learning_rate
 
 
@@ -293,12 +292,11 @@ def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training(monkeypatch):
 
     monkeypatch.setattr("avmsf.evaluation.methods.fit", watched)
     # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
-    grid = Grid((8,), (1e-7, 2e-2), (30,), (1.0,), ("shared",))
+    grid = {"clusters": (8,), "learning_rate": (1e-7, 2e-2), "steps": (30,), "damping": ("shared",)}
     method = with_fit(FieldMethod("grid", grid=grid), replace(TINY, warmup_steps=1, warmup_rate=1e-7))
     field = method.fit(plate_task(train))
     report = report_of(field)["grid"]
-    chosen = {"clusters": 8, "learning_rate": 2e-2, "steps": 30, "early_weight": 1.0, "damping": "shared"}
-    assert report["chosen"] == chosen
+    assert report["chosen"] == {"clusters": 8, "learning_rate": 2e-2, "steps": 30, "damping": "shared"}
     assert report["validation_envelope"][1] < report["validation_envelope"][0]
     assert field.origin.config.learning_rate == 2e-2
     # A quarter of nine is held out of the trials, and all nine learn in the end.

@@ -8,11 +8,11 @@ L1-log is lost.
 import hashlib
 import itertools
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -87,7 +87,7 @@ class FunctionMethod:
 
 def method_named(name: str) -> Method:
     """Return the method of this name. Raises EvaluationError that lists the known ones, and for a missing path."""
-    entry, settings = method_entry(name), {}
+    entry, settings, weights = method_entry(name), {}, ""
     if entry.path:
         given = name.partition(":")[2]
         path = Path(given).expanduser()
@@ -96,11 +96,12 @@ def method_named(name: str) -> Method:
             raise EvaluationError.expected(wanted, name, file=path if given else None, name="method")
         # However it is written: results of one path are those of one method.
         name, settings = f"{kind_of(name)}:{path}", {"path": path}
-    if not entry.make:
-        function = partial(resolve(entry.fit), **entry.settings)
-        return FunctionMethod(name, function, visual_input=entry.visual_input)
-    made: Method = resolve(entry.make)(name, **entry.settings, **settings)
-    return made
+    if entry.make:
+        made: Method = resolve(entry.make)(name, **entry.settings, **settings)
+        return made
+    if entry.path:
+        weights = folder_digest(path) if entry.is_folder else hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings, **settings), weights, entry.visual_input)
 
 
 def white_noise(task: Task) -> WhiteNoise:
@@ -159,23 +160,15 @@ def diffsound(
     return replace(found, noise=task.field("paper").noise()) if learned_residual else found
 
 
-def sonicgauss(name: str, path: Path) -> FunctionMethod:
-    """Return the published architecture and weights in a folder, fine-tuned, on CUDA where there is a GPU."""
-
-    def tuned(task: Task) -> TunedRenderer:
-        model = PublishedSonicGauss.load(path).to(usable_device(task.device, raising=EvaluationError))
-        return fit_published(model, task.gaussians(), task.train, seed=task.seed)
-
-    return FunctionMethod(name, tuned, folder_digest(path))
+def sonicgauss(task: Task, *, path: Path) -> TunedRenderer:
+    """Fine-tune the published architecture and weights in a folder, on CUDA where there is a GPU."""
+    model = PublishedSonicGauss.load(path).to(usable_device(task.device, raising=EvaluationError))
+    return fit_published(model, task.gaussians(), task.train, seed=task.seed)
 
 
-def sonicgauss_small(name: str, path: Path) -> FunctionMethod:
-    """Return the small generator of a file, trained from scratch on simulated objects, fine-tuned."""
-
-    def tuned(task: Task) -> TunedRenderer:
-        return fit_small(SmallWeights.read(path), task.gaussians(), task.train, seed=task.seed)
-
-    return FunctionMethod(name, tuned, hashlib.sha256(path.read_bytes()).hexdigest()[:16])
+def sonicgauss_small(task: Task, *, path: Path) -> TunedRenderer:
+    """Fine-tune the small generator of a file, trained from scratch on simulated objects."""
+    return fit_small(SmallWeights.read(path), task.gaussians(), task.train, seed=task.seed)
 
 
 @dataclass(frozen=True)
@@ -272,39 +265,26 @@ class Recorded:
         return f"a mono wav of {samples} samples at {self.sample_rate:g} Hz, as the recordings have"
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Values of the settings that a choice is made of; every combination is a candidate."""
-
-    clusters: tuple[int, ...]
-    learning_rate: tuple[float, ...]
-    steps: tuple[int, ...]
-    """Steps end to end; on a whole object's recordings a step is an epoch."""
-    early_weight: tuple[float, ...]
-    damping: tuple[Literal["shared", "per-contact"], ...] = ("shared", "per-contact")
-    other_rates: tuple[str, ...] = ()
-    """Settings that have the learning rate's value, too."""
-
-    def candidates(self, base: FitConfig) -> Iterator[FitConfig]:
-        """Yield `base` with every combination of the values, the last setting changing fastest."""
-        values = asdict(self)
-        others = values.pop("other_rates")
-        for chosen in itertools.product(*values.values()):
-            settings = dict(zip(values, chosen, strict=True))
-            yield replace(base, **settings, **dict.fromkeys(others, settings["learning_rate"]))
-
-
-PAPER_GRID = Grid(
-    (128, 256, 512),
-    (1e-2, 5e-3, 1e-3),
-    (5000, 10000, 20000),
-    (0.5, 1.0, 2.0),
-    other_rates=("warmup_rate", "correction_rate", "noise_rate"),
-)
+Grid = Mapping[str, Sequence[Any]]
+"""Values of the settings that a choice is made of; names with blanks between them share one."""
+_DAMPINGS = ("shared", "per-contact")
+PAPER_GRID: Grid = {
+    "clusters": (128, 256, 512),
+    "learning_rate warmup_rate correction_rate noise_rate": (1e-2, 5e-3, 1e-3),
+    "steps": (5000, 10000, 20000),
+    "early_weight": (0.5, 1.0, 2.0),
+    "damping": _DAMPINGS,
+}
 """The paper's lists (supplement, training setup), with one rate of Adam for all parameters: 162 fits an object, to run
-where there is time for them."""
-QUICK_GRID = Grid((8, 16, 32), (3e-3, 1e-3), (150,), (1.0,))
+where there is time for them. On a whole object's recordings a step is an epoch."""
+QUICK_GRID: Grid = {"clusters": (8, 16, 32), "learning_rate": (3e-3, 1e-3), "damping": _DAMPINGS}
 """What of it matters at the quick recipe's sizes: 12 fits an object."""
+
+
+def candidates(grid: Grid, base: FitConfig) -> list[FitConfig]:
+    """Return `base` with every combination of a grid's values, the last setting changing fastest."""
+    chosen = (zip(grid, values, strict=True) for values in itertools.product(*grid.values()))
+    return [replace(base, **{name: value for names, value in each for name in names.split()}) for each in chosen]
 
 
 @dataclass(frozen=True)
@@ -374,42 +354,38 @@ class FieldMethod:
         if len(rows_by_place(train.contacts)) < _MIN_VALIDATED_POSITIONS or not rows:
             return base, {"validated": False}
         learnt, held = [row for row in range(len(train)) if row not in rows], train.take(rows)
-        candidates, errors = list(grid.candidates(base)), []
-        for config in candidates:
+        configs, errors = candidates(grid, base), []
+        for config in configs:
             trial = self._fitted(task, train.take(learnt), features, modes.take(learnt), config)
             sounds = trial.render(held.contacts, directions=held.directions)
             errors.append(float(envelope_distance(sounds, held.sounds, sample_rate=held.sample_rate).mean()))
-        chosen = candidates[min(range(len(candidates)), key=errors.__getitem__)]
+        chosen = configs[min(range(len(configs)), key=errors.__getitem__)]
         return chosen, {
             "validated": True,
             "validation_contacts": list(held.names),
             "validation_envelope": errors,
-            "chosen": {each.name: getattr(chosen, each.name) for each in fields(grid) if hasattr(chosen, each.name)},
+            "chosen": {name: getattr(chosen, name) for name in (names.split()[0] for names in grid)},
         }
 
 
-def gaussian_process(name: str, *, model: GainModelName) -> FieldMethod:
-    """Return a Gaussian process over all kernel families, or over one."""
-    return FieldMethod(name, PipelineConfig(gain_model=model), "surface")
-
-
-def network(
+def field_method(
     name: str,
     visual_input: VisualInput,
     *,
+    model: GainModelName = "network",
     published: bool = False,
     informed: bool = True,
     grid: bool = False,
     **fit: Any,
 ) -> FieldMethod:
-    """Return the attention network with the quick settings, or those of the preset `paper`, but for those of `fit`.
+    """Return a field with the quick settings, or those of the preset `paper`, but for those of `fit`.
 
     `published` has one of the preset's two dampings, shared unless `fit` names the other.
     """
-    base, candidates = (PRESETS["paper"], PAPER_GRID) if published else (NETWORK, QUICK_GRID)
+    base, choice = (PRESETS["paper"], PAPER_GRID) if published else (replace(NETWORK, gain_model=model), QUICK_GRID)
     settings = {"damping": "shared", **fit} if published else fit
     pipeline = replace(base, fit=replace(base.fit, **settings))
-    return FieldMethod(name, pipeline, visual_input, published, informed, candidates if grid else None)
+    return FieldMethod(name, pipeline, visual_input, published, informed, choice if grid else None)
 
 
 def random_modes(train: Impacts, *, modes: int, bins: int, generator: torch.Generator) -> Extraction:

@@ -77,7 +77,7 @@ class MethodEntry:
     visual_input: "VisualInput" = "surface"
     """The features that a function with `fit` reads (`task.VisualInput`), by the field that it asks for."""
     path: str = ""
-    """The folder or file that it reads, for a method whose name goes on with `:` and a path."""
+    """The folder or file that it reads, as the setting `path`, for a method whose name goes on with `:` and a path."""
     is_folder: bool = False
     """Whether that is a folder."""
 
@@ -86,8 +86,8 @@ def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
     return lambda title, **settings: MethodEntry(title, make=make, settings={**common, **settings})
 
 
-_process, _network = _made("methods:gaussian_process"), _made("methods:network", visual_input="visual")
-_paper = _made("methods:network", visual_input="paper", published=True)
+_process, _network = (_made("methods:field_method", visual_input=each) for each in ("surface", "visual"))
+_paper = _made("methods:field_method", visual_input="paper", published=True)
 _EDIT = "editing:edit_method"
 """Makes the methods of the protocol `edit`."""
 _edit, _guided = _made(_EDIT), _made(_EDIT, edit="guided")
@@ -156,13 +156,13 @@ METHODS: dict[str, MethodEntry] = {
     "paper-grid": _paper("the paper's method with settings chosen from its lists", grid=True),
     "sonicgauss": MethodEntry(
         "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
-        make="methods:sonicgauss",
+        "methods:sonicgauss",
         path="a folder with the published weights",
         is_folder=True,
     ),
     "sonicgauss-small": MethodEntry(
         "SonicGauss's objective at a small size, trained from scratch on simulated objects",
-        make="methods:sonicgauss_small",
+        "methods:sonicgauss_small",
         path="a file, which python -m benchmarks baselines --parts sonicgauss-training --weights FILE makes",
     ),
     "recorded": MethodEntry(
