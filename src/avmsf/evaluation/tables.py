@@ -16,7 +16,7 @@ from typing import Any
 from avmsf._utils.text import counted, format_number
 from avmsf.evaluation.published import COMPUTATION, PUBLISHED, published_ratios
 from avmsf.evaluation.registry import BASELINE, METHODS, METRICS, PROTOCOLS, kind_of
-from avmsf.evaluation.results import ObjectRecord, Outcome
+from avmsf.evaluation.results import ObjectRecord
 
 WARNING = (
     "The paper describes its metrics in words only. The convention used here is inferred from its rows for white "
@@ -93,36 +93,35 @@ def values_of(
     return {identifier: found for identifier, found in figures.items() if found}
 
 
-def means(table: Values) -> dict[str, dict[str, Mean]]:
-    """Return the means over objects by method and metric."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for figures in table.values():
+def _by_metric(table: Values) -> dict[str, dict[str, dict[str, float]]]:
+    """Return the values by method, metric and object."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for identifier, figures in table.items():
         for method, values in figures.items():
             for metric, value in values.items():
-                found.setdefault(method, {}).setdefault(metric, []).append(value)
-    return {method: {metric: Mean.of(each) for metric, each in values.items()} for method, values in found.items()}
+                found.setdefault(method, {}).setdefault(metric, {})[identifier] = value
+    return found
+
+
+def means(table: Values) -> dict[str, dict[str, Mean]]:
+    """Return the means over objects by method and metric."""
+    pooled = _by_metric(table).items()
+    return {method: {name: Mean.of([*each.values()]) for name, each in metrics.items()} for method, metrics in pooled}
 
 
 def ratios(table: Values, *, of_means: bool = False) -> dict[str, dict[str, float]]:
     """Return the geometric means of the ratios to the baseline, object by object, or the ratios `of_means`."""
-    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for figures in table.values():
-        known = {metric: value for metric, value in figures.get(BASELINE, {}).items() if value > 0}
-        for method, values in figures.items():
-            for metric in (each for each in values if each in known):
-                pairs = found.setdefault(method, {})
-                if not _is_rising(metric):
-                    pairs.setdefault(metric, []).append((values[metric], known[metric]))
-    return {
-        method: {metric: _ratio(*zip(*each, strict=True), of_means=of_means) for metric, each in values.items()}
-        for method, values in found.items()
-    }
-
-
-def _ratio(own: Sequence[float], other: Sequence[float], *, of_means: bool) -> float:
-    if of_means:
-        return math.fsum(own) / math.fsum(other)
-    return geometric_mean([one / base for one, base in zip(own, other, strict=True)]) if min(own) > 0 else 0.0
+    pooled, found = _by_metric(table), dict[str, dict[str, float]]()
+    for method, metrics in pooled.items():
+        for metric, values in metrics.items():
+            known = pooled.get(BASELINE, {}).get(metric, {})
+            pairs = [(value, known[name]) for name, value in values.items() if known.get(name, 0.0) > 0]
+            row = found.setdefault(method, {}) if pairs else {}
+            if pairs and of_means and not _is_rising(metric):
+                row[metric] = math.fsum(one for one, _ in pairs) / math.fsum(base for _, base in pairs)
+            elif pairs and not _is_rising(metric):
+                row[metric] = geometric_mean([one / base for one, base in pairs]) if min(pairs)[0] > 0 else 0.0
+    return found
 
 
 def summarize(
@@ -176,47 +175,40 @@ def missing_of(records: Iterable[ObjectRecord], wanted: Mapping[str, Sequence[st
     """
     known, missing = {record.identifier: record for record in records}, {}
     for name, methods in wanted.items():
-        record = known.get(name)
-        if record is None:
-            missing[name] = list(methods)
-        elif record.failure is None:
-            found = {(each.case, each.method) for each in record.outcomes}
-            missing[name] = [each for each in methods if any((case.key, each) not in found for case in record.cases)]
+        record = known.get(name, ObjectRecord(name))
+        found, cases = {(each.case, each.method) for each in record.outcomes}, record.cases
+        if record.failure is None:
+            missing[name] = [
+                each for each in methods if not cases or any((case.key, each) not in found for case in cases)
+            ]
     return {name: methods for name, methods in missing.items() if methods}
 
 
 def failures_of(records: Iterable[ObjectRecord]) -> list[dict[str, str | None]]:
     """Return the failures with their reasons, each in one line."""
-    found: list[tuple[str, str | None, str | None, str | None]] = []
+    found: list[dict[str, str | None]] = []
     for record in records:
-        found.append((record.identifier, None, None, record.failure))
         order = {case.key: number for number, case in enumerate(record.cases)}
-        for each in sorted(record.outcomes, key=lambda each: (order.get(each.case, len(order)), each.method)):
-            found.append((record.identifier, each.case, each.method, each.failure))
-    return [
-        {"object": name, "case": case, "method": method, "failure": failure.partition("\n")[0]}
-        for name, case, method, failure in found
-        if failure is not None
-    ]
+        outcomes = sorted(record.outcomes, key=lambda each: (order.get(each.case, len(order)), each.method))
+        rows = [(None, None, record.failure), *((each.case, each.method, each.failure) for each in outcomes)]
+        for case, method, failure in rows:
+            if failure is not None:
+                reason = failure.partition("\n")[0]
+                found.append({"object": record.identifier, "case": case, "method": method, "failure": reason})
+    return found
 
 
 def times_of(records: Iterable[ObjectRecord]) -> dict[str, dict[str, Any]]:
     """Return each object's seconds: what methods share, and each method's to fit and to render all test contacts."""
     times = {}
     for record in records:
-        methods: dict[str, list[Outcome]] = {}
+        methods: dict[str, dict[str, float]] = {}
         for each in record.outcomes:
-            methods.setdefault(each.method, []).append(each)
-        times[record.identifier] = {
-            "shared": math.fsum(case.shared_seconds for case in record.cases),
-            "methods": {
-                method: {
-                    "fit": math.fsum(each.fit_seconds for each in outcomes),
-                    "render": math.fsum(each.render_seconds for each in outcomes),
-                }
-                for method, outcomes in methods.items()
-            },
-        }
+            steps = methods.setdefault(each.method, {"fit": 0.0, "render": 0.0})
+            steps["fit"] += each.fit_seconds
+            steps["render"] += each.render_seconds
+        shared = math.fsum(case.shared_seconds for case in record.cases)
+        times[record.identifier] = {"shared": shared, "methods": methods}
     return times
 
 
@@ -290,12 +282,13 @@ class _Report:
         about = f"{PROTOCOLS[name].title} " if name in PROTOCOLS else ""
         cases = [case for record in self.records for case in record.cases if case.label == self.label]
         several, settings = f" ({self.label})" if len(self.tables) > 1 else "", ("metrics", "modes")
+        trained = sorted(len(case.train) for case in cases) or [0]
         return Section(
             f"{name} on {dataset}",
             (
                 *self._incomplete(),
                 f"{about}Objects: {len(self.records)}; training recordings of each: "
-                f"{_span([len(case.train) for case in cases])}; test recordings in total: "
+                f"{' to '.join(map(str, dict.fromkeys((trained[0], trained[-1]))))}; test recordings in total: "
                 f"{sum(len(case.test) for case in cases)}{several}; avmsf {self.identity['version']}, seed "
                 f"{self.identity['seed']}.",
                 "Values are means over an object's test recordings (CDPAM: over `cdpam_contacts` of them, 0 for all), "
@@ -319,29 +312,38 @@ class _Report:
         return [f"Incomplete: results of {objects} are missing: {', '.join(listed)}. {advice}"] if listed else []
 
     def main_table(self) -> Section:
-        found, (dataset, _) = means(self.main), self.experiment
+        found, (dataset, _), objects = means(self.main), self.experiment, self.main.values()
         rows = [
-            (
-                method,
-                *(_mean(values.get(metric)) for metric in self.shown),
-                str(max((each.objects for each in values.values()), default=0)),
-            )
+            (*_row(method, values, self.shown), str(max((each.objects for each in values.values()), default=0)))
             for method, values in found.items()
         ]
         paper = [row for row in PUBLISHED.get(self.experiment, ()) if row.label in (None, self.label)]
         rows += [(*_row(f"paper: {row.title}", row.values, self.shown), _DASH) for row in paper]
-        remark = f"The paper has no values of this experiment on {dataset}."
+        best = set()
+        for column, metric in enumerate(self.shown, 1):
+            # Among the methods that have the metric of all objects that have it.
+            total = sum(any(metric in values for values in methods.values()) for methods in objects)
+            complete = {
+                row: values[metric].mean
+                for row, (method, values) in enumerate(found.items())
+                if metric in values and values[metric].objects == total and method != CHOSEN_ON_TEST
+            }
+            if complete:
+                best.add(((max if _is_rising(metric) else min)(complete, key=complete.__getitem__), column))
+        remarks = [f"The paper has no values of this experiment on {dataset}."]
         if self.experiment in PUBLISHED:
-            remark = f"Rows that begin with “paper:” are the paper's values on {dataset}. {WARNING}"
-        titles = "; ".join(f"{each}: {METHODS[kind_of(each)].title}" for each in found if kind_of(each) in METHODS)
-        return Section(
-            "All methods" + (f": {self.label}" if len(self.tables) > 1 else ""),
-            (),
-            ("method", *(METRICS[metric].heading for metric in self.shown), "objects"),
-            tuple(rows),
-            self._best(found),
-            (*self._of_fewer(), remark, *([f"{titles}."] if titles else [])),
-        )
+            remarks = [f"Rows that begin with “paper:” are the paper's values on {dataset}."]
+        if fewer := [method for method in found if any(method not in methods for methods in objects)]:
+            remarks.insert(
+                0,
+                f"Not of all {len(objects)} objects: {', '.join(fewer)}. Their means are of other objects than those "
+                "of the other rows, and not marked as best; ratios are of the same objects.",
+            )
+        if titles := [f"{each}: {METHODS[kind_of(each)].title}" for each in found if kind_of(each) in METHODS]:
+            remarks.append(f"{'; '.join(titles)}.")
+        title = "All methods" + (f": {self.label}" if len(self.tables) > 1 else "")
+        columns = ("method", *(METRICS[metric].heading for metric in self.shown), "objects")
+        return Section(title, (), columns, tuple(rows), frozenset(best), tuple(remarks))
 
     def ratio_table(self) -> Section:
         found, (dataset, protocol) = ratios(self.main), self.experiment
@@ -361,14 +363,17 @@ class _Report:
 
     def median_table(self) -> Section:
         found = means(self._ordered(values_of(self.records, str(self.label), median)))
-        rows = [(method, *(_mean(values.get(metric)) for metric in self.shown)) for method, values in found.items()]
+        rows = [_row(method, values, self.shown) for method, values in found.items()]
         text = "Medians over an object's test recordings, which single contacts do not decide, then means over objects."
         return Section("Medians", (text,), ("method", *(METRICS[metric].heading for metric in self.shown)), tuple(rows))
 
     def case_table(self, metric: str) -> Section:
         found = {label: means(table) for label, table in self.tables.items()}
         methods = dict.fromkeys(method for each in found.values() for method in each)
-        rows = [(method, *(_mean(each.get(method, {}).get(metric)) for each in found.values())) for method in methods]
+        rows = [
+            _row(method, {label: each.get(method, {}).get(metric) for label, each in found.items()}, found)
+            for method in methods
+        ]
         paper = PUBLISHED.get(self.experiment, ())
         for title in dict.fromkeys(row.title for row in paper):
             own = {row.label: row.values[metric] for row in paper if row.title == title and metric in row.values}
@@ -395,34 +400,15 @@ class _Report:
         columns = ("object", "case", "method", "reason") if rows else ()
         return Section("Failures", () if rows else ("None.",), columns, rows)
 
-    def _best(self, found: Mapping[str, Mapping[str, Mean]]) -> frozenset[tuple[int, int]]:
-        """Return the best cells of each metric's column, among the methods that have it of all objects that have it."""
-        best = set()
-        for column, metric in enumerate(self.shown, 1):
-            total = sum(any(metric in values for values in methods.values()) for methods in self.main.values())
-            known = {
-                row: values[metric]
-                for row, (method, values) in enumerate(found.items())
-                if metric in values and method != CHOSEN_ON_TEST
-            }
-            complete = {row: mean.mean for row, mean in known.items() if mean.objects == total}
-            if complete:
-                best.add(((max if _is_rising(metric) else min)(complete, key=complete.__getitem__), column))
-        return frozenset(best)
 
-    def _of_fewer(self) -> list[str]:
-        """Return the sentence on methods without results of some objects."""
-        methods = dict.fromkeys(method for values in self.main.values() for method in values)
-        fewer = [method for method in methods if any(method not in values for values in self.main.values())]
-        text = (
-            f"Not of all {len(self.main)} objects: {', '.join(fewer)}. Their means are of other objects than those of "
-            "the other rows, and not marked as best; ratios are of the same objects."
-        )
-        return [text] if fewer else []
-
-
-def _row(name: str, values: Mapping[Any, float], columns: Iterable[str]) -> tuple[str, ...]:
-    return name, *(format_number(values.get(column)) for column in columns)
+def _row(name: str, values: Mapping[Any, Mean | float | None], columns: Iterable[str]) -> tuple[str, ...]:
+    """Return a row of a table: of means also their standard errors, and a dash where there is no value."""
+    cells = []
+    for value in (values.get(column) for column in columns):
+        error = value.standard_error if isinstance(value, Mean) else None
+        text = format_number(value.mean if isinstance(value, Mean) else value)
+        cells.append(text if error is None else f"{text} ± {format_number(error, 2)}")
+    return name, *cells
 
 
 def _listed(settings: Mapping[str, Any]) -> str:
@@ -431,16 +417,3 @@ def _listed(settings: Mapping[str, Any]) -> str:
         f"{name} ({_listed(value)})" if isinstance(value, Mapping) else f"{name} {value}"
         for name, value in settings.items()
     )
-
-
-def _span(counts: Sequence[int]) -> str:
-    """Return a number, or the least and the largest of several."""
-    least, most = min(counts, default=0), max(counts, default=0)
-    return f"{least}" if least == most else f"{least} to {most}"
-
-
-def _mean(mean: Mean | None) -> str:
-    if mean is None:
-        return _DASH
-    text = format_number(mean.mean)
-    return text if mean.standard_error is None else f"{text} ± {format_number(mean.standard_error, 2)}"
