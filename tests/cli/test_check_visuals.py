@@ -22,8 +22,7 @@ from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import read_camera_file, write_views
-from avmsf.pipeline.visuals import VisualInputs, inputs
-from factories.capture_folder import fill
+from avmsf.pipeline.visuals import VisualInputs, inputs, misplaced
 from factories.plate_capture import fill_plate
 from factories.raising import raises
 from factories.small_scene import slab, slab_views, write_surface_file
@@ -112,26 +111,6 @@ def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
     assert not found(tmp_path).reconstructs
 
 
-@pytest.mark.parametrize("pictured", [True, False])
-def test_the_report_has_them_and_leads_to_the_command_that_uses_them(
-    tmp_path: Path, capsys: Streams, pictured: bool
-) -> None:
-    folder = fill(tmp_path / "cup")
-    if pictured:
-        write_transforms(folder, frames(ring(4)))
-        write_image(folder / "masks" / "e.png")
-    assert main(["check", str(folder)]) == 0
-    out, err = capsys.readouterr()
-    (line,) = [line for line in out.splitlines() if line.startswith("the object is shown by: ")]
-    assert ("4 photographs" in line) == pictured
-    following = f"avmsf fit {folder} -o field.safetensors" if pictured else f"avmsf modes {folder}"
-    assert err.splitlines()[-1] == f"next: {following}"
-    # The mask without a photograph is one; nor has noise a plain background, from which masks are found.
-    assert out.splitlines()[-1] == ("readable, with 2 warnings" if pictured else "no problem found")
-    visual = results_of(capsys, "check", folder)[0]["visual_inputs"]
-    assert (visual["photographs"], len(visual["problems"])) == (4 * pictured, pictured)
-
-
 def pictured_slab(folder: Path) -> Path:
     """A struck plate that is the upper side of a slab in photographs with cameras and masks."""
     fill_plate(folder, surface=False)
@@ -158,24 +137,21 @@ CAMERAS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], dict[str, Any], str
 }
 
 
+def said_of(folder: Path) -> list[str]:
+    """Return what is wrong with all that shows the object, alone and next to the contacts."""
+    visual = found(folder)
+    return [*visual.problems, *map(str, misplaced(folder, None, visual))]
+
+
 @pytest.mark.parametrize("case", CAMERAS)
-def test_what_is_wrong_with_cameras_is_named_by_check_as_by_reconstruct(
-    tmp_path: Path, case: str, capsys: Streams
-) -> None:
+def test_what_is_wrong_with_cameras_is_named(tmp_path: Path, case: str) -> None:
     folder, (change, extra, words) = pictured_slab(tmp_path / "slab"), CAMERAS[case]
     record = json.loads((folder / "transforms.json").read_text()) | extra
     for frame in record["frames"]:
         frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
     (folder / "transforms.json").write_text(json.dumps(record))
-    assert main(["check", str(folder)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == ("readable, with 1 warning" if words else "no problem found")
-    if words:
-        (line,) = [line for line in lines if words in line]
-        assert main(["fit", str(folder), "--gain-model", "visual", "--set", "lift.encoder=descriptors"]) == 2
-        assert not (folder / ".avmsf" / "cloud.ply").exists()
-        # The views that are compared are others, and so is the number of the cameras.
-        assert line.partition(words)[2] in capsys.readouterr().err
+    said = said_of(folder)
+    assert [words in each for each in said] == [True] * bool(words)
 
 
 TURN = Rotation.from_euler("zyx", [28, 15, -40], degrees=True)
@@ -192,9 +168,7 @@ TURN = Rotation.from_euler("zyx", [28, 15, -40], degrees=True)
         ("moved as stated", "once moved as dataparser_transforms.json"),
     ],
 )
-def test_check_opens_gaussians_and_tells_another_frame_which_fit_refuses(
-    tmp_path: Path, case: str, words: str, capsys: Streams
-) -> None:
+def test_gaussians_are_opened_and_another_frame_is_told(tmp_path: Path, case: str, words: str) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     centers = surface_points(slab(), count=2000)
     if case.startswith("moved"):
@@ -211,15 +185,8 @@ def test_check_opens_gaussians_and_tells_another_frame_which_fit_refuses(
     if case == "colors":
         content = (folder / "splats.ply").read_bytes()
         (folder / "splats.ply").write_bytes(content.replace(b"property float f_dc_", b"property float color"))
-    assert main(["check", str(folder)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == ("readable, with 1 warning" if words else "no problem found")
-    if words:
-        (line,) = [line for line in lines if words in line]
-        assert "feet" not in line
-        assert main(["fit", str(folder), "--gain-model", "visual", "--set", "lift.encoder=descriptors"]) == 2
-        assert words in capsys.readouterr().err
-        assert not (folder / ".avmsf" / "features.safetensors").exists()
+    said = said_of(folder)
+    assert [words in each and "feet" not in each for each in said] == [True] * bool(words)
 
 
 @pytest.mark.parametrize("unit", ["m", "mm", "in"])

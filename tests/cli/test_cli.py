@@ -11,7 +11,7 @@ import soundfile
 import torch
 
 import avmsf
-from avmsf.capture import Capture, CaptureSettings, read_capture
+from avmsf.capture import read_capture
 from avmsf.cli import VERBS, main
 from avmsf.cli.report import mode_rows, mode_table
 from avmsf.errors import CaptureError, FitError
@@ -70,14 +70,6 @@ def test_a_mistyped_verb_gets_a_suggestion(word: str, meant: str, capsys: Stream
     assert re.search(rf"\b{meant}\b", error["message"].partition(repr(word))[2])
 
 
-def test_check_of_a_good_capture_finds_no_problem(capture: Path, capsys: Streams) -> None:
-    assert main(["check", str(capture)]) == 0
-    out, err = capsys.readouterr()
-    assert all(f"{number:03d}.wav" in out for number in range(1, 9))
-    assert "no problem found" in out
-    assert err == f"next: avmsf modes {capture}\n"
-
-
 def test_check_counts_its_warnings_which_other_verbs_note(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate")
     sound, rate = soundfile.read(folder / "004.wav")
@@ -92,17 +84,6 @@ def test_check_counts_its_warnings_which_other_verbs_note(tmp_path: Path, capsys
     assert "004.wav: " in note
     assert "clipped" in note
     assert "CaptureWarning" not in err
-
-
-def test_check_shows_every_problem_and_ends_with_2_where_it_cannot_be_read(tmp_path: Path, capsys: Streams) -> None:
-    folder = fill_plate(tmp_path / "plate")
-    (folder / "003.wav").unlink()
-    soundfile.write(folder / "004.wav", np.zeros(2400), 8000, subtype="FLOAT")
-    report, err = results_of(capsys, "check", folder, code=2)
-    assert not report["readable"]
-    assert [row["readable"] for row in report["recordings"]] == [number not in (2, 3) for number in range(8)]
-    assert "\n003.wav: " in err
-    assert "\n004.wav: " in err
 
 
 def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams) -> None:
@@ -142,20 +123,6 @@ def test_a_quiet_verb_prints_its_table_alone(capture: Path, capsys: Streams) -> 
     out, err = capsys.readouterr()
     assert "frequency Hz" in out
     assert err == ""
-
-
-def test_modes_of_the_paper_start_at_the_peak(capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams) -> None:
-    asked: list[str] = []
-
-    def read(folder: Path, settings: CaptureSettings) -> Capture:
-        asked.append(settings.time_zero)
-        return read_capture(folder, settings)
-
-    monkeypatch.setattr("avmsf.capture.read_capture", read)
-    for words in ([], ["--preset", "paper"], ["--preset", "paper", "--time-zero", "onset"]):
-        found, _ = results_of(capsys, "modes", capture, "--modes", 4, *words)
-        assert found["method"] == ("short-time" if words else "high-resolution")
-    assert asked == ["onset", "peak", "onset"]
 
 
 def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys: Streams) -> None:
@@ -207,35 +174,6 @@ def test_fit_takes_a_single_recording_unless_it_is_silent(tmp_path: Path, capsys
     with raises(CaptureError, file="001.wav", name=None, value=0.0):
         run_verb("fit", str(folder), "--output", str(tmp_path / "silent.safetensors"), *TINY)
     assert not (tmp_path / "silent.safetensors").exists()
-
-
-def test_fit_to_one_position_is_scored_at_the_others(capture: Path, tmp_path: Path, capsys: Streams) -> None:
-    words = ["--output", tmp_path / "field.safetensors", "--train-count", "1", "--start", "3", *SMOOTH]
-    told, _ = results_of(capsys, "fit", capture, *words)
-    assert (told["trained_on"], len(told["tested_on"])) == (["004.wav"], 7)
-    assert "mean waveform of 1 nearest" in told["scores"]
-    assert np.isfinite([error for each in told["scores"].values() for error in each.values()]).all()
-
-
-def test_fit_says_once_why_elastic_mode_shapes_took_no_part(tmp_path: Path, capsys: Streams) -> None:
-    folder = fill_plate(tmp_path / "plate", surface=False)
-    told, err = results_of(capsys, "fit", folder, "--output", tmp_path / "a.safetensors", "--train-count", "2", *TINY)
-    assert "got 2" in err
-    assert told["report"]["bodies"] == []
-    assert "surface.obj" in told["report"]["unavailable"]["elastic"]
-    (note,) = [line for line in err.splitlines() if "surface" in line]
-    assert "elastic" in note
-    # Told to do without them, it does not look for any.
-    assert "elastic mode" not in results_of(capsys, "fit", folder, "--output", tmp_path / "b.safetensors", *SMOOTH)[1]
-
-
-def test_a_stated_wall_that_the_object_cannot_have_ends_the_fit(tmp_path: Path, capsys: Streams) -> None:
-    folder, output = fill_plate(tmp_path / "plate"), tmp_path / "plate.safetensors"
-    for words in (["fit", str(folder)], ["fit", str(folder / "surface.ply"), "--material", "glass"]):
-        assert main([*words, "--output", str(output), "--set", "body.wall=3", *TINY]) == 2
-        assert "body.wall" in capsys.readouterr().err
-    assert not output.exists()
-    assert not list(folder.glob(".avmsf/modes.safetensors"))
 
 
 @pytest.mark.parametrize("early", [True, False])

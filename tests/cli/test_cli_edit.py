@@ -23,7 +23,6 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from factories.made_audio import save_audio
 from factories.made_fields import FIELDS, mixture, places
 from factories.raising import raises
 from factories.settings import sets
@@ -136,19 +135,6 @@ def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(fie
         assert "850 Hz" in str(caught.value)
 
 
-def test_silent_modes_are_said(field: Path, capsys: Streams) -> None:
-    edited(field, "--pitch", "3")
-    out, _ = capsys.readouterr()
-    assert "note: 2 of 5 modes, from 4080 Hz to 6900 Hz, are silent" in out
-    assert "only residual noise" not in out
-    words = ["edit", field, "--output", field.with_name("high.safetensors"), "--pitch", "30"]
-    told, err = results_of(capsys, *words)
-    assert "only residual noise" in err
-    assert told["silent_modes"] == 5
-    assert told["edits"][0]["silent_hertz"] == pytest.approx((30 * FREQUENCY).tolist())
-    assert {(row["silent"], row["level_change_db"]) for row in told["modes"]} == {(True, None)}
-
-
 def test_towards_a_recording_and_an_interrupted_edit_goes_on(
     field: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,7 +161,7 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(
     assert not list(field.parent.glob("*.preview.wav")) + list(field.parent.glob("*.checkpoint"))
 
 
-def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
+def test_towards_a_materials_sound(field: Path) -> None:
     quick = [*sets("guide.steps=2 guide.contacts_per_step=2 guide.preview_every=0")]
     wood = edited(field, "--like-material", "Wood", *quick, name="wood")
     (told,) = wood.origin.report[EDITS]
@@ -188,11 +174,6 @@ def test_towards_a_materials_sound(field: Path, capsys: Streams) -> None:
     both = edited(field, *words, *quick, name="both")
     assert [each["edit"] for each in both.origin.report[EDITS]] == ["change_material", "guided"]
     assert {name: both.origin.report[EDITS][1][name] for name in expected} == expected
-    capsys.readouterr()
-    assert main(["info", str(field.with_name("both.safetensors"))]) == 0
-    out = capsys.readouterr().out
-    assert "edited     change_material, from glass to wood, law displacement" in out
-    assert "edited     guided, towards 'steel', pitch " in out
 
 
 def test_the_loudest_place_is_that_of_both_parts_of_the_gains() -> None:
@@ -256,25 +237,6 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert model.asked[0] == ("a bell", "wood")
     # The answer is 2 % higher.
     assert 1.005 < float((new.bank.frequency / FREQUENCY).median()) < 1.035
-
-
-@pytest.mark.filterwarnings("ignore:`torch.nn.utils.weight_norm` is deprecated:FutureWarning")
-def test_towards_words_by_a_saved_model_and_an_interrupted_edit_goes_on(
-    field: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("diffusers", reason="needs pip install 'avmsf[text]'")
-    pytest.importorskip("transformers")
-    model = save_audio(field.with_name("tiny-audio"))
-    words = ["--prompt", "a wooden bowl is hit", "--model", str(model), *sets("prompt.device=cpu denoising=2")]
-    words += sets("guide.steps=2 guide.contacts_per_step=2 guide.preview_every=1")
-    whole = edited(field, *words, name="whole")
-    (told,) = whole.origin.report[EDITS]
-    assert (told["edit"], told["prompt"], told["model"]) == ("guided", "a wooden bowl is hit", "tiny-audio")
-    assert bool((whole.bank.frequency != FREQUENCY).all())
-    steps = interrupt_at(monkeypatch, 1)
-    assert main(["edit", str(field), "--output", str(field.with_name("part.safetensors")), *words]) == 130
-    expect_same(edited(field, *words, name="part"), whole)
-    assert steps == [1, 2]
 
 
 WRONG: dict[str, tuple[str | None, object]] = {

@@ -60,18 +60,6 @@ def test_one_capture_and_one_object_will_do(plates: Path, tmp_path: Path, monkey
     assert summary["objects"] == 1
 
 
-def test_a_changed_setting_is_named(plates: Path, tmp_path: Path) -> None:
-    words = ["farthest", str(plates), *CHEAP, "--objects", "a", "--output", str(tmp_path / "results")]
-    assert run_verb("evaluate", *words, "--cdpam-contacts", "3") == 0
-    with raises(EvaluationError, file=tmp_path / "results", name="metrics.cdpam_contacts", value=3) as caught:
-        run_verb("evaluate", *words)
-    assert "cdpam_contacts 8, got 3" in str(caught.value)
-    with raises(EvaluationError, file=tmp_path / "results", name="settings.body.wall", value=None):
-        run_verb("evaluate", *words, "--cdpam-contacts", "3", "--set", "body.wall=0.002")
-    # Neither is a result of other methods, objects or workers another one.
-    assert run_verb("evaluate", *words, "--cdpam-contacts", "3", "--objects", "b") == 0
-
-
 WRONG = {
     "farhest plates": ("protocol", "farhest"),
     "farthest plates --methods knn3,fild": ("method", "fild"),
@@ -105,21 +93,6 @@ def test_what_is_wrong_is_said_before_anything_is_written(
     with raises(AvmsfError, file="nowhere"):
         run_verb("evaluate", "farthest", "nowhere")
     assert sorted(path.name for path in plates.parent.iterdir()) == before
-
-
-def test_methods_train_on_the_device_that_is_asked_for(
-    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def stop(*given: object, device: str, **settings: object) -> None:
-        asked.append(device)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("avmsf.evaluation.methods.fit", stop)
-    words = ["farthest", str(plates), "--methods", "field-auto", "--no-cdpam", "--device", "cpu"]
-    assert main(["evaluate", *words, "--output", str(tmp_path / "results")]) == 130
-    assert asked == ["cpu"]
 
 
 def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked_for(
@@ -181,7 +154,9 @@ def test_ctrl_c_keeps_what_is_there(
     assert json.loads((tmp_path / "results" / "summary.json").read_text())["missing"] == {}
 
 
-def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_and_the_device_reach_the_evaluation(
+    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[Evaluation] = []
 
     def stop(evaluation: Evaluation, *objects: object, **settings: object) -> None:
@@ -189,9 +164,16 @@ def test_a_known_wall_is_handed_on(plates: Path, tmp_path: Path, monkeypatch: py
         raise KeyboardInterrupt
 
     monkeypatch.setattr("avmsf.evaluation.runner.run_objects", stop)
-    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--set", "body.wall=0"]
-    assert main(["evaluate", *words, "--set", "geometry=noisy"]) == 130
+    words = [
+        "farthest",
+        str(plates),
+        *CHEAP,
+        "--output",
+        str(tmp_path / "results"),
+        *sets("body.wall=0 geometry=noisy"),
+    ]
+    assert main(["evaluate", *words, "--device", "cpu"]) == 130
     inputs = asked[0].inputs
-    assert (inputs.body.wall, inputs.geometry) == (0.0, "noisy")
+    assert (inputs.body.wall, inputs.geometry, asked[0].device) == (0.0, "noisy", "cpu")
     # Figures of another wall are not these.
     assert asked[0].settings["body"]["wall"] == 0.0

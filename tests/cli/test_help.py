@@ -1,7 +1,6 @@
 """What `--help` prints of every verb, and hints for names of earlier versions."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,22 +20,6 @@ from factories.raising import raises
 Streams = pytest.CaptureFixture[str]
 MOST_LINES = 50
 """Of a help at 80 columns."""
-
-
-@pytest.mark.parametrize(
-    ("read", "setting", "value"),
-    [
-        (lambda words: FitOptions.parse(["mug", *words]).all_settings, "lift.feature_size", 0.0),
-        (lambda words: FitOptions.parse(["mug", *words]).all_settings, "splat.wrong_masks", 2.0),
-        (lambda words: EditOptions.parse(["field", "-o", "new", *words]).all_settings, "guide.free_modes", 0),
-        (lambda words: EditOptions.parse(["field", "-o", "new", *words]).all_settings, "contacts_per_step", 0),
-        (lambda words: SimulateOptions.parse(words).all_settings, "elastic_modes", 0),
-        (lambda words: SimulateOptions.parse(words).all_settings, "impacts", 1),
-    ],
-)
-def test_an_error_names_a_setting(read: Callable[[list[str]], object], setting: str, value: float) -> None:
-    with raises(AvmsfError, name=setting.rpartition(".")[2], value=value):
-        read(["--set", f"{setting}={value}"])
 
 
 def test_names_of_earlier_versions_lead_to_those_of_today(capsys: Streams) -> None:
@@ -84,15 +67,6 @@ def test_settings_are_printed_as_a_file_that_gives_them_back(
     assert options.parse([*needed, *words.split()]).all_settings != options.usual
     read = options.parse([*needed, "--config", str(file)])
     assert read.all_settings == options.parse([*needed, *words.split()]).all_settings
-
-
-def test_settings_are_read_once(tmp_path: Path) -> None:
-    file = tmp_path / "settings.toml"
-    file.write_text("modes = 5")
-    options = FitOptions.parse(["mug", "--config", str(file)])
-    assert options.all_settings.modes == 5
-    file.unlink()
-    assert options.all_settings.modes == 5
 
 
 @pytest.mark.parametrize("words", [["--set", "kind=bowl"], ["--kind", "bowl"], ["--seed", "0"]])

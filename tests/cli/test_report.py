@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from avmsf.cli.output import display
-from avmsf.cli.report import compare, field_lines, outlier_words, quality_words
+from avmsf.cli.report import compare, field_lines, quality_words
 from avmsf.errors import EvaluationError, FieldFileError
 from avmsf.evaluation.scores import Scores, evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
@@ -25,7 +24,6 @@ from avmsf.modal.extraction.extract import extract_modes
 from avmsf.modal.residual_noise import Residual
 from factories.made_fields import BANK, positional
 from factories.raising import raises
-from factories.verbs import results_of
 from oracles.plate import Plate, sample_contacts, strike
 
 FOUND = {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
@@ -82,40 +80,12 @@ def test_a_body_that_is_not_credible_or_edited_is_not_named() -> None:
     assert field_with(report | {"edits": [{"edit": "x"}]}).body is None
 
 
-def test_info_shows_the_body_and_its_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    save(field_with(body_report(wall=0.0013, ratio=3.67, searched=True)), tmp_path / "jug.safetensors")
-    told, err = results_of(capsys, "info", tmp_path / "jug.safetensors")
-    body = told["body"]
-    assert (body["wall_thickness"], body["stiffness_ratio"]) == pytest.approx((0.0013, 3.67))
-    assert body["wall_interval"] == [0.0009, 0.0018]
-    for words in (body["warning"], "0.9 to 1.8 mm", "95 MJ/kg"):
-        assert words in err
-
-
 @pytest.mark.parametrize(
     "damage", [{"bodies": []}, {"bodies": [3]}, {"bodies": {}}, {"thickness": 3}, {"thickness": {"a": 1}}]
 )
 def test_a_damaged_report_of_a_body_is_refused(tmp_path: Path, damage: dict[str, object]) -> None:
     with pytest.raises(FieldFileError):
         save(field_with(body_report(wall=0.0013, ratio=1.0, searched=True) | damage), tmp_path / "jug.safetensors")
-
-
-def test_an_outlier_says_first_what_was_done_and_has_figures_only_for_verbose(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = {"place": [0.046, -0.003, 0.1], "ratio": -1.9, "place_ratio": 1.6, "distance": 0.0086, "reversed": False}
-    report: dict[str, object] = {
-        "outliers": {"a.wav": "a.wav contradicts", "b.wav": "b.wav contradicts"},
-        "outlier_figures": {"a.wav": figures},
-        "excluded": ["a.wav"],
-    }
-    left_out, used = outlier_words(field_with(report))
-    assert left_out.startswith("left out")
-    assert used.startswith("used")
-    assert "1.9" not in left_out
-    monkeypatch.setattr(display, "verbose", True)
-    left_out, used = outlier_words(field_with(report))
-    assert "-1.9" in left_out
-    assert "(0.046, -0.003, 0.1) m" in left_out
-    assert used.endswith("contradicts")
 
 
 @pytest.mark.parametrize("directed", [True, False])

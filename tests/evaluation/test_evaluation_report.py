@@ -174,13 +174,6 @@ def test_tables_have_the_papers_rows_for_its_datasets_alone() -> None:
     assert "| paper, ObjectFolder Real: paper | 0.929 |" in other
 
 
-def test_tables_give_the_titles_of_methods_also_of_those_that_read_a_file() -> None:
-    method = "sonicgauss:/some/folder"
-    records = (record("1", {"knn3": (1.0, 1.0), method: (1.0, 1.0)}),)
-    words = markdown(sections(records, {**IDENTITY, "methods": {"knn3": "", method: ""}}))
-    assert METHODS["sonicgauss"].title in words
-
-
 def test_the_papers_ratio_is_of_its_own_rows() -> None:
     ratios = published_ratios("farthest")
     assert ratios["ObjectFolder Real"]["paper"]["cdpam"] == pytest.approx(1.35 / 1.53)

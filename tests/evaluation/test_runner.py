@@ -28,7 +28,7 @@ from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.registry import PROTOCOLS, MetricSettings
 from avmsf.evaluation.report import write_summary
-from avmsf.evaluation.results import ENCODER, ResultsFolder, natural
+from avmsf.evaluation.results import ResultsFolder, natural
 from avmsf.evaluation.runner import CaseRun, ObjectData, Progress, run_objects
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import Case, split
@@ -223,17 +223,6 @@ def test_a_folder_of_other_things_and_damaged_results_are_refused(plates: Path, 
         (results.path / "objects" / "a.json").write_text(content)
         with raises(EvaluationError, file="objects/a.json"):
             results.records()
-
-
-def test_another_encoder_is_named_by_its_option(tmp_path: Path) -> None:
-    results = ResultsFolder(tmp_path)
-    results.begin({"protocol": "farthest"}, {"field": f"Field(width=3){ENCODER}descriptors"})
-    with raises(EvaluationError, name="field") as caught:
-        results.begin({"protocol": "farthest"}, {"field": f"Field(width=3){ENCODER}facebook/dinov2-base"})
-    assert "--set lift.encoder=descriptors" in str(caught.value)
-    with raises(EvaluationError, name="field") as caught:
-        results.begin({"protocol": "farthest"}, {"field": f"Field(width=4){ENCODER}descriptors"})
-    assert "lift.encoder" not in str(caught.value)
 
 
 def test_names_are_in_natural_order() -> None:
@@ -457,8 +446,3 @@ def die_at_b(task: Task) -> Renderer:
     if task.name == "b":
         os.kill(os.getpid(), signal.SIGKILL)
     return NearestRecording(task.train)
-
-
-def test_workers_are_one_or_more(plates: Path, tmp_path: Path) -> None:
-    with raises(EvaluationError, name="workers", value=0):
-        run_objects(planned(plates), ("a",), ResultsFolder(tmp_path), workers=0)
