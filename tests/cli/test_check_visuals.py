@@ -21,7 +21,7 @@ from avmsf.errors import SceneError
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import surface_points
-from avmsf.photographs.folder import read_camera_file, write_views
+from avmsf.photographs.folder import read_camera_file, write_frames
 from avmsf.pipeline.visuals import VisualInputs, inputs, misplaced
 from factories.plate_capture import fill_plate
 from factories.raising import raises
@@ -114,9 +114,7 @@ def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
 def pictured_slab(folder: Path) -> Path:
     """A struck plate that is the upper side of a slab in photographs with cameras and masks."""
     fill_plate(folder, surface=False)
-    write_views(slab_views(64), folder.parent / "views")
-    for each in (folder.parent / "views").iterdir():
-        each.rename(folder / each.name)
+    write_frames(slab_views(64), folder)
     return folder
 
 

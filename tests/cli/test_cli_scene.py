@@ -13,7 +13,7 @@ from avmsf.features.store import load_features, read_report
 from avmsf.field.store import load
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
-from avmsf.photographs.folder import write_views
+from avmsf.photographs.folder import write_frames
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.settings import sets
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab_views
@@ -26,19 +26,11 @@ FIT = TINY[: -len(MODES)]
 SMALL = (*SMALL_SPLAT, *LIFT, *FIT, *MODES, "--gain-model", "network")
 
 
-def photograph(folder: Path) -> Path:
-    """Put the slab's pictures into a folder, which may hold recordings."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_views(slab_views(), folder / "pictures")
-    for part in sorted((folder / "pictures").iterdir()):
-        part.rename(folder / part.name)
-    (folder / "pictures").rmdir()
-    return folder
-
-
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return photograph(fill_plate(tmp_path_factory.mktemp("captures") / "slab", surface=False))
+    folder = fill_plate(tmp_path_factory.mktemp("captures") / "slab", surface=False)
+    write_frames(slab_views(), folder)
+    return folder
 
 
 @pytest.fixture(scope="module")

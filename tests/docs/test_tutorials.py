@@ -10,7 +10,7 @@ import pytest
 
 from avmsf.cli import main
 from avmsf.evaluation.registry import METHODS, METRICS
-from avmsf.photographs.folder import write_views
+from avmsf.photographs.folder import write_frames
 from factories.plate_capture import fill_plate
 from factories.plate_set import fill_plates
 from factories.settings import sets
@@ -55,9 +55,7 @@ def photographed(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     folder = tmp_path_factory.mktemp("photographed") / "workshop"
     shutil.copytree(workshop, folder)
     (folder / "bowl" / "surface.ply").rename(folder / "bowl.ply")
-    write_views(slab_views(), folder / "views")
-    for part in (folder / "views").iterdir():
-        part.rename(folder / "bowl" / part.name)
+    write_frames(slab_views(), folder / "bowl")
     return folder
 
 

@@ -1,6 +1,5 @@
 """A mesh beside photographs of it, of a larger one, of a displaced one and of one in another unit."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from avmsf.cli import main
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import write_surface
-from avmsf.photographs.folder import write_views
+from avmsf.photographs.folder import write_frames
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.pipeline.frame_check import check_outlines, compare_outlines, expect_contacts_in_views
 from factories.plate_capture import fill_plate
@@ -73,9 +72,7 @@ def test_cameras_or_contacts_in_another_unit_are_refused_with_it(unit: str) -> N
 def test_reconstruct_refuses_them_before_it_fits_gaussians(tmp_path: Path) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     write_surface(slab(), folder / "surface.ply")
-    write_views(slab_views(), tmp_path / "views")
-    for part in (tmp_path / "views").iterdir():
-        shutil.move(part, folder / part.name)
+    write_frames(slab_views(), folder)
     with open(folder / "capture.toml", "a") as file:
         file.write('views_unit = "cm"\n')
     assert main(["fit", str(folder), "--gain-model", "visual", "--set", "lift.encoder=descriptors"]) == 2

@@ -11,7 +11,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
 from avmsf.mesh import read_surface
 from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.photographs.folder import write_views
+from avmsf.photographs.folder import write_frames
 from avmsf.pipeline.config import CACHE, SURFACE
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 from factories.plate_capture import TINY, fill_plate
@@ -30,9 +30,7 @@ SMALL = (
 def slab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a capture folder with photographs of the slab and impacts on it."""
     folder = fill_plate(tmp_path_factory.mktemp("photographs") / "slab", surface=False)
-    write_views(slab_views(), folder / "views")
-    for each in (folder / "views").iterdir():
-        each.rename(folder / each.name)
+    write_frames(slab_views(), folder)
     return folder
 
 
