@@ -46,6 +46,10 @@ def test_a_help_fits_on_one_screen(verb: str, capsys: Streams, monkeypatch: pyte
     options = re.findall(r"^│ -[-\w]", out, re.MULTILINE)
     assert len(options) <= 25
     assert VERBS[verb] in " ".join(out.split())
+    # An argument before it takes nothing out of it.
+    with pytest.raises(SystemExit, match="0"):
+        main([verb, "edit", "--help"])
+    assert capsys.readouterr().out == out
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,9 @@ def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | N
     given: dict[str, Any] = {} if default is None else {"default": default}
     try:
         with redirect_stderr(io.StringIO()) as box:
-            return tyro.cli(kind, prog=f"avmsf {verb}", args=words, **given)
+            # A help is of all arguments, also of those that stand before it.
+            args = ["--help"] if {"-h", "--help"} & {*words} else words
+            return tyro.cli(kind, prog=f"avmsf {verb}", args=args, **given)
     except SystemExit as ending:
         if not ending.code:
             raise
