@@ -45,6 +45,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "twice.csv").write_text("file,x,y,z\na.wav,0,0,0\na,0.1,0,0\n")
     (folder / "outside.csv").write_text("file,x,y,z\n../a.wav,0,0,0\n")
     (folder / "wrong.toml").write_text('unit = "miles"\n')
+    (folder / "miles").mkdir()
+    (folder / "miles" / "capture.toml").write_text('unit = "miles"\n')
     return folder
 
 
@@ -53,6 +55,8 @@ AT = "--position 0.1 0.05 0"
 TABLE = "render field.safetensors --output s --contact-table"
 EARLY: dict[str, dict[str, Any]] = {
     "check plate --settings wrong.toml": {"file": "wrong.toml", "name": "unit", "value": "miles"},
+    # What is wrong with the capture is said before what is wrong with the name of the output.
+    "fit miles -o f": {"file": "miles/capture.toml", "name": "unit", "value": "miles"},
     "modes nowhere": {"file": "nowhere"},
     "modes plate --settings nowhere.toml": {"file": "nowhere.toml"},
     "modes plate --modes 0": {"name": "modes", "value": 0},

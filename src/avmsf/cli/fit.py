@@ -157,15 +157,15 @@ class Options(Configured, Many):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        one, config = len(self.captures) == 1, self.all_settings
+        if one := len(self.captures) == 1:
+            self._check_capture(read_settings(self.capture, self.settings))
+        config = self.all_settings
         if one and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
         expect_device(config.device, raising=FitError)
         if self.material is not None:
             material_named(self.material, option="--material")
         self._check_unused(config)
-        if one:
-            self._check_capture(read_settings(self.capture, self.settings))
 
     def _check_capture(self, settings: CaptureSettings) -> None:
         """Raise for a capture that is not there, or not whole."""
