@@ -24,6 +24,8 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.prepare import prepare
 from avmsf.capture.settings import CaptureSettings
 from avmsf.datasets.dataset import Dataset
+from avmsf.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
+from avmsf.datasets.realimpact import SELF_INTERSECTING
 from avmsf.editing.clips import level, with_length
 from avmsf.editing.distillation import DecoderDistillation
 from avmsf.editing.guided import PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
@@ -65,16 +67,18 @@ PROMPTS: Mapping[str, tuple[str, str]] = {
     "ceramic": ("a single tap on a ceramic cup, a short bright clink", "a porcelain bowl is struck once with a stick"),
 }
 """Two prompts for each new material. The paper has two a transition and prints none: these are ours."""
-_CERAMIC = ("3_CeramicKoiBowl", "4_CeramicBowlFish", "9_BowlCeramic", "61_PlanterCeramic", "63_SmallPlanterCeramic",
-            "64_CeramicMug", "65_PitcherCeramic")  # fmt: skip
-_WOOD = ("27_WoodPlate", "28_WoodPlateSquare", "31_WoodSlab", "32_WoodChalice", "33_WoodWineGlass", "34_WoodMug",
-         "68_WoodBoard")  # fmt: skip
-_METAL = ("17_IronSkillet", "43_IronMortar", "67_IronPlate", "86_MetalHoledSpoon", "89_MetalSpatula", "90_MetalLadle",
-          "91_MetalSpoon")  # fmt: skip
-_PLASTIC = ("48_PlasticBowl", "49_PlasticBowl", "50_PlasticBowl", "97_PlasticScoop")
-_GLASS = ("94_GlassGoblet",)
-_LISTED = {"ceramic": _CERAMIC, "wood": _WOOD, "metal": _METAL, "plastic": _PLASTIC, "glass": _GLASS}
-REALIMPACT_26: Mapping[str, str] = {name: material for material, names in _LISTED.items() for name in names}
+
+
+def _realimpact_26() -> dict[str, str]:
+    found: dict[str, list[str]] = {}
+    for name in REALIMPACT_NAMES:
+        material = material_in(name) or next((each for each in ("metal", "plastic") if each in name.lower()), None)
+        if material is not None and number_of(name) not in SELF_INTERSECTING:
+            found.setdefault("metal" if material == "iron" else material, []).append(name)
+    return {name: material for material, names in found.items() for name in names[:7]}
+
+
+REALIMPACT_26 = _realimpact_26()
 """Materials of 26 objects of RealImpact by their names. The paper evaluates on 26 and names none: the choice is ours.
 
 Those whose name contains the material, the first seven of each by number, iron and metal as one, without
