@@ -153,13 +153,15 @@ def _digest_of(model: Any, processor: Any) -> str:
 class ClapCurve:
     """The CLAP score of a field's sound at one contact over the steps of an edit; step 0 is the unedited field."""
 
-    def __init__(self, clap: Clap, prompt: str, field: SoundField, kept: Path, *, resumed: bool) -> None:
-        """Start a curve, or with `resumed` continue that of the file `kept`.
+    def __init__(
+        self, clap: Clap, prompt: str, field: SoundField, kept: Path | None = None, *, resumed: bool = False
+    ) -> None:
+        """Start a curve, which the file `kept` stores, or with `resumed` continue that of the file.
 
         Raises EditError for a file that is damaged or has scores of another network.
         """
         self.clap, self.prompt, self.field, self.kept = clap, prompt, field, kept
-        self.scores = _read_scores(kept, clap) if resumed and kept.is_file() else {}
+        self.scores = _read_scores(kept, clap) if resumed and kept is not None and kept.is_file() else {}
 
     def add(self, progress: GuidedEditProgress) -> None:
         """Score a preview, and the unedited field before the first one. Silent sounds have no score."""
@@ -168,8 +170,9 @@ class ClapCurve:
         if not self.scores:
             self._score(0, self.field.render(progress.place[None])[0])
         self._score(progress.step, progress.preview)
-        text = json.dumps({"digest": self.clap.digest, "scores": list(self.scores.items())})
-        write_whole(self.kept, text, raising=EditError)
+        if self.kept is not None:
+            text = json.dumps({"digest": self.clap.digest, "scores": list(self.scores.items())})
+            write_whole(self.kept, text, raising=EditError)
 
     def recorded_in(self, edited: SoundField) -> SoundField:
         """Return the edited field with the steps and scores in the record of its last edit."""

@@ -28,12 +28,12 @@ from avmsf.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
 from avmsf.datasets.realimpact import SELF_INTERSECTING
 from avmsf.editing.clips import level, with_length
 from avmsf.editing.distillation import DecoderDistillation
-from avmsf.editing.guided import PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.guided import PARAMETERIZATIONS, Guide, edit_towards
 from avmsf.editing.material import change_material
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.clap import Clap
+from avmsf.evaluation.clap import Clap, ClapCurve
 from avmsf.evaluation.methods import FieldMethod, FunctionMethod, method_named
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
@@ -192,6 +192,7 @@ class Edits:
             None if reference is not None else case.goal,
             reference,
             self.model,
+            self.clap,
             self.settings.generated,
         )
 
@@ -201,8 +202,8 @@ class Edited:
     """A renderer of an edited field."""
 
     field: SoundField
-    previews: tuple[tuple[int, Float[Tensor, " samples"]], ...] = ()
-    """Steps of the edit and the sound after each, all at one contact; step 0 is the unedited object."""
+    clap: tuple[tuple[int, float], ...] = ()
+    """Steps of the edit and the CLAP scores of the sounds after them, all at one contact; 0 is the unedited field."""
 
     @property
     def sample_rate(self) -> float:
@@ -225,7 +226,6 @@ class Generated:
     bank: ModalBank
     sound: Float[Tensor, " samples"]
     sample_rate: float
-    previews: tuple[tuple[int, Float[Tensor, " samples"]], ...] = ()
 
     def modes(self, contacts: Contacts) -> ModalBank:
         """Return its audible modes."""
@@ -261,21 +261,17 @@ def physics(request: EditRequest) -> Edited:
 
 def guided(request: EditRequest, *, parameters: str) -> Edited:
     """Edit towards the prompt or the reference, with the parameters of this name. Raises as `edit_towards`."""
-    field, previews = request.field, list[tuple[int, Tensor]]()
-
-    def keep(progress: GuidedEditProgress) -> None:
-        if progress.preview is not None and progress.place is not None:
-            if not previews:
-                previews.append((0, field.render(progress.place[None])[0]))
-            previews.append((progress.step, progress.preview))
-
     guide: Guide | None = request.reference
     if request.model is not None and request.prompt is not None:
-        guide = DecoderDistillation(request.model, request.prompt, sample_rate=field.sample_rate)
+        guide = DecoderDistillation(request.model, request.prompt, sample_rate=request.field.sample_rate)
     if guide is None:
         raise EvaluationError.expected("a prompt and a model, or a reference", name="edit")
-    how = PARAMETERIZATIONS[parameters]
-    return Edited(edit_towards(field, guide, config=request.config, parameters=how, progress=keep), tuple(previews))
+    field, config, how = request.field, request.config, PARAMETERIZATIONS[parameters]
+    if request.clap is None or request.prompt is None:
+        return Edited(edit_towards(field, guide, config=config, parameters=how))
+    curve = ClapCurve(request.clap, request.prompt, field)
+    edited = edit_towards(field, guide, config=config, parameters=how, progress=curve.add)
+    return Edited(edited, tuple(curve.scores.items()))
 
 
 def generation(request: EditRequest) -> Generated:
@@ -313,7 +309,6 @@ def score_edit(
     contacts: Contacts,
     request: EditRequest,
     spaces: Mapping[str, MaterialSpace],
-    clap: Clap | None = None,
 ) -> tuple[dict[str, tuple[float | None, ...]], dict[str, float], dict[str, Any]]:
     """Return an edit's values for each sound, those of the whole, and what figures are drawn of, as plain values."""
     places = {name: space.place(edited.modes(contacts)) for name, space in spaces.items()}
@@ -324,13 +319,11 @@ def score_edit(
     if request.reference is not None:
         distance = spectral_distance(sounds, request.reference, sample_rate=edited.sample_rate)
         values["spectral"] = tuple(distance.tolist())
-    if clap is not None and request.prompt is not None:
-        rate, prompts = edited.sample_rate, [request.prompt]
-        values["clap"] = tuple(clap.score(sounds, prompts, sample_rate=rate).flatten().tolist())
-        previews = [(step, sound) for step, sound in edited.previews if bool(sound.any())]
-        if previews:
-            curve = clap.score(torch.stack([each for _, each in previews]), prompts, sample_rate=rate)
-            report["clap"] = [(step, score) for (step, _), score in zip(previews, curve.tolist(), strict=True)]
+    if request.clap is not None and request.prompt is not None:
+        scores = request.clap.score(sounds, [request.prompt], sample_rate=edited.sample_rate)
+        values["clap"] = tuple(scores.tolist())
+        if isinstance(edited, Edited) and edited.clap:
+            report["clap"] = list(edited.clap)
     return values, figures, report
 
 

@@ -141,7 +141,7 @@ class CaseRun:
             figures: Mapping[str, float | None] = {}
             if edits is not None and task.edit is not None and isinstance(renderer, Edited | Generated):
                 contacts = recordings.test.contacts
-                values, figures, report = score_edit(renderer, sounds, contacts, task.edit, edits.spaces, edits.clap)
+                values, figures, report = score_edit(renderer, sounds, contacts, task.edit, edits.spaces)
             elif self.evaluation.protocol.scoring == "contacts":
                 values, maps = self._located(method.name, recordings, renderer, published)
             else:

@@ -15,6 +15,7 @@ from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.clap import Clap
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.sound_field import SoundField
@@ -109,6 +110,8 @@ class EditRequest:
     """Sounds of the new material, in place of words."""
     model: StableAudio | None = None
     """Text-to-audio model."""
+    clap: Clap | None = None
+    """The network of the CLAP score, if there is one."""
     generated: float = 3.0
     """Seconds of a sound that is generated from the prompt alone."""
 
