@@ -59,6 +59,19 @@ def format_number(value: float | None, digits: int = 3) -> str:
     return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
 
 
+def json_text(values: Any, *, indent: int, default: type[str] | None = None) -> str:
+    """Return values as JSON: what is not finite as null, and what JSON has not by `default`, or as a TypeError."""
+    return json.dumps(_finite(values), indent=indent, ensure_ascii=False, allow_nan=False, default=default)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def listed(names: Sequence[str], *, most: int = 5) -> str:
     """Return the first names and how many more there are."""
     more = len(names) - most

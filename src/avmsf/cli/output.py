@@ -1,7 +1,5 @@
 """What the commands print: tables and text for people, JSON for programs, each on its own stream."""
 
-import json
-import math
 import shlex
 import sys
 import warnings
@@ -10,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from avmsf._utils.progress import ProgressDisplay
-from avmsf._utils.text import printable
+from avmsf._utils.text import json_text, printable
 from avmsf.errors import AvmsfWarning
 
 
@@ -69,8 +67,7 @@ def print_json(values: Mapping[str, Any]) -> None:
     """
     if display.json:
         display.close()
-        text = json.dumps(_plain(values), indent=2, ensure_ascii=False, allow_nan=False, default=str)
-        print(printable(text), flush=True)
+        print(printable(json_text(values, indent=2, default=str)), flush=True)
 
 
 def print_result(text: str, values: Mapping[str, Any]) -> None:
@@ -92,11 +89,3 @@ def show_plainly() -> None:
 
     warnings.simplefilter("always", AvmsfWarning)
     warnings.showwarning = show
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -5,7 +5,6 @@ Some of the sounds are stored too, to be listened to and drawn.
 
 import io
 import json
-import math
 import re
 import traceback
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text import read_json
+from avmsf._utils.text import json_text, read_json
 from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.splits import Case
 
@@ -248,8 +247,7 @@ def _damaged(path: Path, error: object) -> EvaluationError:
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write plain values whole. Raises EvaluationError where that cannot be."""
-    text = json.dumps(_finite(values), indent=1, ensure_ascii=False, allow_nan=False)
-    write_whole(path, text + "\n", raising=EvaluationError)
+    write_whole(path, json_text(values, indent=1) + "\n", raising=EvaluationError)
 
 
 def failure_of(error: Exception) -> str:
@@ -269,15 +267,6 @@ def natural(name: str) -> list[tuple[bool, int, str]]:
     """Return a key that sorts numbers within names by value."""
     parts = re.findall(r"\d+|\D+", name)
     return [(not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
-
-
-def _finite(value: Any) -> Any:
-    """Return the values with null for what JSON cannot hold."""
-    if isinstance(value, Mapping):
-        return {str(key): _finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _first_difference(wanted: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[str, Any, Any]:
