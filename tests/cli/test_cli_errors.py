@@ -110,7 +110,6 @@ EARLY: dict[str, dict[str, Any]] = {
     "check empty": {"file": "empty"},
     "fit empty --until gaussians": {"file": "empty"},
     "fit empty --material glass": {"file": "empty"},
-    "fit plate -o f.safetensors --device tpu": {"name": "device", "value": "tpu"},
     "fit plate -o f.safetensors --set modes=0": {"name": "modes", "value": 0},
     "info newer.safetensors": {"file": "newer.safetensors"},
     "locate field.safetensors": {"name": "recordings", "value": 0},
@@ -126,6 +125,7 @@ EARLY: dict[str, dict[str, Any]] = {
 }
 """What is refused before torch, which takes seconds, is loaded."""
 LATE: dict[str, dict[str, Any]] = {
+    "fit plate -o f.safetensors --device tpu": {"name": "device", "value": "tpu"},
     "fit plate --output f.safetensors --train-count 4 --start 8": {"name": "start", "value": 8},
     "render field.safetensors --position 50 60 0 -o s": {"name": "--position", "row": 0, "value": [50.0, 60.0, 0.0]},
     f"render field.safetensors {AT} --position 50 60 0 --output s": {"name": "--position", "row": 1},

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from avmsf.cli.options import Configured, expect_device
+from avmsf.cli.options import Configured
 from avmsf.cli.output import doing, next_command, print_json, say, show
 from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg
 from avmsf.cli.settings import with_settings
@@ -125,7 +125,6 @@ class Options(Configured):
         for name, (wrong, wanted) in unused.items():
             if wrong:
                 raise EditError.expected(wanted, name=name)
-        expect_device(settings.prompt.device, raising=EditError)
         if self.prompt is not None:
             settings.check_prompt(self.prompt)
             if settings.prompt.generated is not None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.options import Configured, Device, Flag, expect_device
+from avmsf.cli.options import Configured, Device, Flag
 from avmsf.cli.output import display, next_command, next_step, note, print_json, say, show, table
 from avmsf.cli.paths import CacheFolder, ContactData, Existing, OutputFolder, arg
 from avmsf.cli.settings import with_settings
@@ -97,7 +97,6 @@ class Options(Configured):
         if self.protocol == "predefined" and not self.test:
             wanted, advice = "names of the recordings to test on", "such as --test 009.wav,010.wav"
             raise EvaluationError.expected(wanted, name="--test", advice=advice)
-        expect_device(self.device, raising=EvaluationError)
         _ = self.all_settings
         detect_dataset(self.data)
 

@@ -21,7 +21,6 @@ from avmsf.cli.options import (
     Name,
     Number,
     expect_capture,
-    expect_device,
     option_of,
     read_settings,
 )
@@ -162,7 +161,6 @@ class Options(Configured, Many):
         config = self.all_settings
         if one and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
-        expect_device(config.device, raising=FitError)
         if self.material is not None:
             material_named(self.material, option="--material")
         self._check_unused(config)
@@ -212,7 +210,7 @@ def run(options: Options) -> int:
         return run_many("fit", options, raising=FitError)
     from avmsf._utils.device import TRAINABLE, usable_device
 
-    usable_device(options.device, raising=FitError, kinds=TRAINABLE)
+    usable_device(options.all_settings.device, raising=FitError, kinds=TRAINABLE)
     settings = read_settings(options.capture, options.settings).starting(options.all_settings.time_zero)
     if options.until is not None:
         _make_stage(options, settings)

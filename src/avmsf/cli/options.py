@@ -17,7 +17,6 @@ from avmsf.capture.settings import settings_of as capture_settings_of
 from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.cli.paths import InputError, arg, path_mark
 from avmsf.cli.settings import Assignments, SettingsTable, as_toml, settings_of
-from avmsf.errors import AvmsfError
 
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
 """An option that is off unless it is given."""
@@ -29,8 +28,6 @@ Device = Annotated[str | None, arg("cpu|cuda")]
 Unit = Literal["m", "cm", "mm", "in", "ft"]
 _RENAMED = {"--at": "--position", "--picture": "--plots", "--to-material": "--to"}
 """Options of earlier versions, and what they are called now."""
-DEVICES = ("cpu", "cuda")
-"""Kinds of devices that commands compute on."""
 _BORDERS = re.compile(r"[─│╭╮╰╯|+]|-{3,}")
 """What tyro draws around a message."""
 _MORE = re.compile(r"Argument helptext:|For full helptext|Got errors:")
@@ -145,12 +142,6 @@ class Configured(Common, ABC):
 def option_of(name: str) -> str:
     """Return the option of a field without a prefix."""
     return f"--{name.replace('_', '-')}"
-
-
-def expect_device(name: str | None, *, raising: type[AvmsfError]) -> None:
-    """Raise `raising` for the name of a device of another kind than `DEVICES`."""
-    if name is not None and name.partition(":")[0] not in DEVICES:
-        raise raising.expected(" or ".join(DEVICES), name, name="device")
 
 
 def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
