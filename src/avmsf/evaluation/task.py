@@ -50,21 +50,17 @@ class Renderer(Protocol):
 def expect_renderer(given: Any) -> Renderer:
     """Return `given`, or raise EvaluationError that says what a renderer has unless it is one."""
     kind = given if isinstance(given, type) else type(given)
-    lacking = [each for each in ("sample_rate", "render") if not hasattr(given, each)]
-    fault = advice = ""
-    if isinstance(given, type):
-        fault, advice = "the class itself", "make an object of it, or give the training recordings as `train`"
-    elif lacking:
-        fault = f"one without {' and '.join(lacking)}"
-    elif not isinstance(given.sample_rate, int | float | np.number):
-        fault = f"one whose `sample_rate` is a {type(given.sample_rate).__name__}"
-    else:
+    fault, advice = "the class itself", "make an object of it, or give the training recordings as `train`"
+    if given is not kind:
+        fault, advice = "", ""
         try:
+            if not isinstance(given.sample_rate, int | float | np.number):
+                fault = f"one whose `sample_rate` is a {type(given.sample_rate).__name__}"
             inspect.signature(given.render).bind(None, directions=None)
+        except (AttributeError, TypeError) as error:
+            fault = str(error)
         except ValueError:  # a compiled method has no signature to look at
             pass
-        except TypeError as error:
-            fault = f"one whose `render` does not take these arguments ({error})"
     if not fault:
         renderer: Renderer = given
         return renderer
@@ -72,7 +68,7 @@ def expect_renderer(given: Any) -> Renderer:
         "an object with a number `sample_rate` (Hz) and a method `render(self, contacts, *, directions=None)` that "
         "returns sounds [contacts, samples]"
     )
-    got = f"{kind.__name__}, {fault}"
+    got = f"{kind.__name__}: {fault}"
     raise EvaluationError.expected(wanted, kind.__name__, got=got, name="renderer", advice=advice)
 
 
