@@ -126,7 +126,7 @@ def run(options: Options) -> int:
     title = dataset_title(dataset, options.data)
     objects, total = choose_objects(dataset, protocol, words_of(options.objects)), len(dataset.objects())
     if not options.objects and protocol.subset is not None and len(objects) < total:
-        taken = f"{protocol.name} takes {len(objects)} of {total} objects, {SUBSETS[protocol.subset]}"
+        taken = f"{protocol.name} takes {len(objects)} of {total} objects, {SUBSETS[protocol.subset][0]}"
         note(f"{taken}: {', '.join(objects)}; --objects NAME,NAME takes others")
     folder = (options.output or Path("evaluation") / title / protocol.name).resolve()
     settings, cdpam = options.all_settings, protocol.scoring == "sounds" and not options.no_cdpam

@@ -173,13 +173,15 @@ def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, s
     )
 
 
-SUBSETS: Mapping[str, str] = {
-    "ablation": "those of the paper's ablations or the simulated ones in their place",
-    "non-symmetric": "those without rotational symmetry",
+SUBSETS: Mapping[str, tuple[str, Sequence[str], Sequence[str]]] = {
+    "ablation": (
+        "those of the paper's ablations or the simulated ones in their place",
+        ABLATION,
+        recipe.ABLATED,
+    ),
+    "non-symmetric": ("those without rotational symmetry", NON_SYMMETRIC, recipe.NON_SYMMETRIC),
 }
-"""What the objects of each group have in common, by the group's name."""
-_NUMBERS: Mapping[str, Sequence[str]] = {"ablation": ABLATION, "non-symmetric": NON_SYMMETRIC}
-_SIMULATED: Mapping[str, Sequence[str]] = {"ablation": recipe.ABLATED, "non-symmetric": recipe.NON_SYMMETRIC}
+"""Groups of objects by name: what they have in common, their numbers in the paper's datasets, and simulated ones."""
 
 
 def members(dataset: Dataset) -> dict[str, frozenset[str]]:
@@ -188,15 +190,12 @@ def members(dataset: Dataset) -> dict[str, frozenset[str]]:
     The numbers of ObjectFolder Real are RealImpact's too, before the first underscore of an object's name. Of captures
     only those are known that were simulated.
     """
-    if isinstance(dataset, CaptureCollection):
-        found = {name: simulated(dataset, names) for name, names in _SIMULATED.items()}
-    else:
-        objects = dataset.objects()
-        found = {
-            name: frozenset(each for each in objects if each.partition("_")[0] in numbers)
-            for name, numbers in _NUMBERS.items()
-        }
-    return {name: each for name, each in found.items() if each}
+    found = {}
+    for group, (_, numbers, names) in SUBSETS.items():
+        found[group] = frozenset(each for each in dataset.objects() if each.partition("_")[0] in numbers)
+        if isinstance(dataset, CaptureCollection):
+            found[group] = simulated(dataset, names)
+    return {group: each for group, each in found.items() if each}
 
 
 def choose_objects(dataset: Dataset, protocol: Protocol, asked: Sequence[str] = ()) -> tuple[str, ...]:
