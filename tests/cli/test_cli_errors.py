@@ -63,8 +63,6 @@ EARLY: dict[str, dict[str, Any]] = {
     "fit nowhere -o f.safetensors": {"file": "nowhere"},
     "fit plate --output plate": {"file": "plate", "value": "folder"},
     "fit plate --output words.csv/f.safetensors": {"file": "words.csv", "value": "file"},
-    "fit plate --output f.safetensors --train-count 8": {"value": 8},
-    "fit plate --output f.safetensors --train-fraction 1.5": {"name": "--train-fraction", "value": 1.5},
     "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": {"name": "--train-count"},
     "fit plate --output f.safetensors --set validation=2": {"name": "validation", "value": 2.0},
     "fit plate --output f.safetensors --material glass --train-count 4": {"name": "--train-count", "value": "glass"},
@@ -127,6 +125,8 @@ EARLY: dict[str, dict[str, Any]] = {
 LATE: dict[str, dict[str, Any]] = {
     "fit plate -o f.safetensors --device tpu": {"name": "device", "value": "tpu"},
     "fit plate --output f.safetensors --train-count 4 --start 8": {"name": "start", "value": 8},
+    "fit plate --output f.safetensors --train-count 8": {"name": "count", "value": 8},
+    "fit plate --output f.safetensors --train-fraction 1.5": {"name": "train_size", "value": 1.5},
     "render field.safetensors --position 50 60 0 -o s": {"name": "--position", "row": 0, "value": [50.0, 60.0, 0.0]},
     f"render field.safetensors {AT} --position 50 60 0 --output s": {"name": "--position", "row": 1},
     f"{TABLE} far.csv": {"file": "far.csv", "row": 4, "name": "b.wav", "value": [50.0, 60.0, 0.0]},

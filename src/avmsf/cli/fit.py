@@ -27,7 +27,7 @@ from avmsf.cli.options import (
 from avmsf.cli.output import display, doing, next_command, next_step, print_json, print_result, show
 from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, SettingsFile, arg
 from avmsf.cli.settings import with_settings
-from avmsf.errors import EvaluationError, FitError
+from avmsf.errors import FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import GainModelName
 from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset
@@ -157,7 +157,7 @@ class Options(Configured, Many):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if one := len(self.captures) == 1:
-            self._check_capture(read_settings(self.capture, self.settings))
+            self._check_capture()
         config = self.all_settings
         if one and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
@@ -165,26 +165,15 @@ class Options(Configured, Many):
             material_named(self.material, option="--material")
         self._check_unused(config)
 
-    def _check_capture(self, settings: CaptureSettings) -> None:
+    def _check_capture(self) -> None:
         """Raise for a capture that is not there, or not whole."""
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
-            expect_views(self.capture, settings)
+            expect_views(self.capture, read_settings(self.capture, self.settings))
         elif self.material is None:
             if not self.capture.is_dir():
                 wanted, advice = "a capture folder", "--material NAME computes a field of a mesh without recordings"
                 raise FitError.expected(wanted, got="a file", file=self.capture, name="--material", advice=advice)
-            self._check_split(expect_capture(self.capture, settings))
-
-    def _check_split(self, impacts: int) -> None:
-        """Raise for a split that leaves no contact to train on or to score, as far as the number of impacts says it."""
-        if self.train_count is not None and self.train_fraction is not None:
-            raise FitError.expected("it or --train-fraction", got="both", name="--train-count", advice="leave one out")
-        if self.train_fraction is not None and not 0.0 < self.train_fraction < 1.0:
-            wanted = "a fraction of training contacts between 0 and 1, such as 0.75"
-            raise EvaluationError.expected(wanted, self.train_fraction, name="--train-fraction")
-        if self.train_count is not None and not 0 < self.train_count < impacts:
-            wanted = f"1 to {impacts - 1} training contacts, so that others are left to score"
-            raise EvaluationError.expected(wanted, self.train_count, name="--train-count")
+            expect_capture(self.capture, self.settings)
 
     def _check_unused(self, config: PipelineConfig) -> None:
         """Raise FitError for options that nothing would read."""
@@ -200,6 +189,8 @@ class Options(Configured, Many):
             for name in (each for each in names if chosen and each in given):
                 wanted, advice = f"no --{other} with it", "leave one out"
                 raise FitError.expected(wanted, chosen, name=option_of(name), advice=advice)
+        if self.train_count is not None and self.train_fraction is not None:
+            raise FitError.expected("it or --train-fraction", got="both", name="--train-count", advice="leave one out")
         if self.start and self.train_fraction is None and self.train_count is None:
             raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
 

@@ -57,7 +57,7 @@ class Options(Common):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if self.capture is not None:
-            expect_capture(self.capture, read_settings(self.capture, self.settings))
+            expect_capture(self.capture, self.settings)
 
 
 def run(options: Options) -> int:

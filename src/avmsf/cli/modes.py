@@ -43,7 +43,7 @@ class Options(Common):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         _ = self.pipeline
-        expect_capture(self.capture, read_settings(self.capture, self.settings))
+        expect_capture(self.capture, self.settings)
 
     @property
     def pipeline(self) -> PipelineConfig:

@@ -149,6 +149,6 @@ def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
     return capture_settings_of(folder) if settings is None else CaptureSettings.read(settings)
 
 
-def expect_capture(folder: Path, settings: CaptureSettings) -> int:
-    """Return the number of impacts of a capture folder's table. Raises `CaptureError` where it cannot be used."""
-    return len(present_impacts(folder, read_impacts(folder, settings, Issues()), Issues()))
+def expect_capture(folder: Path, settings: Path | None) -> None:
+    """Raise `CaptureError` where a capture folder's settings, or those of a file, or its table cannot be used."""
+    present_impacts(folder, read_impacts(folder, read_settings(folder, settings), Issues()), Issues())

@@ -60,7 +60,7 @@ class Options(Common):
         if self.unseen and self.candidates is not None:
             raise FitError.expected("no --candidates with it", got="both", name="--unseen", advice="leave one out")
         if self.candidates is not None:
-            expect_capture(self.candidates, read_settings(self.candidates, self.settings))
+            expect_capture(self.candidates, self.settings)
 
 
 def run(options: Options) -> int:
