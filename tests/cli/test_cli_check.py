@@ -51,14 +51,6 @@ def test_other_settings_are_not_mixed_with_written_ones_nor_with_a_dataset(rumbl
     assert not (rumbling / "capture.toml").exists()
 
 
-def test_recordings_that_start_with_the_impact_are_said_to_be_uncut(tmp_path: Path, capsys: Streams) -> None:
-    time = np.arange(4000) / RATE
-    sounds = {f"{name}.wav": np.exp(-15 * time) * np.cos(2 * np.pi * 700 * time) / (2 + ord(name)) for name in "abc"}
-    report, _ = results_of(capsys, "check", fill(tmp_path, replace=sounds))
-    assert len(report["remarks"]) == 1
-    assert {row["onset_seconds"] for row in report["recordings"]} == {0.0}
-
-
 def fill_five(folder: Path, *, own_phases: int | None = None) -> Path:
     """Write recordings of five modes with the impact after .1 s and some samples; one may have phases of its own."""
     generator = np.random.default_rng(1)
@@ -124,14 +116,3 @@ def test_every_command_names_the_unit_of_the_mesh_and_writes_nothing(
     assert 'surface_unit = "mm"' in said.out + said.err
     assert sorted(folder.rglob("*")) == before
     assert [each.name for each in tmp_path.iterdir()] == ["plate"]
-
-
-@pytest.mark.parametrize("unit", ["mm", "cm", "in"])
-def test_the_unit_that_fits_is_named_and_mends_the_capture(unit: str, tmp_path: Path, capsys: Streams) -> None:
-    folder, line = capture_in(tmp_path / "plate", unit), f'surface_unit = "{unit}"'
-    report, _ = results_of(capsys, "check", folder, code=2)
-    assert not report["readable"]
-    assert any(line in problem for problem in report["problems"])
-    with open(folder / "capture.toml", "a") as file:
-        file.write(f"{line}\n")
-    assert results_of(capsys, "check", folder)[0]["readable"]

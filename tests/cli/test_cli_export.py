@@ -127,18 +127,6 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
     assert soundfile.info(folder / rows[0]["file"]).frames == 400
 
 
-def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
-    export(field_file, "faust", tmp_path / "a.dsp", "--contacts", 7, "--json")
-    contacts = Path(json.loads(capsys.readouterr().out)["contacts"])
-    folder = export(field_file, "wavs", tmp_path / "w", "--contacts", 7, "--seconds", 0.01)
-    one, other = (
-        {row["contact"]: [row[axis] for axis in "xyz"] for row in table_of(path)}
-        for path in (contacts, folder / "samples.csv")
-    )
-    assert len(one) == 7
-    assert one == other
-
-
 def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
     field_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Streams
 ) -> None:
@@ -154,11 +142,8 @@ def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
 
 WRONG: dict[str, dict[str, Any]] = {
     "wavs s2.wav": {"file": "s2.wav", "name": "suffix", "value": ".wav"},
-    "avmsf-demo bowl.ZIP": {"file": "bowl.ZIP", "name": "suffix", "value": ".ZIP"},
     "web page.glb": {"file": "page.glb", "name": "suffix", "value": ".glb"},
-    "gltf a.wav": {"file": "a.wav", "name": "suffix", "value": ".wav"},
     "faust a": {"file": "a", "name": "suffix", "value": ""},
-    "uff a.txt": {"file": "a.txt", "name": "suffix", "value": ".txt"},
     "sfz s": {"name": "--to", "value": "sfz"},
     "wavs out --contacts 0": {"name": "--contacts", "value": 0},
     "wavs out --forces 1 2 3 --contact-times 0 0": {"name": "--contact-times", "value": 2},

@@ -37,7 +37,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.fit import fit as field_fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
-from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
+from avmsf.simulate.ground_truth import read_truth
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_field import QUICK
 from factories.plate_set import PlateInputs, fill_plates
@@ -145,18 +145,6 @@ def test_an_object_that_cannot_be_read_or_shows_nothing_is_a_failure(tmp_path: P
     assert "03.wav" in failures[1]["failure"]
 
 
-def test_a_truth_of_other_recordings_costs_its_object_alone_until_it_is_mended(tmp_path: Path) -> None:
-    folder = fill_plates(tmp_path / "plates", ("a", "b"), count=6, truth=True)
-    truth = read_truth(folder / "a")
-    write_truth(replace(truth, names=tuple(f"x{name}" for name in truth.names)), folder / "a" / TRUTH)
-    results = ResultsFolder(tmp_path / "results")
-    run_objects(planned(folder, "nearest"), ("a", "b"), results)
-    assert [len(each.outcomes) for each in results.records()] == [0, 1]
-    (folder / "a" / TRUTH).unlink()
-    run_objects(planned(folder, "nearest"), ("a", "b"), results)
-    assert [(len(each.outcomes), each.failure) for each in results.records()] == [(1, None), (1, None)]
-
-
 def test_methods_share_modes_that_are_found_once_and_kept(plates: Path, tmp_path: Path) -> None:
     found = []
     for names in (("one",), ("two", "three")):
@@ -169,19 +157,6 @@ def test_methods_share_modes_that_are_found_once_and_kept(plates: Path, tmp_path
     method = asking(lambda task: counts.append((len(task.train), len(task.modes().gains))), "shots")
     run_objects(planned(plates, method, protocol="shots"), ("a",), ResultsFolder(tmp_path / "shots"))
     assert counts == [(8, 8), (4, 4), (2, 2), (1, 1)]
-
-
-def test_shared_time_is_no_methods_time(plates: Path, tmp_path: Path) -> None:
-    class SlowInputs(PlateInputs):
-        def features(self, *arguments: object, **named: object):  # type: ignore[no-untyped-def]
-            time.sleep(0.2)
-            return super().features(*arguments, **named)
-
-    method = asking(lambda task: task.features("positions"))
-    run_objects(replace(planned(plates, method), inputs=SlowInputs()), ("a",), ResultsFolder(tmp_path))
-    (record,) = ResultsFolder(tmp_path).records()
-    assert record.outcomes[0].fit_seconds < record.cases[0].shared_seconds
-    assert record.cases[0].shared_seconds >= 0.2
 
 
 def test_results_of_different_evaluations_are_not_mixed(
