@@ -20,7 +20,6 @@ from factories.verbs import results_of, run_verb
 
 Streams = pytest.CaptureFixture[str]
 SMOOTH = ("--gain-model", "smooth", "--train-count", "5", *TINY)
-NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
 

@@ -63,19 +63,23 @@ def labelled(count: int = 8) -> tuple[list[ModalBank], list[str]]:
     return [*low, *high], ["wood"] * count + ["glass"] * count
 
 
+def space_of(banks: list[ModalBank], materials: list[str], *, seed: int = 0) -> MaterialSpace:
+    return MaterialSpace.of(banks, materials, names=[f"object {row}" for row in range(len(banks))], seed=seed)
+
+
 @pytest.mark.slow
 def test_like_is_near_unlike_far_and_a_seed_gives_the_same_space():
     # Importing it compiles for many seconds, which only its embeddings need.
     if importlib.util.find_spec("umap") is None:
         pytest.skip("needs pip install 'avmsf[eval]'")
-    space, again = (MaterialSpace.of(*labelled(), seed=3) for _ in range(2))
+    space, again = (space_of(*labelled(), seed=3) for _ in range(2))
     wood, glass = space.place(random_bank(25, seed=99)), space.place(random_bank(25, seed=98, pitch=3.0))
     assert space.distance(wood, "wood") < 0.5 * space.distance(wood, "glass")
     assert space.distance(glass, "glass") < 0.5 * space.distance(glass, "wood")
     assert space.nearest_neighbor_accuracy() == 1.0
     assert np.array_equal(again.embedding, space.embedding)
     assert np.array_equal(again.place(random_bank(25, seed=99)), wood)
-    assert not np.array_equal(MaterialSpace.of(*labelled(), seed=4).embedding, space.embedding)
+    assert not np.array_equal(space_of(*labelled(), seed=4).embedding, space.embedding)
 
 
 BANKS, MATERIALS = labelled()
@@ -87,10 +91,10 @@ BANKS, MATERIALS = labelled()
         (lambda: pitches(bank([])), {"name": "bank", "value": 0}),
         (lambda: pitches_and_dampings(bank([100.0, 0.0])), {"row": 1, "name": "frequency", "value": 0.0}),
         (lambda: pitches_and_dampings(bank([100.0], math.nan)), {"row": 0, "name": "damping"}),
-        (lambda: MaterialSpace.of(BANKS, MATERIALS[1:]), {"name": "materials", "value": 15}),
-        (lambda: MaterialSpace.of(BANKS[:4], MATERIALS[:4]), {"name": "mode_sets", "value": (4, 1)}),
-        (lambda: MaterialSpace.of(BANKS, MATERIALS).center("steel"), {"name": "material", "value": "steel"}),
-        (lambda: MaterialSpace.of(BANKS, MATERIALS).embedding, {"name": "umap-learn"}),
+        (lambda: space_of(BANKS, MATERIALS[1:]), {"name": "materials", "value": 15}),
+        (lambda: space_of(BANKS[:4], MATERIALS[:4]), {"name": "mode_sets", "value": (4, 1)}),
+        (lambda: space_of(BANKS, MATERIALS).center("steel"), {"name": "material", "value": "steel"}),
+        (lambda: space_of(BANKS, MATERIALS).embedding, {"name": "umap-learn"}),
     ],
 )
 def test_what_makes_no_space_is_refused(make, attributes, monkeypatch):

@@ -67,7 +67,7 @@ FEATURES: dict[str, Callable[[ModalBank], Float64[np.ndarray, " dim"]]] = {
 def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, " modes"]]:
     """Return log2 of frequencies and dampings."""
     if not len(bank):
-        raise EvaluationError("expected a bank of one mode or more, got none", name="bank", value=0)
+        raise EvaluationError.expected("one mode or more", 0, got="none", name="bank")
     for name in ("frequency", "damping"):
         for row, value in enumerate(getattr(bank, name).tolist()):
             if not 0.0 < value < math.inf:
@@ -95,7 +95,7 @@ class MaterialSpace:
         mode_sets: Sequence[ModalBank],
         materials: Sequence[str],
         *,
-        names: Sequence[str] | None = None,
+        names: Sequence[str],
         features: str = "umap",
         seed: int = 0,
     ) -> "MaterialSpace":
@@ -104,24 +104,19 @@ class MaterialSpace:
         Raises EvaluationError for labels that do not fit the sets, for fewer than six objects or two materials, and as
         the features do, with the object's name.
         """
-        called = tuple(f"object {row}" for row in range(len(mode_sets))) if names is None else tuple(names)
-        for name, labels in (("materials", materials), ("names", called)):
+        for name, labels in (("materials", materials), ("names", names)):
             if len(labels) != len(mode_sets):
                 raise EvaluationError.expected(f"one for each of {len(mode_sets)} sets", len(labels), name=name)
         if len(mode_sets) < _MIN_OBJECTS or len(set(materials)) < 2:
-            raise EvaluationError(
-                f"expected {_MIN_OBJECTS} objects of two materials or more, got {len(mode_sets)} objects of "
-                f"{len(set(materials))} materials",
-                name="mode_sets",
-                value=(len(mode_sets), len(set(materials))),
-            )
+            found, wanted = (len(mode_sets), len(set(materials))), f"{_MIN_OBJECTS} objects of two materials or more"
+            raise EvaluationError.expected(wanted, found, got="{} of {}".format(*found), name="mode_sets")
         vectors = []
-        for name, bank in zip(called, mode_sets, strict=True):
+        for name, bank in zip(names, mode_sets, strict=True):
             try:
                 vectors.append(FEATURES[features](bank))
             except EvaluationError as error:
                 raise EvaluationError(f"{name}: {error}", **{**error.attributes, "name": name}) from error
-        return cls(features, tuple(materials), called, np.stack(vectors), seed)
+        return cls(features, tuple(materials), tuple(names), np.stack(vectors), seed)
 
     @cached_property
     def embedding(self) -> Float[np.ndarray, "objects 2"]:
@@ -175,10 +170,8 @@ class MaterialSpace:
                 # Half a minute the first time, while numba compiles: so only those who embed pay for it.
                 import umap
             except ImportError as error:
-                raise EvaluationError(
-                    f"UMAP distance: expected the package umap-learn, got {error}; pip install 'avmsf[eval]'",
-                    name="umap-learn",
-                ) from error
+                advice = "pip install 'avmsf[eval]'"
+                raise EvaluationError.expected("a package", got=str(error), name="umap-learn", advice=advice) from error
             model = umap.UMAP(
                 n_components=2,
                 n_neighbors=min(_NEIGHBORS, len(self.vectors) - 1),
