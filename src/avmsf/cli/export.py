@@ -114,11 +114,6 @@ class Options(Many):
         """The field, where there is one."""
         return self.fields[0]
 
-    @property
-    def written(self) -> Path | None:
-        """The file or folder of `--output`."""
-        return self.output
-
     def of(self, given: Path, output: Path) -> "Options":
         """Return the options for one of many fields."""
         capture = None if self.capture is None else self.capture / output.name

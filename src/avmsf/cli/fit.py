@@ -115,11 +115,6 @@ class Options(Configured, Many):
         """The capture, where there is one."""
         return self.captures[0]
 
-    @property
-    def written(self) -> Path | None:
-        """The file or folder of `--output`."""
-        return self.output
-
     def of(self, given: Path, output: Path) -> "Options":
         """Return the options for one of many captures."""
         cache, plots = (None if each is None else each / output.name for each in (self.cache, self.plots))

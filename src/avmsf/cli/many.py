@@ -51,9 +51,10 @@ class Many(Common, ABC):
         return inputs
 
     @property
-    @abstractmethod
     def written(self) -> Path | None:
         """The output of a single input, or the folder of those of several."""
+        output: Path | None = vars(self)["output"]
+        return output
 
     @abstractmethod
     def of(self: M, given: Path, output: Path) -> M:

@@ -92,13 +92,12 @@ def materials_of(dataset: Dataset) -> dict[str, str]:
     """
     names = dataset.objects()
     listed = {name: REALIMPACT_26[name] for name in names if name in REALIMPACT_26}
-    found = {name: dataset.facts(name).material or _material_in(name) for name in names}
+    words = {name: re.findall("[a-z]+", name.lower()) for name in names}
+    found = {
+        name: dataset.facts(name).material or next((each for each in PROMPTS if each in words[name]), None)
+        for name in names
+    }
     return listed or {name: material for name, material in found.items() if material is not None}
-
-
-def _material_in(name: str) -> str | None:
-    words = re.findall("[a-z]+", name.lower())
-    return next((material for material in PROMPTS if material in words), None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
 from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, table_modules
 from avmsf.evaluation.results import ENCODER, SPACES, ResultsFolder, write_json
-from avmsf.evaluation.scores import expect_metrics
+from avmsf.evaluation.scores import shared_cdpam
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, finder_named
@@ -58,8 +58,8 @@ class Evaluation:
 
         Raises EvaluationError where the folder holds other ones, and where a metric's package is not installed.
         """
-        if self.protocol.scoring == "sounds":
-            expect_metrics(self.metric_settings)
+        if self.protocol.scoring == "sounds" and self.metric_settings.cdpam:
+            shared_cdpam()
         identity = {
             "version": version("avmsf"),
             "source": [source_digest(module) for module in (f"{__package__}.runner", *table_modules())],

@@ -156,12 +156,6 @@ shared_cdpam = lru_cache(maxsize=1)(Cdpam.load)
 """Returns CDPAM, which is read once a process. Raises as `Cdpam.load`."""
 
 
-def expect_metrics(settings: MetricSettings) -> None:
-    """Raise EvaluationError where a metric's package is not installed, before hours of computation."""
-    if settings.cdpam:
-        shared_cdpam()
-
-
 def metric_values(
     settings: MetricSettings, renderer: Renderer, sounds: Sounds, test: Impacts, truth: Truth | None, *, loudest: float
 ) -> tuple[Values, dict[str, float | None]]:
