@@ -3,6 +3,8 @@
 And one of warnings, `AvmsfWarning`: what goes on all the same, and the user should know.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -182,6 +184,19 @@ def lacks_memory(error: BaseException) -> bool:
         # llvmlite raises another OSError, which names no reason, while it handles this one.
         return error.__context__ is not None and lacks_memory(error.__context__)
     return isinstance(error, MemoryError)
+
+
+@contextmanager
+def from_extra(extra: str, package: str, *, raising: type[AvmsfError], instead: str = "") -> Iterator[None]:
+    """Import an optional package within; where that fails, raise `raising` with its name and how to install its extra.
+
+    `instead` says how to do without it.
+    """
+    try:
+        yield
+    except (ImportError, RuntimeError) as error:  # RuntimeError: one of the package's own packages is broken
+        advice = f"pip install 'avmsf[{extra}]'" + (f", or {instead}" if instead else "")
+        raise raising.expected("an installed package", got=str(error), name=package, advice=advice) from error
 
 
 def download_failure(error: BaseException) -> str:

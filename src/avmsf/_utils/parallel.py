@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from avmsf._utils.processes import end_with_parent, ending_of
-from avmsf.errors import AvmsfError, WorkerError
+from avmsf.errors import AvmsfError, WorkerError, from_extra
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -244,9 +244,6 @@ def _imported_ray(raising: type[AvmsfError]) -> ModuleType:
     os.environ.setdefault("RAY_AUTH_MODE", "disabled")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    try:
+    with from_extra("scale", "ray", raising=raising, instead="omit --ray"):
         import ray
-    except ImportError as error:
-        advice = "pip install 'avmsf[scale]', or omit --ray"
-        raise raising.expected("an installed package", name="ray", advice=advice) from error
     return ray

@@ -24,7 +24,7 @@ from avmsf._utils.device import usable_device
 from avmsf._utils.files import model_folder
 from avmsf.editing.clips import with_length
 from avmsf.editing.config import STABLE_AUDIO, check_prompt
-from avmsf.errors import EditError, download_failure
+from avmsf.errors import EditError, download_failure, from_extra
 
 Latents = Float[Tensor, "contacts dim frames"]
 """What the autoencoder makes of waveforms."""
@@ -336,13 +336,9 @@ def _missing_weights(folder: Path, network: nn.Module) -> list[str]:
 
 
 def _pipeline_class() -> Any:
-    try:
+    with from_extra("text", "diffusers", raising=EditError, instead="edit towards a recording"):
         from diffusers import StableAudioPipeline
 
         if find_spec("torchsde") is None:  # the scheduler imports it late, and its error names no remedy
             raise ImportError("no module named 'torchsde'")
-    except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-        wanted = "the packages diffusers, transformers and torchsde for text prompts"
-        advice = "pip install 'avmsf[text]', or edit towards a recording"
-        raise EditError.expected(wanted, got=str(error), name="diffusers", advice=advice) from error
     return StableAudioPipeline

@@ -25,7 +25,7 @@ from avmsf._utils.text import read_json
 from avmsf.editing.clips import resampled
 from avmsf.editing.guided import GuidedEditProgress
 from avmsf.editing.modal_edit import EDITS
-from avmsf.errors import EditError, EvaluationError, download_failure
+from avmsf.errors import EditError, EvaluationError, download_failure, from_extra
 from avmsf.evaluation.metrics import PerContact, validate_sounds
 from avmsf.field.sound_field import SoundField
 
@@ -59,11 +59,8 @@ class Clap:
         """
         name, what = str(source), f"a folder with a CLAP model, or a name such as {DEFAULT}"
         folder = model_folder(source, what, raising=EvaluationError)
-        try:
+        with from_extra("eval", "transformers", raising=EvaluationError):
             from transformers import ClapModel, ClapProcessor
-        except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-            got, advice = str(error), "pip install 'avmsf[eval]'"
-            raise EvaluationError.expected("a package", got=got, name="transformers", advice=advice) from error
         download = f"hf download {DEFAULT if folder else name} --local-dir FOLDER"
         advice = f"on a computer with a network run {download}, copy FOLDER here, and give its path"
         try:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64
 
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, from_extra
 from avmsf.modal.modes import ModalBank
 
 _QUANTILES = 32
@@ -166,12 +166,9 @@ class MaterialSpace:
         """Return umap-learn's model, fitted to the vectors."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            try:
+            with from_extra("eval", "umap-learn", raising=EvaluationError):
                 # Half a minute the first time, while numba compiles: so only those who embed pay for it.
                 import umap
-            except ImportError as error:
-                advice = "pip install 'avmsf[eval]'"
-                raise EvaluationError.expected("a package", got=str(error), name="umap-learn", advice=advice) from error
             model = umap.UMAP(
                 n_components=2,
                 n_neighbors=min(_NEIGHBORS, len(self.vectors) - 1),

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
 
-from avmsf.errors import ExportError
+from avmsf.errors import ExportError, from_extra
 from avmsf.export.one_phase import shared_dampings
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import SUFFIXES, Written, check_suffix, generator, write_files
@@ -44,7 +44,8 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     check_suffix(path, SUFFIXES["uff"])
     if functions < 0:
         raise ExportError.expected("0 or more", functions, name="functions")
-    pyuff = _pyuff()
+    with from_extra("uff", "pyuff", raising=ExportError):
+        import pyuff
     damping = shared_dampings(field)
     sets = [_header(field), _units(), _nodes(field)]
     sets += [_mode(field, mode, damping) for mode in range(len(field.frequency))]
@@ -186,12 +187,3 @@ def _function(field: SampledField, row: int, frequencies: Float64[np.ndarray, " 
         "orddenom_axis_lab": "Force",
         "orddenom_axis_units_lab": "N" if field.per_newton else "NONE",
     }
-
-
-def _pyuff() -> Any:
-    try:
-        import pyuff
-    except ImportError as error:
-        advice = "run pip install 'avmsf[uff]'"
-        raise ExportError.expected("the package for the universal file format", name="pyuff", advice=advice) from error
-    return pyuff

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from avmsf._utils.text import read_json_object
-from avmsf.errors import SceneError, download_failure
+from avmsf.errors import SceneError, download_failure, from_extra
 from avmsf.features.encoder import describe_patches
 
 MODELS: Final = tuple(
@@ -134,10 +134,6 @@ def _read_normalization(path: Path) -> list[Float[Tensor, "3 1 1"]]:
 
 def _model_classes() -> dict[str, Any]:
     """Return the classes of transformers by the type of model in their settings."""
-    try:
+    with from_extra("vision", "transformers", raising=SceneError, instead="use --set lift.encoder=descriptors"):
         from transformers import Dinov2Model, Dinov2WithRegistersModel
-    except (ImportError, RuntimeError) as error:  # RuntimeError: one of its own optional packages is broken
-        wanted, got = "the package transformers for DINOv2", f"an import error ({error})"
-        advice = "pip install 'avmsf[vision]', or use --set lift.encoder=descriptors"
-        raise SceneError.expected(wanted, got=got, name="transformers", advice=advice) from error
     return {"dinov2": Dinov2Model, "dinov2_with_registers": Dinov2WithRegistersModel}

