@@ -211,11 +211,7 @@ def _adjustments(options: Options, field: "SoundField") -> dict[str, Any]:
 
 
 def _guided(options: Options, field: "SoundField", old: Material | None) -> "SoundField":
-    """Return the field edited towards a prompt, recordings, or the sound of a material.
-
-    State and preview are written next to the output, so that the same command continues to the same result. `old` is
-    the field's material, needed only for `like_material`.
-    """
+    """Return the field edited towards a prompt, recordings, or the sound of a material in place of `old`."""
     from avmsf._utils.text import format_number
     from avmsf.cli.output import display
     from avmsf.cli.writing import peak_factor, write_sound

@@ -178,11 +178,7 @@ def _true_contact(contacts: "Contacts", recording: Path) -> "Float64[Tensor, ' 3
 
 
 def _error(contact: "ContactPosterior", truth: "Float64[Tensor, ' 3']", level: float) -> dict[str, Any]:
-    """Return how far the most probable contact is from the true one, and both estimates relative to the diagonal.
-
-    `rmed` is of the point of least cosine distance, as in `avmsf evaluate localize`; `in_region` says whether the
-    credible region contains the true contact.
-    """
+    """Return how far the most probable contact is from the true one, and both estimates as `evaluate localize`."""
     diagonal = float((contact.points.amax(0) - contact.points.amin(0)).norm())
     places = (contact.points[int(contact.distance.argmin())], contact.position)
     cosine, likely = (float((place.double() - truth).norm()) for place in places)
@@ -198,12 +194,7 @@ def _is_training(field: "SoundField", path: Path) -> bool:
 
 
 def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return values over the located impacts of known contacts; None where there are fewer than two.
-
-    These are their number, the median error in meters, the mean of both relative errors, and the fraction of the true
-    contacts that are within their credible region. Recordings that the field was fitted to are left out, and counted as
-    `training`.
-    """
+    """Return values over the located impacts of known contacts, without training recordings; None of fewer than two."""
     known = [each for each in impacts if "error" in each]
     scored = [each for each in known if not each["training"]]
     if len(scored) < 2:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.config import SplatConfig
-from avmsf.modal.config import ExtractionMethod, expect_modes
+from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
 
 if TYPE_CHECKING:
@@ -368,9 +368,6 @@ class EvaluationSettings:
     """Elastic bodies."""
     edit: EditProtocolSettings = field(default_factory=EditProtocolSettings)
     """The protocol `edit`."""
-
-    def __post_init__(self) -> None:
-        expect_modes(self.modes)
 
 
 @dataclass(frozen=True)
