@@ -62,14 +62,6 @@ def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level:
     assert len(advised) == (0 if level == -10 else 1)
 
 
-def test_columns_that_are_not_used_are_named(path: Path, tmp_path: Path, capsys: Streams) -> None:
-    table = tmp_path / "places.csv"
-    table.write_text("File,x,y,z,nz,Hammer,force_newtons\na,0.05,0.03,0.002,1,felt,2\nb,0.02,0.03,0.002,1,felt,2\n")
-    assert main(["render", str(path), "--contact-table", str(table), "--output", str(tmp_path / "out")]) == 0
-    noted = [line for line in capsys.readouterr().err.splitlines() if str(table) in line]
-    assert [line.endswith("hammer, force_newtons") for line in noted] == [True]
-
-
 @pytest.mark.parametrize("shape", ["half-sine", "hertz"])
 def test_render_softens_the_modes(path: Path, shape: PulseShape, capsys: Streams) -> None:
     sound, _, _ = rendered(path, capsys, "--contact-time", "2e-3", "--pulse", shape)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from avmsf.cli.report import compare, field_lines, quality_words
+from avmsf.cli.report import compare
 from avmsf.errors import EvaluationError, FieldFileError
 from avmsf.evaluation.scores import Scores, evaluate
 from avmsf.evaluation.simple_methods import MeanWaveform
@@ -26,8 +26,6 @@ from factories.made_fields import BANK, positional
 from factories.raising import raises
 from oracles.plate import Plate, sample_contacts, strike
 
-FOUND = {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
-
 
 def field_with(report: dict[str, object]) -> SoundField:
     zero = torch.zeros(len(BANK), dtype=torch.float64)
@@ -43,19 +41,6 @@ def body_report(*, wall: float | None, ratio: float, searched: bool = False) -> 
     credibility = {"credible": True, "with_body": 2.5, "without_body": 0.75}
     thickness = {"median": 0.0013, "low": 0.0009, "high": 0.0018} if searched else None
     return {"bodies": [body], "credibility": credibility, "thickness": thickness}
-
-
-def test_a_field_without_a_verdict_gets_no_words_and_one_with_advice_names_the_command() -> None:
-    for report in ({}, {"quality": FOUND, "edits": [{"edit": "x"}]}):
-        assert quality_words(field_with(report), Path("f")) == []
-    assert "avmsf suggest f" in quality_words(field_with({"quality": FOUND}), Path("f"))[0]
-
-
-def test_the_body_is_named_with_the_ratio_of_stiffness_to_density_and_what_it_explains() -> None:
-    lines = field_lines(field_with(body_report(wall=None, ratio=0.25)), Path("f"), settings=False)
-    (line,) = [each for each in lines if each.split()[0] == "body"]
-    assert "6.5 MJ/kg" in line
-    assert "1.8 per mode" in line
 
 
 def test_a_body_stiffer_than_every_material_warns_and_a_plausible_one_does_not() -> None:
