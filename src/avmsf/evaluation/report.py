@@ -3,9 +3,9 @@
 import base64
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, product, zip_longest
+from itertools import chain, product, repeat, zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -105,22 +105,16 @@ def _is_text(cell: str) -> bool:
     return any(mark.isalpha() and mark != "e" for mark in cell)
 
 
-class StoredContact(NamedTuple):
-    """One test contact of an object with stored sounds: its recording, and the predictions of all methods."""
-
-    record: ObjectRecord
-    name: str
-    recorded: str
-    """The recording's file."""
-    made: list[tuple[CaseRecord, Outcome]]
+_StoredContact = tuple[str, str, list[tuple[CaseRecord, Outcome]]]
+"""A test contact with stored sounds: the recording's name and file, and the predictions of all methods."""
 
 
-def stored_contacts(record: ObjectRecord) -> Iterator[StoredContact]:
+def stored_contacts(record: ObjectRecord) -> Iterator[_StoredContact]:
     """Yield an object's contacts with stored sounds."""
     files = {name: file for case in reversed(record.cases) for name, file in case.sounds.items()}
     pairs = [(case, each) for case in record.cases for each in record.outcomes if each.case == case.key]
     for name, file in files.items():
-        yield StoredContact(record, name, file, [pair for pair in pairs if name in pair[1].sounds])
+        yield name, file, [pair for pair in pairs if name in pair[1].sounds]
 
 
 _Card = dict[str, str]
@@ -130,23 +124,24 @@ _Card = dict[str, str]
 def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[tuple[str, list[_Card]]]]:
     """Return contacts' names and sounds by the titles of their objects, as many as fit: one of each object first."""
     stored = [record for record in records if any(case.sounds for case in record.cases)]
-    chosen = [stored_contacts(stored[row]) for row in evenly_spaced(len(stored), MAX_PAGE_OBJECTS)]
+    shown = [stored[row] for row in evenly_spaced(len(stored), MAX_PAGE_OBJECTS)]
     found: dict[str, list[tuple[str, list[_Card]]]] = {}
     size = 0
-    for contact in filter(None, chain.from_iterable(zip_longest(*chosen))):
+    contacts = zip_longest(*(zip(repeat(record), stored_contacts(record)) for record in shown))
+    for facts, contact in filter(None, chain.from_iterable(contacts)):
         cards = list(_cards(contact, folder))
         size += sum(len(card["picture"]) + len(card["sound"]) for card in cards)
         if size > MAX_PAGE_CHARACTERS:
             break
-        facts = contact.record
         label = facts.name if facts.name in ("", facts.identifier) else f"{facts.identifier}: {facts.name}"
         title = ", ".join(filter(None, (label or facts.identifier, facts.material)))
-        found.setdefault(title, []).append((contact.name, cards))
+        found.setdefault(title, []).append((contact[0], cards))
     return found
 
 
-def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
-    recorded = StoredSound.read(folder / contact.recorded)
+def _cards(contact: _StoredContact, folder: Path) -> Iterator[_Card]:
+    name, file, made = contact
+    recorded = StoredSound.read(folder / file)
     loudest, seconds = float(picture_levels(recorded).max()), len(recorded.samples) / recorded.sample_rate
 
     def card(title: str, caption: str, sound: StoredSound) -> _Card:
@@ -155,16 +150,16 @@ def _cards(contact: StoredContact, folder: Path) -> Iterator[_Card]:
 
     band = "{:.0f} Hz to {:.0f} Hz".format(*_band(recorded.sample_rate))
     yield card(RECORDED, f"{seconds:.2g} s, {band}", recorded)
-    several = len({case.label for case, _ in contact.made}) > 1
-    for case, outcome in contact.made:
-        row = case.test.index(contact.name)
+    several = len({case.label for case, _ in made}) > 1
+    for case, outcome in made:
+        row = case.test.index(name)
         scores = [
             f"{entry.heading} {format_number(outcome.values[metric][row])}"
             for metric, entry in METRICS.items()
             if entry.function is not None and metric in outcome.values
         ]
         title = f"{outcome.method}, {case.label}" if several else outcome.method
-        yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[contact.name]))
+        yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[name]))
 
 
 def _band(sample_rate: float) -> tuple[float, float]:
@@ -236,13 +231,13 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> Iterator[Path]:
     labels = list(dict.fromkeys(case.label for case in record.cases if case.sounds))
     for label in labels:
         rows: dict[str, dict[str, Tensor]] = {}
-        for contact in stored_contacts(record):
-            made = {each.method: each.sounds[contact.name] for case, each in contact.made if case.label == label}
+        for recording, recorded, predicted in stored_contacts(record):
+            made = {each.method: each.sounds[recording] for case, each in predicted if case.label == label}
             if made:
-                files = {RECORDED: contact.recorded, **made}
+                files = {RECORDED: recorded, **made}
                 sounds = {name: StoredSound.read(folder / file) for name, file in files.items()}
                 rate = sounds[RECORDED].sample_rate
-                rows[contact.name] = {name: sound.samples for name, sound in sounds.items()}
+                rows[recording] = {name: sound.samples for name, sound in sounds.items()}
         if rows:
             methods = list(dict.fromkeys(method for row in rows.values() for method in row))
             name = record.identifier if len(labels) == 1 else f"{record.identifier} {file_word(label)}"
