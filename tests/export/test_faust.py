@@ -15,7 +15,7 @@ from avmsf.errors import ExportError
 from avmsf.export.faust import contacts_path, faust_library, write_faust
 from avmsf.export.sampled_field import SampledField
 from avmsf.modal.modes import ForcePulse
-from factories.made_tables import POINTS, RATE, SAMPLES, apart, table
+from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, table
 from factories.raising import raises
 
 DRIVER = Path(__file__).with_name("faust_driver.c")
@@ -109,9 +109,16 @@ def test_the_name_cannot_break_out_of_its_string():
     assert not any(re.match(r"\s*process", line) for line in lines)
 
 
-def test_too_many_numbers_and_other_endings_are_refused(tmp_path):
-    with raises(ExportError, name="numbers", value=160_000):
-        write_faust(table(points=40_000), tmp_path / "thing.dsp")
+def test_as_many_points_are_written_as_faust_compiles_unless_more_are_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr("avmsf.export.faust.MAX_NUMBERS", 20)
+    path = tmp_path / "thing.dsp"
+    with raises(ExportError, name="numbers", value=POINTS * MODES):
+        write_faust(table(), path, contacts=POINTS)
+    assert "5 of 9 contacts" in " ".join(write_faust(table(), path).remarks)
+    assert "points = 5;" in path.read_text()
+
+
+def test_other_endings_are_refused(tmp_path):
     with raises(ExportError, file="thing.cpp", name="suffix", value=".cpp"):
         write_faust(table(), tmp_path / "thing.cpp")
 

@@ -126,6 +126,7 @@ def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path, layers, orde
         ({"layers": (Layer(-1.0),)}, "force", -1.0),
         ({"layers": (Layer(contact_time=2.0),)}, "contact_time", 2.0),
         ({"seconds": 0.0}, "seconds", 0.0),
+        ({"range_db": -1.0}, "range_db", -1.0),
         ({"level_db": 6.0}, "level_db", 6.0),
     ],
 )

@@ -1,5 +1,6 @@
 """`avmsf export`: a field, or many, in the formats of other tools."""
 
+import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -17,13 +18,12 @@ from avmsf.cli.options import Flag, Int, Number, Unit, option_of
 from avmsf.cli.output import next_step, note, print_result
 from avmsf.cli.paths import ContactTable, FieldFiles, New, OtherCapture, PositionList, ShapeFile, arg
 from avmsf.errors import ExportError
-from avmsf.export.writing import POINTS, SUFFIXES, Axis, Format, Precision, check_free
+from avmsf.export.writing import FORMATS, Axis, Format, Precision, check_free
 from avmsf.modal.config import PulseShape
 from avmsf.pipeline.config import CACHE, SURFACE
 
 if TYPE_CHECKING:
     from avmsf.export.sampled_field import SampledField
-    from avmsf.export.writing import Written
     from avmsf.field.sound_field import SoundField
     from avmsf.mesh.surface import Surface
 
@@ -41,7 +41,7 @@ _USED: dict[Format, tuple[str, ...]] = {
 }
 """Options that each format uses, in addition to those that all use."""
 _NEXT: dict[str, str] = {
-    **dict.fromkeys(SUFFIXES["web"], "open {0} in a browser"),
+    **dict.fromkeys(FORMATS["web"].suffixes, "open {0} in a browser"),
     "web": "python -m http.server --directory {0}, then open http://localhost:8000 in a browser",
     "gltf": "open {0} in a glTF viewer",
     ".lib": 'in a Faust program beside it: library("{1}").strike(contact, force, contactTime, gate)',
@@ -51,8 +51,6 @@ _NEXT: dict[str, str] = {
     "avmsf-demo": "open {0} in the paper's web demo",
 }
 """What to do with the files of a suffix or a format, of the quoted path and of the file's name."""
-_DEAD_DB = 40.0
-"""Energy of a contact below the loudest one's, dB, from which on it is no key of a sample set by default."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ class Options(Many):
     def of(self, given: Path, output: Path) -> "Options":
         """Return the options for one of many fields."""
         capture = None if self.capture is None else self.capture / output.name
-        path = output.with_name(f"{output.name}{SUFFIXES.get(self.to, ('',))[0]}")
+        path = output.with_name(f"{output.name}{''.join(FORMATS[self.to].suffixes[:1])}")
         return replace(self, fields=(given,), output=path, capture=capture)
 
     def read(self) -> Iterator[Path]:
@@ -148,7 +146,7 @@ class Options(Many):
         if self.contacts is not None and self.contacts < 1:
             raise ExportError.expected("1 or more", self.contacts, name="--contacts")
         # A web page is a file or, by a name without its suffix, a folder.
-        suffixes = SUFFIXES.get(self.to, ())
+        suffixes = FORMATS[self.to].suffixes
         (New(suffixes, or_folder=self.to == "web") if suffixes else New()).check(self.output)
         check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
 
@@ -166,7 +164,7 @@ def run(options: Options) -> int:
         return run_many("export", options, raising=ExportError)
     from avmsf.export.faust import contacts_path
     from avmsf.export.samples import INSTRUMENT
-    from avmsf.export.write import WRITERS
+    from avmsf.export.write import writer_of
     from avmsf.field.store import load
 
     for each in fields(options):
@@ -174,7 +172,7 @@ def run(options: Options) -> int:
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
     source, settings = _prepared(load(options.field), options)
-    written: Written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
+    written = writer_of(options.to)(source, options.output, overwrite=options.overwrite, **settings)
     for remark in written.remarks:
         note(remark)
     if written.error:
@@ -216,12 +214,14 @@ def _prepared(field: "SoundField", options: Options) -> "_Prepared":
             shown, meters = _object(field, options)
             return _sampled(field, options), {"object": shown, "meters": meters, "up": options.up}
         case "faust":
-            return _faust(field, options)
+            sampled = _sampled(field, options)
+            asked = options.contacts is not None or options.contacts_given
+            return sampled, {"noise": not options.no_noise, "contacts": len(sampled) if asked else None}
         case "wavs":
             return _wavs(field, options)
         case "uff":
             return _sampled(field, options), {"functions": options.functions}
-        case _:
+        case "avmsf-demo":
             return _demo(field, options)
 
 
@@ -236,7 +236,7 @@ def _sampled(field: "SoundField", options: Options) -> "SampledField":
         expect_on_object(contacts, field)
         return SampledField.of(field, contacts.places, directions=contacts.directions)
     points = points_on_object(field.gain_field)
-    sampled = SampledField.of(field, points, limit=options.contacts or POINTS[options.to])
+    sampled = SampledField.of(field, points, limit=options.contacts or FORMATS[options.to].points)
     if len(sampled) < len(points) and options.contacts is None:
         held = counted(len(points), "contact")
         note(f"written: {len(sampled)} of the field's {held}; --contacts sets the number")
@@ -308,20 +308,8 @@ def _page_settings(field: "SoundField", options: Options) -> dict[str, Any]:
         "meters": meters,
         "surface": None if isinstance(source, Surface) else field.gain_field.surface,
         "strikes": None if recorded is None else read_capture(recorded).impacts,
-        "limit": options.contacts or POINTS["web"],
+        "limit": options.contacts or FORMATS["web"].points,
     }
-
-
-def _faust(field: "SoundField", options: Options) -> "_Prepared":
-    from avmsf.export.faust import fitted
-
-    sampled, noise = _sampled(field, options), not options.no_noise
-    if options.contacts is None and not options.contacts_given:
-        asked = len(sampled)
-        sampled, noise = fitted(sampled, noise=noise)
-        if len(sampled) < asked:
-            note(f"{len(sampled)} of these are written, as many as Faust compiles in reasonable time")
-    return sampled, {"noise": noise}
 
 
 def _demo(field: "SoundField", options: Options) -> "_Prepared":
@@ -329,7 +317,7 @@ def _demo(field: "SoundField", options: Options) -> "_Prepared":
     from avmsf.export.sampled_field import SampledField, spread_rows
     from avmsf.field.positions import points_on_object
 
-    source, most = options.object, options.contacts or POINTS["avmsf-demo"]
+    source, most = options.object, options.contacts or FORMATS["avmsf-demo"].points
     settings = {"variant": options.variant, "precision": options.precision}
     if source is None:
         return _sampled(field, options), settings
@@ -354,13 +342,6 @@ def _wavs(field: "SoundField", options: Options) -> "_Prepared":
         raise ExportError.expected(wanted, len(times), name="--contact-times")
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=False))
     sampled = _sampled(field, options)
-    if not options.contacts_given:
-        # Those that are heard beside the loudest.
-        level = 10 * sampled.energy.clamp_min(1e-300).log10()
-        loud = (level >= level.max() - _DEAD_DB).nonzero().flatten()
-        if len(loud) < len(sampled):
-            left = counted(len(sampled) - len(loud), "contact")
-            note(f"{left} left out, {_DEAD_DB:g} dB or more below the loudest; --position writes any")
-        sampled = sampled.take(loud)
     settings = {"layers": layers or hertz_layers(forces, options.pulse), "seconds": options.seconds}
-    return sampled, {**settings, "noise": not options.no_noise, "contacts": len(sampled)}
+    settings |= {"noise": not options.no_noise, "contacts": len(sampled)}
+    return sampled, settings | ({"range_db": math.inf} if options.contacts_given else {})

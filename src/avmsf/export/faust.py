@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Written, check_suffix, generator, write_files
+from avmsf.export.writing import FORMATS, Written, check_suffix, generator, write_files
 
 _MIN_POINTS = 16
 """Number of points below which the noise is left out so that more points fit."""
@@ -23,31 +23,41 @@ MAX_NUMBERS = 150_000
 """Maximum of all tables together: with 128 modes Faust compiles as many in half a minute."""
 
 
-def write_faust(field: SampledField, path: str | Path, *, noise: bool = True, overwrite: bool = False) -> Written:
+def write_faust(
+    field: SampledField, path: str | Path, *, contacts: int | None = None, noise: bool = True, overwrite: bool = False
+) -> Written:
     """Write a `.dsp` with controls, or a `.lib` without them, by the path's ending, and a table of the contacts.
 
     The table is `contacts_path(path)`: the coordinates of each `contact`, object frame, meters. Without `noise` only
-    the modes sound. Raises `ExportError` for another ending, and for more numbers than Faust compiles in reasonable
-    time.
+    the modes sound. More than `contacts` are reduced by farthest point sampling, by default to as many as Faust
+    compiles in reasonable time; then a noise so long that few would fit is left out. Raises `ExportError` for another
+    ending, and for `contacts` with more numbers than Faust compiles in reasonable time.
     """
     path = Path(path)
-    check_suffix(path, SUFFIXES["faust"])
-    with_noise = noise and bool(field.noise.any())
+    check_suffix(path, FORMATS["faust"].suffixes)
+    held, with_noise = len(field), noise and bool(field.noise.any())
+    if contacts is None:
+        contacts, with_noise = _compiled(field, noise=with_noise)
+    field = field if held <= contacts else field.take(field.spread(contacts))
     text = faust_library(field, noise=with_noise)
     if path.suffix == ".dsp":
         text += _CONTROLS
     remarks = ["all impacts share one bank of resonators; the force of an impact is half a sine over the contact time"]
     if not field.shared_damping:
         remarks.append("dampings are those of the last contact, for earlier impacts too")
-    if noise and with_noise:
+    if len(field) < held:
+        remarks.append(
+            f"{len(field)} of {held} contacts are written, evenly spread: Faust compiles few in reasonable time"
+        )
+    if with_noise:
         remarks.append("the noise restarts with every impact")
     elif field.noise.any():
         remarks.append("the residual noise is left out")
     rows = (
         ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
     )
-    contacts = "\n".join(["contact,x,y,z", *rows, ""])
-    contents = {path: text.encode(), contacts_path(path): contacts.encode()}
+    coordinates = "\n".join(["contact,x,y,z", *rows, ""])
+    contents = {path: text.encode(), contacts_path(path): coordinates.encode()}
     return Written(write_files(contents, overwrite=overwrite), tuple(remarks))
 
 
@@ -56,17 +66,13 @@ def contacts_path(path: Path) -> Path:
     return path.with_suffix(".contacts.csv")
 
 
-def fitted(field: SampledField, *, noise: bool = True) -> tuple[SampledField, bool]:
-    """Return the field at as many points as Faust compiles in reasonable time, and whether the noise is included.
-
-    The noise is left out if it is so long that few points would fit.
-    """
+def _compiled(field: SampledField, *, noise: bool) -> tuple[int, bool]:
+    """Return how many points Faust compiles in reasonable time, and whether with the noise or, as few fit, without."""
     at_a_point = max(1, _numbers_at_a_point(field))
     most = (MAX_NUMBERS - field.samples) // at_a_point
-    with_noise = noise and bool(field.noise.any()) and most >= min(_MIN_POINTS, len(field))
-    if not with_noise:
-        most = MAX_NUMBERS // at_a_point
-    return (field if len(field) <= most else field.take(field.spread(max(1, most)))), with_noise
+    if noise and most >= min(_MIN_POINTS, len(field)):
+        return most, True
+    return max(1, MAX_NUMBERS // at_a_point), False
 
 
 def _numbers_at_a_point(field: SampledField) -> int:

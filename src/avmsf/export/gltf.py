@@ -21,7 +21,7 @@ from torch import Tensor
 from avmsf.export.geometry import read_vertices
 from avmsf.export.one_phase import approximation_error, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Axis, Written, check_suffix, generator, no_modes, pack, write_files
+from avmsf.export.writing import FORMATS, Axis, Written, check_suffix, generator, no_modes, pack, write_files
 from avmsf.mesh.surface import Surface
 
 EXTENSION = "KHR_audio_rigid_bodies"
@@ -54,7 +54,7 @@ def write_gltf(
     `ExportError` for a name that does not end in .glb, a field without modes, and as `read_vertices`.
     """
     path = Path(path)
-    check_suffix(path, SUFFIXES["gltf"])
+    check_suffix(path, FORMATS["gltf"].suffixes)
     if not len(sampled.frequency):
         raise no_modes(path)
     damping, gains = shared_dampings(sampled), signed_amplitudes(sampled)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float32, Float64, Int
 from torch import Tensor
 
+from avmsf._utils.text import counted
 from avmsf.capture.audio import wav_bytes
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
@@ -65,20 +66,25 @@ def write_grid(
     layers: Sequence[Layer] = (Layer(),),
     seconds: float | None = None,
     level_db: float = -1.0,
+    range_db: float = 40.0,
     noise: bool = True,
     overwrite: bool = False,
 ) -> Written:
     """Write a float32 wav for every contact and layer, the table and the instrument.
 
-    More than `contacts`, of which each has a MIDI note, are reduced by farthest point sampling; each has one impact of
-    each of the `layers`, which are sorted by their level. Sounds last `seconds`, by default as long as the training
+    More than `contacts`, of which each has a MIDI note, are reduced by farthest point sampling; those whose modes have
+    `range_db` or more less energy than the loudest's are left out. Each has one impact of each of the `layers`, which
+    are sorted by their level. Sounds last `seconds`, by default as long as the training
     sounds, and have the residual noise unless `noise` is False. All are scaled by one factor, which the manifest names
     as `scale`, so that the loudest peaks at `level_db` relative to full scale. Raises `ExportError` for no layers,
     more contacts than MIDI has notes, and settings that are not positive.
     """
-    _check(contacts, layers, seconds, level_db, field.sample_rate)
+    _check(contacts, layers, seconds, level_db, range_db, field.sample_rate)
     rate = round(field.sample_rate)
     rows = torch.arange(len(field)) if len(field) <= contacts else field.spread(contacts)
+    energy_db = 10 * field.energy[rows].clamp_min(1e-300).log10()
+    quiet = energy_db < energy_db.max() - range_db
+    rows = rows[~quiet]
     samples = field.samples if seconds is None else max(1, round(seconds * rate))
     rendered = []
     for layer in layers:
@@ -113,13 +119,17 @@ def write_grid(
     manifest["pulses"] = [layer.shape for layer in ordered]
     sizes = write_folder(Path(folder), files, manifest, overwrite=overwrite)
     remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB"]
+    if quiet.any():
+        remarks.append(f"{counted(int(quiet.sum()), 'contact')} left out, {range_db:g} dB or more below the loudest")
     if ordered != list(layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)
         remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
     return Written(sizes, tuple(remarks))
 
 
-def _check(contacts: int, layers: Sequence[Layer], seconds: float | None, level_db: float, rate: float) -> None:
+def _check(
+    contacts: int, layers: Sequence[Layer], seconds: float | None, level_db: float, range_db: float, rate: float
+) -> None:
     most = HIGHEST_NOTE + 1 - LOWEST_NOTE
     checks = [
         ("contacts", contacts, 1 <= contacts <= most, f"1 to {most}, a MIDI note each from {LOWEST_NOTE}"),
@@ -127,6 +137,7 @@ def _check(contacts: int, layers: Sequence[Layer], seconds: float | None, level_
         *(("force", each.force, 0 < each.force < math.inf, "a number above 0") for each in layers),
         *(("contact_time", each.contact_time, 0 <= each.contact_time < 1, "0 to 1 s") for each in layers),
         ("seconds", seconds, seconds is None or 0 < seconds < math.inf, "more than 0"),
+        ("range_db", range_db, range_db >= 0, "0 dB or above"),
         ("level_db", level_db, -math.inf < level_db <= 0, "0 dB or below"),
         ("sample_rate", rate, rate >= 1 and rate == round(rate), "whole hertz for wav files"),
     ]

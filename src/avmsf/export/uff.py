@@ -21,7 +21,7 @@ from torch import Tensor
 from avmsf.errors import ExportError, from_extra
 from avmsf.export.one_phase import shared_dampings
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Written, check_suffix, generator, write_files
+from avmsf.export.writing import FORMATS, Written, check_suffix, generator, write_files
 
 _NORMAL_MODE, _COMPLEX_MODE = 2, 3
 _TRANSLATION = 2
@@ -41,7 +41,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     or .unv, and where pyuff is missing.
     """
     path = Path(path)
-    check_suffix(path, SUFFIXES["uff"])
+    check_suffix(path, FORMATS["uff"].suffixes)
     if functions < 0:
         raise ExportError.expected("0 or more", functions, name="functions")
     with from_extra("uff", "pyuff", raising=ExportError):

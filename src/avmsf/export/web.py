@@ -22,7 +22,7 @@ from typing import Any
 from avmsf.errors import ExportError
 from avmsf.export.bundle import Bundle, make_bundle
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import SUFFIXES, Written, generator, write_files, write_folder
+from avmsf.export.writing import FORMATS, Written, generator, write_files, write_folder
 from avmsf.field.sound_field import SoundField
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
@@ -61,7 +61,7 @@ def write_webpage(
     contacts. What exists is replaced only with `overwrite`.
     """
     output, bundle = Path(output), make_bundle(field, **options)
-    if output.suffix.lower() in SUFFIXES["web"]:
+    if output.suffix.lower() in FORMATS["web"].suffixes:
         return Written(write_files({output: single_file(bundle).encode()}, overwrite=overwrite), bundle.remarks)
     content = {**_needed(page_files(), bundle), **bundle.files}
     html = _titled(content["index.html"].decode(), bundle)

@@ -2,29 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
+from avmsf import export
 from avmsf.errors import ExportError
-from avmsf.export.faust import write_faust
-from avmsf.export.gltf import write_gltf
-from avmsf.export.paper_demo import write_demo
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.samples import write_grid
-from avmsf.export.uff import write_universal
-from avmsf.export.web import write_webpage
-from avmsf.export.writing import POINTS, SUFFIXES, Format, Written
+from avmsf.export.writing import FORMATS, Format, Written
 from avmsf.field.sound_field import SoundField
 
-_FORMATS: dict[str, Format] = {suffix: name for name, suffixes in SUFFIXES.items() for suffix in suffixes}
-WRITERS: dict[Format, Callable[..., Written]] = {
-    "web": write_webpage,
-    "gltf": write_gltf,
-    "faust": write_faust,
-    "avmsf-demo": write_demo,
-    "wavs": write_grid,
-    "uff": write_universal,
-}
-"""The writers, of a field at points of the object; the page's takes the field itself too."""
+_OF_SUFFIX: dict[str, Format] = {suffix: name for name, each in FORMATS.items() for suffix in each.suffixes}
 
 
 def write(
@@ -49,18 +35,24 @@ def write(
         ExportError: For an unknown ending, and as the writer.
     """
     output = Path(output)
-    kind = _FORMATS.get(output.suffix.lower()) if to is None else to
-    if kind is None or kind not in get_args(Format):
+    kind = _OF_SUFFIX.get(output.suffix.lower()) if to is None else to
+    if kind is None or kind not in FORMATS:
         raise ExportError.expected(
-            f"a name that ends in {', '.join(_FORMATS)}, or to= one of {', '.join(get_args(Format))}",
+            f"a name that ends in {', '.join(_OF_SUFFIX)}, or to= one of {', '.join(FORMATS)}",
             output.suffix if to is None else to,
             file=output,
             name="to",
         )
-    limit = POINTS[kind] if contacts is None else contacts
+    limit = FORMATS[kind].points if contacts is None else contacts
     if kind == "web":
-        return write_webpage(field, output, limit=limit, **options)
+        return export.write_webpage(field, output, limit=limit, **options)
     sampled = SampledField.of(field, limit=limit)
-    if kind == "wavs":
+    if kind == "wavs" or (kind == "faust" and contacts is not None):
         options = {"contacts": len(sampled), **options}
-    return WRITERS[kind](sampled, output, **options)
+    return writer_of(kind)(sampled, output, **options)
+
+
+def writer_of(kind: Format) -> Callable[..., Written]:
+    """Return the writer of a format, of a field at points of the object; the page's takes the field itself too."""
+    writer: Callable[..., Written] = getattr(export, FORMATS[kind].writer)
+    return writer

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Shaped
@@ -19,22 +19,27 @@ Precision = Literal["float16", "float32"]
 Axis = Literal["x", "y", "z"]
 MAX_POINTS = 20_000
 """Default number of contacts of a page: 20 MB with 128 modes."""
-POINTS: dict[Format, int] = {
-    "web": MAX_POINTS,
-    "gltf": 2000,
-    "faust": 64,
-    "avmsf-demo": 10_000,
-    "wavs": 16,
-    "uff": 1000,
+
+
+class Target(NamedTuple):
+    """What belongs to a format."""
+
+    writer: str
+    """Function of `avmsf.export`, see `write.writer_of`."""
+    points: int
+    """Default number of contacts, which its tools read quickly."""
+    suffixes: tuple[str, ...] = ()
+    """Of a format in one file; a page may be a folder too."""
+
+
+FORMATS: dict[Format, Target] = {
+    "web": Target("write_webpage", MAX_POINTS, (".html", ".htm")),
+    "gltf": Target("write_gltf", 2000, (".glb",)),
+    "faust": Target("write_faust", 64, (".dsp", ".lib")),
+    "avmsf-demo": Target("write_demo", 10_000),
+    "wavs": Target("write_grid", 16),
+    "uff": Target("write_universal", 1000, (".uff", ".unv")),
 }
-"""Default number of contacts of each format, which its tools read quickly."""
-SUFFIXES: dict[Format, tuple[str, ...]] = {
-    "web": (".html", ".htm"),
-    "gltf": (".glb",),
-    "faust": (".dsp", ".lib"),
-    "uff": (".uff", ".unv"),
-}
-"""Suffixes of the formats in one file; a page may be a folder too."""
 MANIFEST = "manifest.json"
 
 
