@@ -34,7 +34,7 @@ def _evaluate(
     if settings.quick:
         # Training with the paper's settings has no quick form.
         methods = ",".join(each for each in methods.split(",") if not each.startswith(("paper", "av-msf")))
-        options += ["modes=8", "body.dofs=2000"]
+        options += ["--set", "modes=8", "--set", "body.dofs=2000"]
     options += ["--time-zero", "peak"] * paper
     with ExitStack() as stack:
         folder = settings.results or Path(stack.enter_context(TemporaryDirectory()))
@@ -47,6 +47,8 @@ def _evaluate(
         words += ["--output", str(output), "--workers", str(os.cpu_count())]
         with redirect_stdout(sys.stderr):
             code = main(words)
+        if code > 128:
+            raise KeyboardInterrupt
         if code:
             raise RuntimeError(f"avmsf {' '.join(words)} ended with {code}")
         summary = json.loads((output / SUMMARY).read_text(encoding="utf-8"))

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
 from functools import cache
 
-from benchmarks.records import DASH, NAMES, REPOSITORY, Record, described, in_digits, markdown, parts_of, stored
+from benchmarks.records import DASH, NAMES, REPOSITORY, Record, described, in_digits, markdown, parts_of, row_of, stored
 
 STORED = REPOSITORY / "docs" / "benchmarks"
 PAGES = (REPOSITORY / "README.md", REPOSITORY / "docs" / "benchmarks.md")
@@ -77,14 +77,10 @@ def _parts(names: Sequence[str], options: Mapping[str, str], said: set[str]) -> 
         if text not in said:
             yield text
         said.add(text)
-        shown = [each for each in found if fnmatch(_row(each), options.get("rows", "*"))]
+        shown = [each for each in found if fnmatch(row_of(each), options.get("rows", "*"))]
         yield markdown(shown, options["columns"].split("; ") if "columns" in options else ())
         yield f"{_command([part])}, commit {_commits(found)}; [records](benchmarks/{part}.jsonl)"
     yield from _missing(names)
-
-
-def _row(record: Record) -> str:
-    return ", ".join(filter(None, (record.name.split(".", 2)[2].rpartition(".")[0], record.object)))
 
 
 def _results() -> Iterator[str]:

@@ -164,6 +164,12 @@ def store(found: Sequence[Record], path: Path) -> None:
     part.replace(path)
 
 
+def row_of(record: Record) -> str:
+    """Return the row of a part's table that a record belongs to: group and object."""
+    group = record.name.split(".", 2)[2].rpartition(".")[0]
+    return ", ".join(filter(None, (group, record.object))) or "all"
+
+
 def markdown(found: Sequence[Record], columns: Sequence[str] = ()) -> str:
     """Return a table of these columns, or one for all groups with the same; a row for each group and object of a part.
 
@@ -171,8 +177,7 @@ def markdown(found: Sequence[Record], columns: Sequence[str] = ()) -> str:
     """
     rows: dict[str, dict[str, Record]] = {}
     for each in found:
-        group, _, column = each.name.split(".", 2)[2].rpartition(".")
-        rows.setdefault(", ".join(filter(None, (group, each.object))), {})[column] = each
+        rows.setdefault(row_of(each), {})[each.name.rpartition(".")[2]] = each
     tables: dict[tuple[str, ...], dict[str, dict[str, Record]]] = {}
     for label, row in rows.items():
         tables.setdefault(tuple(columns or row), {})[label] = row

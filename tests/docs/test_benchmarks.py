@@ -27,6 +27,6 @@ def test_every_table_of_a_page_is_what_the_records_say(pages: ModuleType, name: 
 
 def test_the_page_has_every_part_and_no_records_are_of_none(pages: ModuleType) -> None:
     text = (REPOSITORY / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    marked = [part for found in pages.MARKED.finditer(text) for part in found[2].split(" | ")[0].split()]
-    assert sorted(marked) == sorted([*pages.parts(), "overview", "results"])
+    marked = {part for found in pages.MARKED.finditer(text) for part in found[2].split(" | ")[0].split()}
+    assert marked == {*pages.parts(), "overview", "results"}
     assert {path.stem for path in pages.STORED.iterdir()} <= set(pages.parts())
