@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--parts", nargs="+", metavar="PART", help="run only these")
     parser.add_argument("--output", type=Path, metavar="FOLDER", help="store the records, and skip parts stored there")
     parser.add_argument("--quick-look", dest="quick", action="store_true", help="small settings, to see that all runs")
-    parser.add_argument("--sim-20", dest="sim20", type=Path, help="objects that `avmsf simulate` has made of a set")
+    parser.add_argument("--sim-20", dest="sim20", type=Path, help="folder of simulated objects, made where missing")
     parser.add_argument("--objects", nargs="+", default=(), metavar="NAME", help="gains: some of these objects")
     parser.add_argument("--clouds", type=Path, help="gains, surface: folder that keeps Gaussians of these objects")
     parser.add_argument("--weights", type=Path, help="baselines: file for the weights of sonicgauss-small")

@@ -26,7 +26,7 @@ from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth
-from avmsf.simulate.recipe import ABLATED, SET, SETS
+from avmsf.simulate.recipe import ABLATED, SET
 from benchmarks import objects
 from benchmarks.ablation import ablation, outliers, supports
 from benchmarks.processes import timed
@@ -41,6 +41,8 @@ SIMPLE = {
 MIXTURE, UNREFINED = "mixture", "mixture, not refined"
 _IMPACTS = (8, 4, 2, 1)
 """Training contacts of the simulated objects."""
+_SETS = {"sim20": SET, "held-out": "held-out", "scans": "scans"}
+"""Sets of simulated objects by the names of their parts."""
 _SHIFTS = {"none": {}, "sensor": {"sensor": 0.0005}, "warming": {"warming": 0.002}}
 _POINTS = 1000
 """Points of the surface among which recordings are located."""
@@ -94,12 +96,13 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
 
     Contacts are farthest-point samples of 40, from the first. tidy: recordings that need no alignment; noisy: meshes
     whose vertices are off by .3 % of the size (standard deviation, each axis); photographs: shapes from 72 photographs;
-    offset: these, and contacts 2 mm off in random directions. modal: error of the modes alone against the true ones,
-    without noise; l1, l1_log, envelope: ratios to the mean of the three nearest, of which means are geometric; located:
-    median distance of held-out contacts from where their recordings are located, over the diagonal.
+    with the errors from the exact mesh and what they are over; offset: these shapes, and contacts 2 mm off in random
+    directions. modal: error of the modes alone against the true ones, without noise; l1, l1_log, envelope: ratios to
+    the mean of the three nearest, of which means are geometric; located: median distance of held-out contacts from
+    where their recordings are located, over the diagonal, and in millimeters.
     """
-    rows = []
-    for name in settings.objects or settings.some(tuple(SETS[of])):
+    rows, exact = [], []
+    for name in settings.objects or settings.some(tuple(objects.SETS[of])):
         capture, truth = objects.simulated(name, settings, objects.TIDY if condition == "tidy" else None)
         surface: Surface | ObjectShape = objects.surface_of(capture)
         if condition == "noisy":
@@ -107,6 +110,11 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
         elif condition in {"photographs", "offset"}:
             views, cloud = objects.views_and_gaussians(name, settings)
             surface = shape_of_cloud(cloud, views)
+            if condition == "photographs":
+                bodies = objects.bodies_of(objects.surface_of(capture), settings)
+                case = objects.SplitCase.of(*split(capture.impacts, _IMPACTS[0]), capture, bodies)
+                exact.append(_scores(case, truth, settings))
+                yield from records(exact[-1], group="mesh", object=name)
             capture = replace(capture, surface=surface.as_seen())
         if condition == "offset":
             capture = replace(capture, impacts=_moved(capture.impacts))
@@ -119,6 +127,8 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
         for each, count in zip(fewer, _IMPACTS[1:], strict=False):
             field = each.fit(MixtureEstimator(bodies=bodies), quick=settings.quick)
             rows[-1][f"error_{count}"] = each.error(field)
+        if exact:
+            rows[-1]["over_mesh"] = rows[-1]["error"] / exact[-1]["error"]
         yield from records(rows[-1], object=name)
     yield from records(means(rows, geometric=("l1", "l1_log", "envelope")), group="mean")
 
@@ -162,6 +172,7 @@ def _moved(impacts: Impacts) -> Impacts:
 def _scores(case: objects.SplitCase, truth: Truth, settings: Settings) -> dict[str, float]:
     """Return the values of one simulated object."""
     field = case.fit(MixtureEstimator(bodies=case.bodies), quick=settings.quick)
+    located, size = _located(field, case.test)
     scores, averaged = evaluate(field, case.test).mean(), evaluate(MeanWaveform(case.train), case.test).mean()
     return {
         "error": scores["relative_stft"],
@@ -169,17 +180,18 @@ def _scores(case: objects.SplitCase, truth: Truth, settings: Settings) -> dict[s
         "modal": _modal_error(field, case.test, truth),
         **{metric: scores[metric] / averaged[metric] for metric in ("l1", "l1_log", "envelope")},
         "coverage": case.coverage(field)[1],
-        "located": _located(field, case.test),
+        "located": located / size,
+        "located_millimeters": 1000.0 * located,
     }
 
 
-def _located(field: SoundField, test: Impacts) -> float:
-    """Return the median distance of held-out contacts from where their recordings are located, over the diagonal."""
+def _located(field: SoundField, test: Impacts) -> tuple[float, float]:
+    """Return the median distance of held-out contacts from where recordings are located, and the diagonal, meters."""
     points = field.gain_field.points
     size = float((points.amax(0) - points.amin(0)).norm())
     locator = Locator.of(field, points=points[farthest_points(points, min(_POINTS, len(points)))])
     positions = torch.stack([locator.locate(sound).position for sound in test.sounds])
-    return float((positions - test.contacts).norm(dim=1).median()) / size
+    return float((positions - test.contacts).norm(dim=1).median()), size
 
 
 def _modal_error(field: SoundField, test: Impacts, truth: Truth) -> float:
@@ -208,10 +220,9 @@ def _speed(settings: Settings) -> Iterator[Record]:
 
 PARTS: dict[str, Measurement] = {
     "captures": _captures,
-    "sim20": _simulated,
-    **{f"sim20-{each}": partial(_simulated, condition=each) for each in ("tidy", "noisy", "photographs", "offset")},
-    "held-out": partial(_simulated, of="held-out"),
-    "held-out-photographs": partial(_simulated, condition="photographs", of="held-out"),
+    **{name: partial(_simulated, of=of) for name, of in _SETS.items()},
+    **{f"{name}-photographs": partial(_simulated, condition="photographs", of=of) for name, of in _SETS.items()},
+    **{f"sim20-{each}": partial(_simulated, condition=each) for each in ("tidy", "noisy", "offset")},
     "drift": _drift,
     "ablation": ablation,
     "outliers": outliers,

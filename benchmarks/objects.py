@@ -36,10 +36,11 @@ from avmsf.photographs.cameras import View
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from avmsf.reconstruction import ObjectShape
+from avmsf.simulate import recipe
 from avmsf.simulate.ground_truth import Truth, read_truth
-from avmsf.simulate.recipe import EXAMPLE_FOLDER, named_recipe
+from avmsf.simulate.recipe import EXAMPLE_FOLDER, ObjectRecipe
 from avmsf.simulate.simulation import simulate_object
-from avmsf.simulate.simulation_folder import example_mesh
+from avmsf.simulate.simulation_folder import example_mesh, simulate_set
 from avmsf.symmetry.characters import groups_of
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
@@ -60,6 +61,18 @@ _POINTS = 8192
 """Points of an object that the gain field looks contacts up in."""
 _BEFORE_NEXT_SECONDS = 0.002
 """How long before the next push's rise past 15 % of the first a clip is cut."""
+SHARED = (REPOSITORY / os.environ.get("AVMSF_SHARED", "../shared")).resolve() / "data"
+"""Measured data: `data` in what AVMSF_SHARED names."""
+SCANS = {
+    name: ObjectRecipe(mesh=SHARED / "meshes" / name / "textured.obj", material=material)
+    for name, material in (
+        ("blue_cup", "ceramic"), ("bowl", "steel"), ("mini_claw_hammer_1", "steel"), ("mug", "ceramic"),
+        ("plate_holder", "wood"), ("spoon", "steel"),
+    )
+}  # fmt: skip
+"""Six scans of household objects. All have both sides of their walls, and so are solid bodies: of no stated wall."""
+SETS = recipe.SETS | {"scans": SCANS}
+"""Recipes of the sets of simulated objects."""
 TIDY = {"speed": 0.15, "contact_time": 0.0, "pretrigger": 0.0, "jitter": 0.0, "propagation": 0.0}
 
 
@@ -105,11 +118,10 @@ IMPULSE = PlateCase(Plate(), contact_time=0.0)
 
 
 def shared_data() -> Path:
-    """Return the folder of measured data: `data` in what AVMSF_SHARED names, by default ../shared."""
-    folder = (REPOSITORY / os.environ.get("AVMSF_SHARED", "../shared")).resolve() / "data"
-    if not folder.is_dir():
-        raise MissingDataError(f"no measured data at {folder}: set AVMSF_SHARED to the folder that holds data/")
-    return folder
+    """Return the folder of measured data."""
+    if not SHARED.is_dir():
+        raise MissingDataError(f"no measured data at {SHARED}: set AVMSF_SHARED to the folder that holds data/")
+    return SHARED
 
 
 def settings_of(name: str) -> CaptureSettings:
@@ -151,23 +163,33 @@ def clips_in_place(name: str, *, highpass: float = 0.0) -> dict[str, tuple[Float
 
 
 def simulated(name: str, settings: Settings, imperfections: Mapping[str, float] | None = None) -> tuple[Capture, Truth]:
-    """Return a simulated object and its truth, from the folder, or simulated now with other imperfections."""
+    """Return an object of `SETS` and its truth, from the folder, or simulated now with other imperfections."""
     if settings.sim20 is not None and imperfections is None:
-        return read_capture(settings.sim20 / name), read_truth(settings.sim20 / name)
-    recipe = named_recipe(name)
-    recipe = replace(recipe, imperfections=replace(recipe.imperfections, **imperfections or {}))
-    made = simulate_object(recipe, name=name)
-    return made.capture, made.truth
+        folder = simulated_folder(name, settings)
+        return read_capture(folder), read_truth(folder)
+    made = _recipe(name)
+    made = replace(made, imperfections=replace(made.imperfections, **imperfections or {}))
+    simulation = simulate_object(made, name=name)
+    return simulation.capture, simulation.truth
+
+
+def simulated_folder(name: str, settings: Settings) -> Path:
+    """Return the folder of an object of `SETS` with its pictures, simulated now where it does not exist."""
+    if settings.sim20 is None:
+        raise MissingDataError("expected --sim-20 FOLDER, which keeps simulated objects and their pictures")
+    if not (settings.sim20 / name).exists():
+        simulate_set({name: _recipe(name)}, settings.sim20)
+    return settings.sim20 / name
+
+
+def _recipe(name: str) -> ObjectRecipe:
+    return SCANS[name] if name in SCANS else recipe.named_recipe(name)
 
 
 def views_and_gaussians(name: str, settings: Settings) -> tuple[tuple[View, ...], GaussianCloud]:
     """Return the photographs of a simulated object and its Gaussians, which `--clouds` keeps."""
-    if settings.sim20 is None:
-        raise MissingDataError(
-            "expected --sim-20 FOLDER with the objects and their pictures; avmsf simulate makes them"
-        )
     config = replace(SplatConfig(), steps=200) if settings.quick else SplatConfig()
-    views = read_views(settings.sim20 / name)
+    views = read_views(simulated_folder(name, settings))
     if settings.clouds is None:
         return tuple(views), splat(views, config)
     path = settings.clouds / f"{name}{'-200-steps' * settings.quick}.ply"

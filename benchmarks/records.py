@@ -30,6 +30,7 @@ KINDS: dict[str, tuple[str, Better]] = {
     "megabytes": ("MB", "lower"),
     "mebibytes": ("MiB", "lower"),
     "bytes": ("B", "lower"),
+    "millimeters": ("mm", "lower"),
     "hertz": ("Hz", ""),
     "db": ("dB", ""),
     "degrees": ("degrees", "lower"),
