@@ -95,6 +95,24 @@ def test_a_thin_plate_seen_from_both_sides_keeps_its_thickness() -> None:
     assert mesh.volume == pytest.approx(np.prod(sides), rel=0.2)
 
 
+def test_no_plate_is_a_frame_through_which_a_view_would_look() -> None:
+    sides = (0.2, 0.06, 0.006)
+    plate = _shape(trimesh.creation.box(sides))
+    assert plate.supposed
+    assert plate.thickness_range is None
+    assert mesh_of(plate.solid()).volume == pytest.approx(np.prod(sides), rel=0.1)
+
+
+def test_a_slender_shape_has_a_shell_below_a_face_that_may_be_open() -> None:
+    # Half a rod that lies on its round side: cells are much smaller than the flat face is wide.
+    rod = trimesh.creation.cylinder(radius=0.02, height=0.2, sections=96)
+    half = trimesh.PointCloud(rod.vertices[rod.vertices[:, 1] < 1e-9]).convex_hull
+    shape = object_surface(views_of(half), depth_of(half))
+    assert (shape.supposed, int(shape.hollow.max())) == (True, 1)
+    wall, area = 0.002, np.pi * 0.02 * 0.2 + np.pi * 0.02**2
+    assert mesh_of(shape.shell(wall)).volume == pytest.approx(area * wall, rel=0.15)
+
+
 def test_views_that_alone_look_through_a_channel_keep_their_masks() -> None:
     length, width, height = 0.12, 0.05, 0.03
     sides = [((0.0, 0.0, -height / 2), (length, width, WALL))]
@@ -149,9 +167,13 @@ def test_the_digest_is_of_all_that_decides_the_surfaces(cup_shape: ObjectShape) 
 
 @pytest.fixture(scope="module")
 def block() -> ObjectShape:
-    """Return a cylinder as views show it; a tube whose ends are covered looks the same."""
+    """Return a cylinder as low views show it; a tube looks the same, through both of whose ends none sees."""
+    return _cylinder(elevations=(0.0, 15.0, -15.0))
+
+
+def _cylinder(**look: object) -> ObjectShape:
     solid = trimesh.creation.cylinder(radius=0.03, height=0.05, sections=96)
-    return object_surface(views_of(solid), depth_of(solid), cells=COARSE)
+    return object_surface(views_of(solid, **look), depth_of(solid), cells=COARSE)
 
 
 def test_both_ends_of_a_cylinder_may_be_open(block: ObjectShape) -> None:
@@ -175,11 +197,14 @@ def test_the_wall_around_a_supposed_cavity_is_a_tube(block: ObjectShape, wall: f
 
 def test_a_supposed_cavity_may_be_closed_all_round(block: ObjectShape, cup_shape: ObjectShape) -> None:
     wall = 0.004
-    mesh = mesh_of(block.closed().shell(wall))
-    assert mesh.is_watertight
-    assert mesh.euler_number == 4
     within = np.pi * (0.03 - wall) ** 2 * (0.05 - 2 * wall)
-    assert mesh.volume == pytest.approx(np.pi * 0.03**2 * 0.05 - within, rel=0.1)
+    # Of steeper views some would look through both ends.
+    for shape in (block.closed(), _cylinder()):
+        mesh = mesh_of(shape.shell(wall))
+        assert mesh.is_watertight
+        assert mesh.euler_number == 4
+        assert mesh.volume == pytest.approx(np.pi * 0.03**2 * 0.05 - within, rel=0.1)
+        assert shape.closed() is None
     assert cup_shape.closed() is None
 
 

@@ -90,13 +90,14 @@ class ObjectShape:
         return self._enclose(self.seen, self.grid, 2 * MAX_FACES)
 
     def closed(self) -> "ObjectShape | None":
-        """Return the shape around a cavity without an opening, where one is supposed; None where nothing is so thick.
+        """Return the shape around a cavity without an opening; None unless it is thick enough and has supposed ones.
 
         Bottles are such bodies, but for a mouth too narrow to be seen into.
         """
         within = np.where(self.outer > 0, distance_from(self.outer) * np.float32(self.grid.spacing), np.float32(0.0))
         deep = within > _MIN_HALF_THICKNESS * self.diagonal
-        return replace(self, hollow=deep.astype(np.int32)) if self.supposed and deep.any() else None
+        possible = self.supposed and self._lids.any() and deep.any()
+        return replace(self, hollow=deep.astype(np.int32)) if possible else None
 
     def shell(self, thickness: float, *, faces: int = MAX_FACES) -> Surface:
         """Return the body whose walls around its cavities are `thickness` meters thick, measured from outside.
@@ -117,7 +118,9 @@ class ObjectShape:
         # Both sides are drawn by themselves, so a wall may be thinner than a cell.
         values = np.minimum(self._signed_depth - np.float32(thickness), -empty)
         grid = Grid(self.grid.lowest - self.grid.spacing, self.grid.spacing, tuple(each + 2 for each in values.shape))
-        cavity = self._enclose(np.pad(values, 1, constant_values=-self.grid.spacing), grid, faces)
+        # Above a lid cells are as far from the wall as below it, up to the grid's edge.
+        edge = -max(self.grid.spacing, float(values.max()))
+        cavity = self._enclose(np.pad(values, 1, constant_values=edge), grid, faces)
         left = difference(self.solid(faces=faces), cavity)
         if not len(left.faces):
             wanted = "a wall thickness in meters that can be represented"

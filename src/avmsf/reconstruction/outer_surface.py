@@ -1,16 +1,17 @@
 """From masks and depth of many views to an object's shape."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import compress
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.visibility import DepthMap
-from avmsf.photographs.cameras import View
+from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.visual_hull import Grid, masked_views, no_common_point, object_extent, touches_edge
 from avmsf.reconstruction.depth_fusion import free_space
 from avmsf.reconstruction.distance import depth_in_convex_hull
@@ -38,6 +39,8 @@ _MIN_AREA_RATIO = 0.7
 """Area of such a face over that of the largest, from which on both are openings or neither: the ends of a tube."""
 _MIN_FACE_RATIO = 0.02
 """Part of the surface that a face must be for a supposed opening."""
+_LINES_PER_VIEW = 64
+"""Lines through openings that are followed, about."""
 _MIN_CAVITY_DEPTH = 0.08
 """Depth below its lid, over the diagonal, from which on what is free is a cavity."""
 _MIN_CAVITY_VOLUME = 0.08
@@ -82,7 +85,10 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     # Beside cavities that were seen, what depth carves is its scatter.
     outer = seen if supposed else bound
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
-    return ObjectShape(grid, outer, seen, hollow, supposed, diagonal, ShapeReport(rejected, offset, unseen))
+    shape = ObjectShape(grid, outer, seen, hollow, supposed, diagonal, ShapeReport(rejected, offset, unseen))
+    if supposed and _seen_through(hollow, seen > 0, cameras, grid):
+        return shape.closed() or replace(shape, hollow=np.zeros_like(hollow))
+    return shape
 
 
 def _rough(
@@ -140,6 +146,29 @@ def _unobserved_cavities(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.
     numbers = np.zeros(count + 1, dtype=np.int32)
     numbers[large] = np.arange(1, len(large) + 1)
     return numbers[label]
+
+
+def _seen_through(
+    openings: Int[np.ndarray, "x y z"], inside: Bool[np.ndarray, "x y z"], cameras: Sequence[Camera], grid: Grid
+) -> bool:
+    """Whether a view through one of the openings would look out through another: its mask would show that."""
+    rows = np.argwhere(openings > 0)
+    rows = rows[:: max(1, len(rows) // _LINES_PER_VIEW)]
+    steps = np.arange(-sum(grid.shape), sum(grid.shape) + 1)[:, None]
+    shape = np.array(grid.shape)
+    for camera in cameras:
+        ways = rows - (camera.position.double().cpu().numpy() - grid.lowest) / grid.spacing
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        cells = np.rint(rows[:, None] + steps * ways[:, None]).astype(int)
+        cells[~((cells >= 0) & (cells < shape)).all(2)] = 0
+        within = inside[tuple(cells.T)].T
+        numbers = openings[tuple(cells.T)].T
+        first, last = within.argmax(1), within.shape[1] - 1 - within[:, ::-1].argmax(1)
+        line = np.arange(len(rows))
+        one, other = numbers[line, first], numbers[line, last]
+        if ((within.sum(1) == last - first + 1) & (one > 0) & (other > 0) & (one != other)).any():
+            return True
+    return False
 
 
 def _closed(
