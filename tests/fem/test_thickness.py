@@ -28,8 +28,7 @@ def searched(
     def evidence(known: Sequence[CandidateBody]) -> list[float]:
         return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
 
-    def make(wall: float, *, closed: bool) -> CandidateBody | None:
-        assert not closed
+    def make(like: CandidateBody, wall: float) -> CandidateBody | None:
         asked.append(wall)
         return walled(wall) if made else None
 
@@ -81,16 +80,15 @@ def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable()
 def test_of_open_and_closed_walls_those_like_the_most_probable_one_are_searched() -> None:
     asked: list[bool] = []
 
-    def make(wall: float, *, closed: bool) -> CandidateBody:
-        asked.append(closed)
-        return replace(bodies()[0], thickness=wall, closed=closed)
+    def make(like: CandidateBody, wall: float) -> CandidateBody:
+        asked.append(like.closed)
+        return replace(like, thickness=wall)
 
     def evidence(known: Sequence[CandidateBody]) -> list[float]:
         true = {False: 0.0011, True: 0.0029}
         return [normal(true[body.closed], 0.2)(math.log(body.thickness)) - 20.0 * (not body.closed) for body in known]
 
-    both = [make(wall, closed=closed) for closed in (False, True) for wall in GRID]
-    asked.clear()
+    both = [replace(bodies()[0], thickness=wall, closed=closed) for closed in (False, True) for wall in GRID]
     found, thickness = search_thickness(both, evidence, make)
     assert thickness.median == pytest.approx(0.0029, rel=0.03)
     assert asked

@@ -122,8 +122,8 @@ class CandidateBodies:
         """Return the modes of a body on any support, with few elements; None where they cannot be computed."""
         return None
 
-    def with_thickness(self, thickness: float, *, closed: bool = False) -> CandidateBody | None:
-        """Return the body with a wall of a thickness, meters, open or closed; None where that fails."""
+    def with_thickness(self, body: CandidateBody, thickness: float) -> CandidateBody | None:
+        """Return a body that differs in its wall's thickness, meters; None where that fails."""
         return None
 
     def digest(self) -> str:
@@ -262,13 +262,13 @@ class SurfaceBodies(CandidateBodies):
             self._log(f"{body.name}: no supports tested: {error}")
             return None
 
-    def with_thickness(self, thickness: float, *, closed: bool = False) -> CandidateBody | None:
-        """Return the body with a wall of this thickness, meters, coarse as of several; None if that fails.
+    def with_thickness(self, body: CandidateBody, thickness: float) -> CandidateBody | None:
+        """Return a body like another with a wall of this thickness, meters, coarse as of several; None if that fails.
 
         `log` is called with the reason.
         """
-        if closed and self._closed is not None:
-            return self._closed.with_thickness(thickness)
+        if body.closed and self._closed is not None:
+            return self._closed.with_thickness(body, thickness)
         try:
             return self._body(thickness, fine=False)
         except SimulationError as error:

@@ -51,14 +51,14 @@ class ThicknessPosterior:
 def search_thickness(
     bodies: Sequence[CandidateBody],
     evidence: Callable[[Sequence[CandidateBody]], Sequence[float]],
-    with_wall: Callable[..., CandidateBody | None],
+    with_wall: Callable[[CandidateBody, float], CandidateBody | None],
 ) -> tuple[list[CandidateBody], ThicknessPosterior | None]:
     """Return the bodies that are not improbable, the most probable one first, and the posterior of the thickness.
 
-    `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body with a wall
-    of a thickness in meters, `closed` or not, None where that fails, and another thickness is tried then. Of open and
-    closed walls only those like the most probable one are searched. There is no posterior where a body without a wall
-    is the most probable one, or where fewer than two thicknesses are known.
+    `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body like
+    another with a wall of a thickness in meters, None where that fails, and another thickness is tried then. Of open
+    and closed walls only those like the most probable one are searched. There is no posterior where a body without a
+    wall is the most probable one, or where fewer than two thicknesses are known.
     """
     found, failed = dict(zip(bodies, evidence(bodies), strict=True)), list[float]()
     thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - TOLERANCES.max_extension
@@ -70,7 +70,7 @@ def search_thickness(
         wall = _next(known, values, np.log(failed), thinnest=thinnest)
         if wall is None:
             break
-        body = with_wall(wall, closed=best.closed)
+        body = with_wall(best, wall)
         if body is None:
             failed.append(wall)
             continue
