@@ -62,14 +62,14 @@ DISCREPANCY = 0.2
 mean square log ratio to the truth over 11 simulated walls from photographs (most are .82 to .94, one is 1.4)."""
 
 
-def factor_range(*, thickness_known: bool = False) -> tuple[float, float]:
+def factor_range() -> tuple[float, float]:
     """Return the least and the largest factor on the frequencies of a body of `NOMINAL` that can be a material's.
 
     A body's frequencies go with sqrt(E / rho): those of the table, with what makes frequencies of real bodies differ
     from those of even ones (`MAX_FREQUENCY_ERROR`). Bending frequencies also go with the thickness, which may be off by
-    the `DISCREPANCY` unless it is known.
+    the `DISCREPANCY`, as that of a scan or a measured wall may.
     """
-    uncertain = (1.0 + MAX_FREQUENCY_ERROR) * (1.0 if thickness_known else 1.0 + DISCREPANCY)
+    uncertain = (1.0 + MAX_FREQUENCY_ERROR) * (1.0 + DISCREPANCY)
     low, high = (math.sqrt(each.young / each.density * NOMINAL.density / NOMINAL.young) for each in (SOFTEST, STIFFEST))
     return low / uncertain, high * uncertain
 

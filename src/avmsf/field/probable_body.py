@@ -85,17 +85,15 @@ class ProbableBody:
     def warning(self) -> str:
         """Say that the surface's unit is another one, or the body stiffer than any material of the table; else empty.
 
-        With the margin of `factor_range`, at which the search for a wall ends.
+        With the margin of `factor_range`, beyond which no factor has a prior.
         """
         if self.unit:
             return (
                 f"The unit of the mesh is probably {self.unit}, by the frequencies of the modes: write "
                 f'unit = "{self.unit}" in capture.toml, or state the present unit there as surface_unit.'
             )
-        searched = self.wall_interval is not None
-        # A search allows no larger factor: one that is within a step of the grid would have been larger.
-        step = 1.0 + FREQUENCY_ERRORS[0] if searched else 1.0
-        if math.sqrt(self.stiffness_ratio) * step <= factor_range(thickness_known=not searched)[1]:
+        # No larger factor is allowed: one that is within a step of the grid would have been larger.
+        if math.sqrt(self.stiffness_ratio) * (1.0 + FREQUENCY_ERRORS[0]) <= factor_range()[1]:
             return ""
         over = self._ratio / (STIFFEST.young / STIFFEST.density)
         wrong, measure = "body", "check the unit of the mesh"
