@@ -17,9 +17,9 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
 from avmsf.localization.locator import Locator
 from avmsf.mesh import Surface
+from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize

@@ -27,7 +27,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual

@@ -12,7 +12,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.alignment import align
 from avmsf.modal.extraction.extract import extract_modes
 from avmsf.pipeline.bodies import candidate_bodies

@@ -23,7 +23,7 @@ from avmsf.evaluation.splits import (
     evenly_spaced,
     split,
 )
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from factories.plate_field import plate_impacts
 from factories.raising import raises
 

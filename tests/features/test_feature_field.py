@@ -7,7 +7,7 @@ import torch
 
 from avmsf.errors import FitError, SceneError
 from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
-from avmsf.gaussians.points import cluster, lattice
+from avmsf.mesh.points import cluster, lattice
 from avmsf.mesh.surface import Surface
 from factories.raising import raises
 

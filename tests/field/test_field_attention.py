@@ -9,7 +9,7 @@ import torch
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import AttentionShape
 from avmsf.field.gains.attention import AttentionGains
-from avmsf.gaussians.points import cluster
+from avmsf.mesh.points import cluster
 
 SHAPE = AttentionShape(clusters=5, bands=3, width=8, hidden=12, layers=2, feature_scale=4.0)
 GAIN_SCALE = torch.tensor([1.0, 0.5, 0.0, 20.0])

@@ -118,7 +118,7 @@ def mode_levels(field: "SoundField") -> "Float[Tensor, ' modes']":
 def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:
     """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
     from avmsf.field.posterior import has_posterior, relative_gain_std, spectrum_band
-    from avmsf.gaussians.points import farthest_points
+    from avmsf.mesh.points import farthest_points
     from avmsf.pipeline.record import modes_words
     from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
     from avmsf.plotting.spectrograms import draw_spectrograms

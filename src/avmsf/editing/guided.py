@@ -21,7 +21,7 @@ from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from avmsf.modal.config import scaled_fft_size
 
 _DEVIATIONS = {"shift": 0.05, "damping_shift": 0.3, "scale": 1.0}

@@ -16,9 +16,9 @@ from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.task import Renderer
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
+from avmsf.mesh.points import farthest_points
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.finders import ShortTime
 

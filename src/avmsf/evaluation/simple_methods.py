@@ -23,7 +23,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.task import Amplitudes, Contacts, Sounds
 from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites
-from avmsf.gaussians.points import nearest_points
+from avmsf.mesh.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank

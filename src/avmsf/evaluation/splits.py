@@ -16,7 +16,7 @@ from avmsf._utils.text import counted
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import EvaluationError, ExtractionError
-from avmsf.gaussians.points import closest_points, farthest_points
+from avmsf.mesh.points import closest_points, farthest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 
 Recordings = TypeVar("Recordings", bound=Capture | Impacts)

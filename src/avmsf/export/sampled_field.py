@@ -14,8 +14,8 @@ from avmsf._utils.arrays import fibonacci_sphere
 from avmsf.errors import ExportError
 from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.neighborhoods import read_neighborhoods
-from avmsf.gaussians.points import farthest_points, nearest_points
+from avmsf.mesh.neighborhoods import read_neighborhoods
+from avmsf.mesh.points import farthest_points, nearest_points
 from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf._utils.arrays import Seed, generator_of, short_repr
+from avmsf._utils.arrays import Seed, short_repr
 from avmsf.errors import FitError, SceneError
-from avmsf.gaussians.points import cluster, lattice, nearest_points, sample_surface
-from avmsf.mesh.surface import Surface
+from avmsf.mesh.points import cluster, lattice, nearest_points
+from avmsf.mesh.surface import Surface, sample_surface
 
 GEOMETRY = "geometry"
 """The encoder's name where features are the points' own positions: the paper's row without visual input."""
@@ -41,7 +41,7 @@ class FeatureField:
         """
         if len(surface.faces) == 0:
             return cls.from_points(surface.vertices)
-        return cls.from_points(sample_surface(surface.vertices, surface.faces, count, generator=generator_of(seed)))
+        return cls.from_points(sample_surface(surface, count, seed=seed))
 
     @classmethod
     def from_points(cls, points: Float[Tensor, "points 3"]) -> "FeatureField":

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf.errors import SceneError
 from avmsf.features.feature_field import FeatureField
-from avmsf.gaussians.neighborhoods import read_neighborhoods
+from avmsf.mesh.neighborhoods import read_neighborhoods
 from avmsf.symmetry.symmetries import Symmetries
 
 DEFAULT_ITERATIONS = 3

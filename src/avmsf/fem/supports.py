@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from avmsf.errors import SimulationError
 from avmsf.fem.eigen import PENDULUM, Vibrations, factorize, orthonormal
 from avmsf.fem.elements import SecondOrder
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 
 Place = tuple[float, float, float]
 FREE = "free"

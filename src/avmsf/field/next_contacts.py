@@ -18,7 +18,7 @@ from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
 from avmsf.field.posterior import energy_of, fitted_mixture
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 
 MAX_POINTS = 400
 """Points of the surface that the expected error is summed over, and that are candidates unless others are given."""

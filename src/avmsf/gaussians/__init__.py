@@ -6,7 +6,6 @@ images, depth maps and the points that a camera sees (`visibility`) of it.
 `fit.splat` is 3D Gaussian Splatting (Kerbl et al. 2023): Gaussians start on the `visual_hull` (`initialize`), images of
 them are compared with the photographs (`targets`, SSIM of Wang et al. 2004 in `ssim`), Adam (Kingma & Ba 2015) changes
 them, adaptive density control adds and splits them (`densify`), and those that are not the object's go (`prune`).
-`points` and `neighborhoods` hold what needs no more than positions: farthest points, k-means, normals.
 
 How a Gaussian's gradient is computed on a CPU, and where: `rasterizer.devices.NumbaRasterizer` is two functions of
 PyTorch's autograd, whose loops numba compiles.

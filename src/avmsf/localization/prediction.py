@@ -14,8 +14,8 @@ from torch import Tensor
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.posterior import fitted_mixture, has_posterior, scale_of
 from avmsf.field.sound_field import SoundField
-from avmsf.gaussians.points import farthest_points
 from avmsf.localization.likelihood import Likelihood, PredictedGains
+from avmsf.mesh.points import farthest_points
 
 _BATCH = 2048
 """Points whose gains are asked for at once."""

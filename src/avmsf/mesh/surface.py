@@ -1,6 +1,7 @@
 """The object's shape, as triangles or as points; points all over it, and the part that contacts lie on."""
 
 import hashlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_vectors
+from avmsf._utils.arrays import ArrayLike, Seed, as_vectors, generator_of
 from avmsf.errors import ArrayError, CaptureError
 
 SurfaceKind = Literal["ply", "obj", "glb"]
@@ -97,12 +98,28 @@ def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") ->
     shape.export(path, file_type=kind)
 
 
+def sample_surface(surface: Surface, count: int, *, seed: Seed) -> Float[Tensor, "points 3"]:
+    """Draw `count` points from the triangles, evenly by area, in the vertices' dtype.
+
+    Raises CaptureError for a surface without area, from which no point can be drawn.
+    """
+    # Takes half a second to import, which what reads no mesh does without.
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.vertices.double().cpu().numpy(), surface.faces.cpu().numpy(), process=False)
+    if not (math.isfinite(mesh.area) and mesh.area > 0.0):
+        got = f"{mesh.area:g} m² of {len(surface.vertices)} vertices, {len(surface.faces)} faces"
+        raise CaptureError.expected("triangles with an area", float(mesh.area), got=got, name="surface")
+    number = int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed)))
+    places = trimesh.sample.sample_surface(mesh, count, seed=number)[0]
+    return torch.from_numpy(np.asarray(places)).to(surface.vertices)
+
+
 def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tensor, "points 3"]:
     """Return points all over a surface, always the same: `count` on its triangles, evenly by area, and its vertices."""
     vertices = surface.vertices.double()
     if not len(surface.faces):
         return vertices
-    # Takes half a second to import, which what reads no mesh does without.
     import trimesh
 
     mesh = trimesh.Trimesh(vertices.numpy(), surface.faces.numpy(), process=False)

@@ -17,9 +17,8 @@ from avmsf.features.feature_field import FeatureField, expect_varied, reduce, re
 from avmsf.features.lift import Lifted, by_presence, by_visibility, lift, lift_points, supported
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.points import sample_surface
 from avmsf.gaussians.visibility import depth_of_surface
-from avmsf.mesh.surface import Surface
+from avmsf.mesh.surface import Surface, sample_surface
 from avmsf.photographs.cameras import View
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.symmetry.find import find_symmetries
@@ -60,8 +59,7 @@ def lift_features(
     inpainted = config.encoder_background == "inpainted"
     if isinstance(shape, GaussianCloud):
         return supported(lift(shape, views, encoder, weighting=weighting, inpainted=inpainted, progress=progress))
-    generator = torch.Generator().manual_seed(config.seed)
-    points = sample_surface(shape.vertices, shape.faces, config.points, generator=generator)
+    points = sample_surface(shape, config.points, seed=config.seed)
     return lift_points(
         points,
         views,

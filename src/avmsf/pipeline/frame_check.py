@@ -14,7 +14,7 @@ from torch import Tensor
 from avmsf.capture.placement import FACTORS, WRONG_ROWS, FrameMismatch, check_placement
 from avmsf.capture.settings import CaptureSettings, unit_named
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.folder import check_cameras

@@ -11,7 +11,7 @@ import torch
 from avmsf.capture.filenames import SPLATS, VIDEO_SUFFIXES, find_surface_file, pictures_in
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import SceneError
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import View

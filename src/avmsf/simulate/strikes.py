@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from avmsf.errors import SimulationError
-from avmsf.gaussians.points import farthest_points
 from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.points import farthest_points
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
 from avmsf.simulate.imperfections import stream

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from avmsf.gaussians.neighborhoods import NEIGHBORS, Neighborhoods, read_neighborhoods
+from avmsf.mesh.neighborhoods import NEIGHBORS, Neighborhoods, read_neighborhoods
 from avmsf.symmetry.motions import Motions, Points
 
 TOLERANCE = 0.38

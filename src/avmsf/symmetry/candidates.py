@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from avmsf.gaussians.neighborhoods import Neighborhoods, describe_neighborhoods
+from avmsf.mesh.neighborhoods import Neighborhoods, describe_neighborhoods
 from avmsf.symmetry.alignment import draw_by_area
 from avmsf.symmetry.motions import Motions, Points, reflections, rotations
 

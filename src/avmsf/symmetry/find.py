@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import SceneError
-from avmsf.gaussians.neighborhoods import NEIGHBORS
+from avmsf.mesh.neighborhoods import NEIGHBORS
 from avmsf.symmetry.alignment import SymmetryTest, draw_by_area, read_surface
 from avmsf.symmetry.candidates import candidates
 from avmsf.symmetry.motions import Vector

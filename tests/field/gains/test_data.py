@@ -12,7 +12,7 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.data import gain_data, orientation_signs
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_field import QUICK, plate_extraction, plate_fit, plate_impacts

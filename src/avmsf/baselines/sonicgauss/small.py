@@ -44,7 +44,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.editing.clips import resampled, with_length
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 
 RATE = 32_000.0
 """Hz."""

@@ -19,7 +19,7 @@ from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import Directions, GainModel, Gains, Points
 from avmsf.field.trainer import FittedGains, GainEstimator, Trainer
 from avmsf.field.training import TrainableGains
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 
 SHARED, PER_CONTACT = "shared", "per-contact"
 """Dampings that are the same everywhere, and those that vary with the contact."""

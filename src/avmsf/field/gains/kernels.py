@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
-from avmsf.gaussians.points import nearest_points
+from avmsf.mesh.points import nearest_points
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Lengths of the smooth kernels over the object's size, the diagonal of the box around it."""

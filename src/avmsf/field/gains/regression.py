@@ -26,7 +26,7 @@ from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import ContactAssessment, Fit, assess_contacts, predicts_better
 from avmsf.field.gains.symmetry import Symmetric
-from avmsf.gaussians.points import farthest_points
+from avmsf.mesh.points import farthest_points
 from avmsf.symmetry.characters import Group
 
 _MAX_SPREAD = 64

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf.errors import CaptureError, EvaluationError, FitError
+from avmsf.errors import EvaluationError, FitError
 
 
 def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:
@@ -91,25 +91,6 @@ def cluster(
             break
         labels = moved
     return centers.to(points), labels.to(points.device)
-
-
-def sample_surface(
-    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], count: int, *, generator: torch.Generator
-) -> Float[Tensor, "points 3"]:
-    """Draw `count` points from the triangles, evenly by area.
-
-    Raises CaptureError for a surface without area, from which no point can be drawn.
-    """
-    # Takes half a second to import, which what reads no mesh does without.
-    import trimesh
-
-    mesh = trimesh.Trimesh(vertices.double().cpu().numpy(), faces.cpu().numpy(), process=False)
-    if not (math.isfinite(mesh.area) and mesh.area > 0.0):
-        got = f"{mesh.area:g} m² of {len(vertices)} vertices, {len(faces)} faces"
-        raise CaptureError.expected("triangles with an area", float(mesh.area), got=got, name="surface")
-    seed = int(torch.randint(2**31 - 1, (1,), generator=generator))
-    places = trimesh.sample.sample_surface(mesh, count, seed=seed)[0]
-    return torch.from_numpy(np.asarray(places)).to(vertices)
 
 
 def lattice(contacts: Float[Tensor, "contacts 3"], count: int) -> Float[Tensor, "points 3"]:

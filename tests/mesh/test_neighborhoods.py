@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from avmsf.gaussians.neighborhoods import describe_neighborhoods, read_neighborhoods
+from avmsf.mesh.neighborhoods import describe_neighborhoods, read_neighborhoods
 
 GRID = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
 

@@ -9,14 +9,14 @@ import torch
 import trimesh
 
 from avmsf.errors import CaptureError, EvaluationError, FitError
-from avmsf.gaussians.points import (
+from avmsf.mesh.points import (
     closest_points,
     cluster,
     farthest_points,
     lattice,
     nearest_points,
-    sample_surface,
 )
+from avmsf.mesh.surface import Surface, sample_surface
 from factories.raising import raises
 
 CHOOSE = (farthest_points, closest_points)
@@ -81,8 +81,8 @@ def test_clusters_are_a_minimum_of_lloyds():
 
 def test_samples_lie_on_the_surface_evenly():
     box = trimesh.creation.box(extents=(1.0, 2.0, 4.0))
-    vertices, faces = torch.tensor(np.asarray(box.vertices)), torch.tensor(np.asarray(box.faces))
-    samples = sample_surface(vertices, faces, 6000, generator=torch.Generator().manual_seed(0))
+    surface = Surface(torch.tensor(np.asarray(box.vertices)), torch.tensor(np.asarray(box.faces)))
+    samples = sample_surface(surface, 6000, seed=0)
     # On a side of the box, the one axis along which they are at its end.
     ends = (samples.abs() - torch.tensor([0.5, 1.0, 2.0], dtype=torch.float64)).abs() < 1e-12
     assert bool(ends.any(dim=1).all())
@@ -120,7 +120,7 @@ FLAT = torch.tensor([[0, 1, 1], [2, 2, 2]])
 
 
 def draw(faces: torch.Tensor) -> torch.Tensor:
-    return sample_surface(TRIANGLE, faces, 50, generator=torch.Generator().manual_seed(0))
+    return sample_surface(Surface(TRIANGLE, faces), 50, seed=0)
 
 
 def test_triangles_without_area_are_passed_over():
