@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
-from avmsf.editing.clips import levelled
 from avmsf.editing.config import DistillationConfig
 from avmsf.editing.distillation import DecoderDistillation, noised, partial_denoising
 from avmsf.errors import AvmsfWarning, EditError
+from avmsf.modal.clips import levelled
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, ringing_field, sound_of
 

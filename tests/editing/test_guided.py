@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from avmsf.editing.clips import level
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.guided import HIERARCHICAL, INDEPENDENT, PUBLISHED, edit_towards
 from avmsf.editing.modal_edit import ModalEdit
 from avmsf.editing.reference import Reference
 from avmsf.errors import EditError
+from avmsf.modal.clips import level
 from factories.raising import raises
 from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
 

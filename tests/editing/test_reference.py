@@ -9,11 +9,11 @@ import pytest
 import soundfile
 import torch
 
-from avmsf.editing.clips import level, levelled, with_length
 from avmsf.editing.modal_edit import FieldAtContacts
 from avmsf.editing.reference import Reference, band_spectrum, gain_slope
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
+from avmsf.modal.clips import level, levelled, with_length
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
 

@@ -12,8 +12,7 @@ from avmsf.cli.options import Common, Flag, Number, Unit
 from avmsf.cli.output import doing, next_command, note, print_result
 from avmsf.cli.paths import ContactTable, FieldFile, New, OutputError, PositionList, expect_writable
 from avmsf.errors import PositionWarning
-from avmsf.modal.config import PulseShape
-from avmsf.simulate.recipe import MAX_CONTACT_SECONDS
+from avmsf.modal.config import MAX_CONTACT_SECONDS, PulseShape
 
 _LOW_LEVEL_DBFS = -20.0
 """Peak in decibels of full scale below which sounds are noted as quiet."""

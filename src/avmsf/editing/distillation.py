@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.editing.clips import Sounds, levelled, resampled, with_length
 from avmsf.editing.config import DistillationConfig, check_prompt
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.stable_audio import Latents, StableAudio
 from avmsf.errors import AvmsfWarning, EditError
+from avmsf.modal.clips import Sounds, levelled, resampled, with_length
 
 
 def noised(clean: Latents, noise: Latents, level: Float[Tensor, " contacts"]) -> Latents:

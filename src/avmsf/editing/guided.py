@@ -15,13 +15,13 @@ from torch import Tensor
 
 from avmsf._utils.caching import key_of, source_digest
 from avmsf._utils.checkpoint import Checkpoint
-from avmsf.editing.clips import Sounds, level
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.points import farthest_points
+from avmsf.modal.clips import Sounds, level
 from avmsf.modal.config import scaled_fft_size
 
 _DEVIATIONS = {"shift": 0.05, "damping_shift": 0.3, "scale": 1.0}

@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from avmsf._utils.text import counted
-from avmsf.editing.clips import Sounds
 from avmsf.errors import EditError
 from avmsf.field.gains.model import Gains
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.posterior import scale_of
 from avmsf.field.sound_field import SoundField
+from avmsf.modal.clips import Sounds
 from avmsf.modal.modes import ModalBank
 
 EDITS = "edits"

@@ -19,12 +19,12 @@ from avmsf.capture.measure import check_impulsive, find_clipping
 from avmsf.capture.onset import find_second_impact
 from avmsf.capture.prepare import prepare, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
-from avmsf.editing.clips import Sounds, levelled, resampled, with_length
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import AvmsfWarning, CaptureError, EditError
 from avmsf.fem.material import Material
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
+from avmsf.modal.clips import Sounds, levelled, resampled, with_length
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.synthesis import synthesize
 

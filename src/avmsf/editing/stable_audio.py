@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf._utils.device import usable_device
 from avmsf._utils.files import model_folder
-from avmsf.editing.clips import with_length
 from avmsf.editing.config import STABLE_AUDIO, check_prompt
 from avmsf.errors import EditError, download_failure, from_extra
+from avmsf.modal.clips import with_length
 
 Latents = Float[Tensor, "contacts dim frames"]
 """What the autoencoder makes of waveforms."""

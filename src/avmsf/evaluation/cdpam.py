@@ -21,9 +21,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.nn.functional import conv1d, leaky_relu, normalize
 
-from avmsf.editing.clips import resampled
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.metrics import PerContact, validate, validate_sounds
+from avmsf.modal.clips import resampled
 
 Scaling = Literal["benchmark", "authors"]
 SAMPLE_RATE = 22050.0

@@ -22,12 +22,12 @@ from torch import Tensor
 
 from avmsf._utils.files import model_folder, write_whole
 from avmsf._utils.text import read_json
-from avmsf.editing.clips import resampled
 from avmsf.editing.guided import GuidedEditProgress
 from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import EditError, EvaluationError, download_failure, from_extra
 from avmsf.evaluation.metrics import PerContact, validate_sounds
 from avmsf.field.sound_field import SoundField
+from avmsf.modal.clips import resampled
 
 DEFAULT: Final = "laion/clap-htsat-unfused"
 """The hub's name of the network that scores are taken with unless another is named."""

@@ -26,7 +26,6 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.datasets.dataset import Dataset
 from avmsf.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
 from avmsf.datasets.realimpact import SELF_INTERSECTING
-from avmsf.editing.clips import level, with_length
 from avmsf.editing.distillation import DecoderDistillation
 from avmsf.editing.guided import PARAMETERIZATIONS, Guide, edit_towards
 from avmsf.editing.material import change_material
@@ -42,6 +41,7 @@ from avmsf.evaluation.splits import Case
 from avmsf.evaluation.task import Contacts, EditRequest, Sounds, Task
 from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
+from avmsf.modal.clips import level, with_length
 from avmsf.modal.extraction.extract import extract_once, extract_sounds
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.modal.modes import ModalBank

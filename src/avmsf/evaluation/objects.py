@@ -18,7 +18,6 @@ from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset
 from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
-from avmsf.editing.clips import resampled
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.editing import TRANSITIONS, materials_of
 from avmsf.evaluation.modal_metrics import simulated
@@ -30,6 +29,7 @@ from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface
+from avmsf.modal.clips import resampled
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.scene import FEATURES, SceneStages

@@ -17,7 +17,7 @@ from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor
 from avmsf.localization.contact_map import ContactPosterior
-from avmsf.localization.likelihood import Force, Likelihood, PredictedGains, cosine_distance
+from avmsf.localization.likelihood import Force, Likelihood, PredictedGains
 from avmsf.localization.prediction import (
     calibrate_tempering,
     calibration_factor,
@@ -27,6 +27,7 @@ from avmsf.localization.prediction import (
     smoothing_matrix,
 )
 from avmsf.localization.preprocess import check_sound, location_errors
+from avmsf.modal.cosine_distance import cosine_distance
 from avmsf.modal.modes import ModalBank
 
 _MAX_CACHED_LENGTHS = 8

@@ -8,7 +8,8 @@ sound of an impact is the sum over modes of Im(c exp((-d + 2 pi i f) t)), plus n
 - `synthesis`: from gains and modes to sounds, with gradients.
 - `residual_noise`: the noise beside the modes, its estimate and its synthesis.
 - `spectra`: short-time and mel spectra, one convention for losses, metrics and pictures.
-- `inner_products`: closed forms of damped sines' inner products over time.
+- `inner_products`: closed forms of damped sines' inner products over time. `cosine_distance`: of gains, at any delay.
+- `clips`: sounds at a common sample rate, length and level.
 - `config`: the names of methods in settings, and sizes of transforms at any sample rate.
 """
 

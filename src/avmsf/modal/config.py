@@ -11,6 +11,8 @@ ExtractionMethod = Literal["high-resolution", "short-time"]
 A class for each is in `avmsf.modal.extraction.finders.FINDERS`."""
 PulseShape = Literal["half-sine", "hertz"]
 """How a hammer's force rises and falls: a mass on a linear spring, or on a Hertzian contact."""
+MAX_CONTACT_SECONDS = 0.02
+"""Longest contact of an impact, seconds."""
 
 
 def expect_modes(modes: int) -> None:

@@ -23,7 +23,8 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.material import Material
-from avmsf.simulate.recipe import MAX_CONTACT_SECONDS, Hammer
+from avmsf.modal.config import MAX_CONTACT_SECONDS
+from avmsf.simulate.recipe import Hammer
 
 _HERTZ_SCALE = 2.868
 _HERTZ_AREA = math.sqrt(math.pi) * math.gamma(1.25) / math.gamma(1.75)

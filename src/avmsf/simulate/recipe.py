@@ -12,9 +12,8 @@ from typing import Any, Literal
 from avmsf._utils.caching import source_digest
 from avmsf.errors import SimulationError
 from avmsf.fem.material import material_named
+from avmsf.modal.config import MAX_CONTACT_SECONDS
 
-MAX_CONTACT_SECONDS = 0.02
-"""Longest contact of an impact, seconds."""
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 

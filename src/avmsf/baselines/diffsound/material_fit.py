@@ -23,11 +23,11 @@ from torch import Tensor
 from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.baselines.diffsound.losses import ClipSpectra
 from avmsf.capture.impacts import Impacts
-from avmsf.editing.clips import resampled, with_length
 from avmsf.errors import EvaluationError
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.isotropic import IsotropicModes
 from avmsf.fem.material import MATERIALS, Material, material_named
+from avmsf.modal.clips import resampled, with_length
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 

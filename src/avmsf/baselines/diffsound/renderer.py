@@ -33,8 +33,8 @@ from avmsf.baselines.diffsound.material_fit import (
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.localization.likelihood import cosine_distance
 from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.cosine_distance import cosine_distance
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank

@@ -38,9 +38,9 @@ from avmsf.baselines.sonicgauss.training import (
     tune,
 )
 from avmsf.capture.impacts import Impacts
-from avmsf.editing.clips import resampled, with_length
 from avmsf.errors import EvaluationError, from_extra
 from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.modal.clips import resampled, with_length
 
 FRAMES: Final = 64
 """Of latents, and tokens of Gaussians."""

@@ -41,10 +41,10 @@ from avmsf.baselines.sonicgauss.training import (
     tune,
 )
 from avmsf.capture.impacts import Impacts
-from avmsf.editing.clips import resampled, with_length
 from avmsf.errors import EvaluationError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.mesh.points import farthest_points
+from avmsf.modal.clips import resampled, with_length
 
 RATE = 32_000.0
 """Hz."""

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from avmsf.localization.likelihood import LARGEST_DELAY, cosine_distance
+from avmsf.modal.cosine_distance import LARGEST_DELAY, cosine_distance
 
 FREQUENCY = torch.tensor([310.0, 870.0, 1900.0, 3400.0, 5200.0, 8100.0], dtype=torch.float64)
 GAINS = torch.randn(40, 6, 2, generator=torch.Generator().manual_seed(0))
