@@ -9,7 +9,7 @@ import torch
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import SplatProgress, splat
-from avmsf.gaussians.rasterizer.devices import choose_rasterizer
+from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
 from avmsf.gaussians.ssim import psnr, ssim
 from avmsf.gaussians.targets import pyramid
 from avmsf.photographs import find_foreground, read_views

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
+from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer
 from avmsf.photographs.cameras import Camera
 from benchmarks.processes import timed
 from benchmarks.records import Record, Settings, records

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.devices import choose_rasterizer
+from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
 from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.rays import RayCaster

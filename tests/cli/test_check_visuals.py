@@ -22,7 +22,7 @@ from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import read_camera_file, write_frames
-from avmsf.pipeline.visuals import VisualInputs, inputs, misplaced
+from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced
 from factories.plate_capture import fill_plate
 from factories.raising import raises
 from factories.small_scene import slab, slab_views, write_surface_file

@@ -13,10 +13,10 @@ from avmsf.errors import FitError
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.estimators import Progress
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import spectral_loss
 from avmsf.field.sound_field import SoundField
-from avmsf.field.trainer import Progress
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.modes import ModalBank
@@ -187,7 +187,7 @@ def test_looking_more_often_changes_no_step(monkeypatch):
     """The looks draw noise too, which must not be missing in the training's stream."""
     losses: dict[int, list[float]] = {1: [], 100: []}
     for every, seen in losses.items():
-        monkeypatch.setattr("avmsf.field.trainer.VALIDATION_STEPS", every)
+        monkeypatch.setattr("avmsf.field.estimators.VALIDATION_STEPS", every)
         plate_fit(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
     assert losses[1] == losses[100]
 

@@ -10,11 +10,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from avmsf._utils.device import without_denormals
 from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
+from avmsf.field.estimators import GainEstimator
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import Resolution, SpectralTarget
-from avmsf.field.trainer import GainEstimator
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.record import with_record

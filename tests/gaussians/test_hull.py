@@ -5,7 +5,7 @@ import torch
 
 from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.initialize import StartPoints
-from avmsf.gaussians.visual_hull import visual_hull
+from avmsf.gaussians.start_points import visual_hull
 from factories.ball_views import MIDDLE, RADIUS, ball_cameras, ball_view, ball_views
 from factories.raising import raises, warns
 

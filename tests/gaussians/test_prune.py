@@ -7,7 +7,7 @@ from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.prune import blended_weight, keep_object
-from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
+from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer
 from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_normals, ball_views
 from factories.raising import raises
 

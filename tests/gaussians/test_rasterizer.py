@@ -10,9 +10,9 @@ import torch
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.devices import NumbaRasterizer, choose_rasterizer
 from avmsf.gaussians.rasterizer.projection import project
 from avmsf.gaussians.rasterizer.protocol import Rendering
+from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer, choose_rasterizer
 from avmsf.photographs.cameras import Camera
 from factories.raising import raises
 from oracles.gaussian_image import render_everywhere, splats
@@ -238,7 +238,7 @@ def test_gsplat_is_given_what_it_expects(monkeypatch: pytest.MonkeyPatch) -> Non
     with raises(SceneError, name="cloud", value="cpu"):
         own(single((0.0, 0.0, 0.5)), AHEAD, background=BACKGROUND)
     # There is no card here: only the question where a tensor lies is answered otherwise.
-    monkeypatch.setattr("avmsf.gaussians.rasterizer.devices.is_on_gpu", lambda tensor: True)
+    monkeypatch.setattr("avmsf.gaussians.rasterizer.rasterizers.is_on_gpu", lambda tensor: True)
     cloud = leaves(single((0.1, 0.2, 0.5), scale=0.02, logit=0.0))
     found = own(cloud, AHEAD, background=BACKGROUND)
     assert [given[name].shape for name in ("means", "quats", "scales", "opacities", "colors")] == [

@@ -11,7 +11,7 @@ from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
-from avmsf.gaussians.rasterizer.devices import NumbaRasterizer
+from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer
 from avmsf.gaussians.ssim import psnr
 from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
 from avmsf.photographs.cameras import View

@@ -11,7 +11,7 @@ from avmsf.mesh.level_set import enclose
 from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.fairing import fair_hull
-from avmsf.reconstruction.visual_hull import Outline, hull_distance
+from avmsf.reconstruction.hull_distance import Outline, hull_distance
 from factories.looked_at import ball, mesh_of, views_of
 
 RADIUS = 0.05

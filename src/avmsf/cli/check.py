@@ -77,7 +77,7 @@ def run(options: Options) -> int:
     from avmsf.capture.issues import shared_problems
     from avmsf.capture.proposals import propose_settings, write_settings
     from avmsf.modal.extraction.alignment_report import AlignmentReport
-    from avmsf.pipeline.visuals import inputs, misplaced
+    from avmsf.pipeline.visual_checks import inputs, misplaced
 
     if options.is_dataset:
         return _check_dataset(options)

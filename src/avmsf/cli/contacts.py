@@ -101,7 +101,7 @@ def rows_of(contacts: Contacts, recording: Path) -> list[int]:
     return [max(ends, key=lambda row: len(contacts.names[row]))] if ends else rows
 
 
-def expect_on_object(contacts: Contacts, field: SoundField, *, advice: str = ", see --unit") -> None:
+def check_given_contacts(contacts: Contacts, field: SoundField, *, advice: str = ", see --unit") -> None:
     """Raise `OutputError` for a contact that is not on the object, see `expect_near`; `advice` ends its message.
 
     Note how far the contacts are that are near it and off its surface, see `off_surface`.

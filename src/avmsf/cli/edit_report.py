@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
-from avmsf.cli.contacts import expect_on_object, given_contacts
+from avmsf.cli.contacts import check_given_contacts, given_contacts
 from avmsf.cli.output import decimals, say, table
 from avmsf.cli.report import MAX_LISTED_MODES
 from avmsf.cli.writing import peak_factor, write_sound
@@ -85,7 +85,7 @@ def contact_of_sounds(field: SoundField, at: tuple[float, float, float] | None) 
     """Return the contact of the sounds: the requested one, or the loudest of some."""
     if at is not None:
         chosen = given_contacts([at], None, unit="m")
-        expect_on_object(chosen, field, advice=", in meters")
+        check_given_contacts(chosen, field, advice=", in meters")
         return chosen.places[0]
     points = field.gain_field.points
     some = points[:: max(1, len(points) // _CANDIDATES)]

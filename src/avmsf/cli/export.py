@@ -227,13 +227,13 @@ def _prepared(field: "SoundField", options: Options) -> "_Prepared":
 
 def _sampled(field: "SoundField", options: Options) -> "SampledField":
     """Return the field at the contacts of the options, or at its own points spread over the object."""
-    from avmsf.cli.contacts import expect_on_object, given_contacts
+    from avmsf.cli.contacts import check_given_contacts, given_contacts
     from avmsf.export.sampled_field import SampledField
     from avmsf.field.positions import points_on_object
 
     if options.contacts_given:
         contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
-        expect_on_object(contacts, field)
+        check_given_contacts(contacts, field)
         return SampledField.of(field, contacts.places, directions=contacts.directions)
     points = points_on_object(field.gain_field)
     sampled = SampledField.of(field, points, limit=options.contacts or FORMATS[options.to].points)

@@ -217,7 +217,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     from avmsf.field.store import load
     from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.pipeline.fit import fit_in_stages
-    from avmsf.pipeline.visuals import expect_shape
+    from avmsf.pipeline.visual_checks import expect_shape
 
     capture = read_capture(options.capture, settings)
     size = options.train_count if options.train_fraction is None else options.train_fraction

@@ -153,7 +153,7 @@ def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_A
 
 def _true_contacts(options: Options, field: "SoundField") -> "Contacts | None":
     """Return the true contacts, if any. Raises OutputError for one far from the object, as in another unit."""
-    from avmsf.cli.contacts import expect_on_object, given_contacts, read_contacts
+    from avmsf.cli.contacts import check_given_contacts, given_contacts, read_contacts
 
     if options.true_contact_table is not None:
         contacts = read_contacts(options.true_contact_table, unit=options.unit, recordings=True)
@@ -161,7 +161,7 @@ def _true_contacts(options: Options, field: "SoundField") -> "Contacts | None":
         contacts = given_contacts([options.true_contact], None, unit=options.unit, option="--true-contact")
     else:
         return None
-    expect_on_object(contacts, field)
+    check_given_contacts(contacts, field)
     return contacts
 
 

@@ -12,11 +12,10 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 import tyro
 
 from avmsf.capture.issues import Issues
-from avmsf.capture.settings import CaptureSettings
-from avmsf.capture.settings import settings_of as capture_settings_of
+from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.cli.paths import InputError, arg, path_mark
-from avmsf.cli.settings import Assignments, SettingsTable, as_toml, settings_of
+from avmsf.cli.settings import Assignments, SettingsTable, as_toml, nested_settings
 
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
 """An option that is off unless it is given."""
@@ -121,7 +120,7 @@ class Configured(Common, ABC):
             name = word.partition("=")[0].replace("-", "_").lstrip("_")
             if not word.startswith("--") or name in own:
                 continue
-            meant = [full for full, *_ in settings_of(cls.usual) if f".{full}".endswith(f".{name}")]
+            meant = [full for full, *_ in nested_settings(cls.usual) if f".{full}".endswith(f".{name}")]
             if meant:
                 forms = " or ".join(f"--set {full.removeprefix('scene.')}=VALUE" for full in meant)
                 raise InputError.expected(forms, got=word, name=word)
@@ -146,7 +145,7 @@ def option_of(name: str) -> str:
 
 def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
     """Return the settings of a file, or without one those of a capture folder."""
-    return capture_settings_of(folder) if settings is None else CaptureSettings.read(settings)
+    return settings_of(folder) if settings is None else CaptureSettings.read(settings)
 
 
 def expect_capture(folder: Path, settings: Path | None) -> None:

@@ -75,7 +75,7 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Render and write."""
-    from avmsf.cli.contacts import expect_on_object, given_contacts
+    from avmsf.cli.contacts import check_given_contacts, given_contacts
     from avmsf.cli.writing import peak_factor, write_sound
     from avmsf.field.store import load
     from avmsf.modal.modes import ForcePulse
@@ -83,7 +83,7 @@ def run(options: Options) -> int:
     contacts = given_contacts(options.position, options.contact_table, unit=options.unit, directions=options.direction)
     paths = _paths(options.output, contacts.names)
     field = load(options.field)
-    expect_on_object(contacts, field)
+    check_given_contacts(contacts, field)
     if options.force not in (None, 1) and not field.origin.per_newton:
         note(f"the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:

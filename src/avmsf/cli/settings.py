@@ -38,7 +38,7 @@ def with_settings(
     name that is unknown or has several meanings, for a setting that is given as an option too, and for a value of
     another type, and what the configurations raise for values out of range.
     """
-    known = {name: hint for name, hint, _, _ in settings_of(config)}
+    known = {name: hint for name, hint, _, _ in nested_settings(config)}
     chosen = {name: value for name, value in options.items() if value is not None}
     given: dict[str, Any] = {}
     for source, values in ((file, _read(file)), (None, map(_assigned, assignments))):
@@ -55,7 +55,7 @@ def as_toml(config: object) -> str:
     """Return a configuration as TOML, with the meaning of each setting as a comment; None is the text "null"."""
     lines: list[str] = []
     section = ""
-    for name, _, value, meaning in sorted(settings_of(config), key=lambda each: each[0].count(".") > 0):
+    for name, _, value, meaning in sorted(nested_settings(config), key=lambda each: each[0].count(".") > 0):
         owner, _, last = name.rpartition(".")
         if owner != section:
             lines += ["", f"[{owner}]"]
@@ -67,13 +67,13 @@ def as_toml(config: object) -> str:
     return "\n".join(lines)
 
 
-def settings_of(config: object, owner: str = "") -> Iterator[tuple[str, Any, Any, str]]:
+def nested_settings(config: object, owner: str = "") -> Iterator[tuple[str, Any, Any, str]]:
     """Yield the name of each setting of nested configurations, its type, its value and its meaning."""
     hints, meanings = get_type_hints(type(config)), _meanings(type(config))
     for each in fields(config):  # type: ignore[arg-type]
         value = getattr(config, each.name)
         if is_dataclass(value):
-            yield from settings_of(value, f"{owner}{each.name}.")
+            yield from nested_settings(value, f"{owner}{each.name}.")
         else:
             yield owner + each.name, hints[each.name], value, meanings.get(each.name, "")
 

@@ -206,7 +206,7 @@ def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
     return _PEAK / peak if peak > 0 else 1.0
 
 
-def write_sound(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, gain: float) -> None:
+def write_flac(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, gain: float) -> None:
     """Write a sound times `gain` as a FLAC file of 16 bits; what would clip is turned down to full scale.
 
     Sounds at rates that browsers do not play are resampled by a whole factor. Raises EvaluationError.
@@ -230,7 +230,7 @@ class StoredSound:
 
     @classmethod
     def read(cls, path: Path) -> "StoredSound":
-        """Read a file that `write_sound` wrote. Raises EvaluationError where it is gone or damaged."""
+        """Read a file that `write_flac` wrote. Raises EvaluationError where it is gone or damaged."""
         try:
             content = path.read_bytes()
             samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")

@@ -36,7 +36,7 @@ from avmsf.evaluation.results import (
     failure_of,
     file_word,
     listening_gain,
-    write_sound,
+    write_flac,
 )
 from avmsf.evaluation.scores import Values, metric_values
 from avmsf.evaluation.splits import Case, align_split, evenly_spaced
@@ -249,7 +249,7 @@ class CaseRun:
         stored, test = {}, self.scored.test
         for row in self.stored_rows:
             file, gain = f"sounds/{self.name}/{row:03d} {file_word(name)}.flac", listening_gain(test.sounds[row])
-            write_sound(self.folder / file, sounds[row], sample_rate=sample_rate, gain=gain)
+            write_flac(self.folder / file, sounds[row], sample_rate=sample_rate, gain=gain)
             stored[test.names[row]] = file
         return stored
 

@@ -3,11 +3,12 @@
 In go photographs with cameras and masks (`avmsf.photographs`), or a `.ply` of 3DGS; out come a `GaussianCloud`, and
 images, depth maps and the points that a camera sees (`visibility`) of it.
 
-`fit.splat` is 3D Gaussian Splatting (Kerbl et al. 2023): Gaussians start on the `visual_hull` (`initialize`), images of
-them are compared with the photographs (`targets`, SSIM of Wang et al. 2004 in `ssim`), Adam (Kingma & Ba 2015) changes
-them, adaptive density control adds and splits them (`densify`), and those that are not the object's go (`prune`).
+`fit.splat` is 3D Gaussian Splatting (Kerbl et al. 2023): Gaussians start on the visual hull (`start_points`,
+`initialize`), images of them are compared with the photographs (`targets`, SSIM of Wang et al. 2004 in `ssim`), Adam
+(Kingma & Ba 2015) changes them, adaptive density control adds and splits them (`densify`), and those that are not the
+object's go (`prune`).
 
-How a Gaussian's gradient is computed on a CPU, and where: `rasterizer.devices.NumbaRasterizer` is two functions of
+How a Gaussian's gradient is computed on a CPU, and where: `rasterizer.rasterizers.NumbaRasterizer` is two functions of
 PyTorch's autograd, whose loops numba compiles.
 
 1. `rasterizer.projection.Projection` takes each Gaussian to an ellipse in the image (EWA splatting, Zwicker et al.

@@ -21,11 +21,11 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.densify import Density
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.prune import keep_object
-from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering
+from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
 from avmsf.gaussians.ssim import psnr, ssim
+from avmsf.gaussians.start_points import visual_hull
 from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
-from avmsf.gaussians.visual_hull import visual_hull
 from avmsf.photographs.cameras import View
 
 _MIN_PROGRESS_STEPS = 10

@@ -6,8 +6,8 @@ import torch
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.devices import choose_rasterizer
 from avmsf.gaussians.rasterizer.protocol import Rasterizer
+from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
 from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import View

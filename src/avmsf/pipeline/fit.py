@@ -19,13 +19,13 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.fem.material import Material, material_named
 from avmsf.field.config import AUTO, NETWORK, GainModelName
+from avmsf.field.estimators import Progress
 from avmsf.field.fit import fit as fit_field
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.kernels import Visual
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.field.trainer import Progress
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once
@@ -36,7 +36,7 @@ from avmsf.pipeline.record import modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.shape import FitShape, is_mesh, object_shape, pipeline_of, shape_of
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
-from avmsf.pipeline.visuals import expect_shape
+from avmsf.pipeline.visual_checks import expect_shape
 
 MODES, FIELD = "modes.safetensors", CACHED_FIELD
 """What the last stages call their outputs."""
@@ -201,7 +201,7 @@ def _fit_shape(
         listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
         extract_once(train, method, path, needed=True)
 
-    def fit_gains(path: Path, found: Path) -> None:
+    def train_field(path: Path, found: Path) -> None:
         modes = extract_once(train, method, found)
         supporting = supporting_poles(modes, train)
         listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
@@ -229,7 +229,7 @@ def _fit_shape(
         # First: what is wrong with the object's shape shows in less time than the modes take.
         estimator()
     found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
-    field = pipeline.add(Stage(FIELD, fit_gains, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
+    field = pipeline.add(Stage(FIELD, train_field, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
     surface = pipeline.made.get(SURFACE)
     modes = extract_once(train, method, found.path)
     return StagedFit(field.path, pipeline.made, shape.report, modes, None if surface is None else surface.path)

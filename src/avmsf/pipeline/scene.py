@@ -22,7 +22,7 @@ from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.initialize import StartPoints
 from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.gaussians.prune import keep_object
-from avmsf.gaussians.rasterizer.devices import choose_rasterizer
+from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
 from avmsf.mesh.surface import Surface, read_surface
 from avmsf.photographs import read_sparse_points, read_views, write_views
 from avmsf.photographs.cameras import View

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float32
 from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.photographs.visual_hull import Grid
+from avmsf.reconstruction.hull_distance import Outline, hull_distance
 from avmsf.reconstruction.object_shape import closed_surface
-from avmsf.reconstruction.visual_hull import Outline, hull_distance
 
 WRONG_FRACTION = 0.05
 """Part of the masks that may be wrong."""

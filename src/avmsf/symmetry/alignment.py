@@ -58,13 +58,13 @@ class SymmetryTest:
     its square, and chance decides."""
 
     def __init__(self, points: Points, generator: np.random.Generator) -> None:
-        self.surface = read_surface(points)
+        self.surface = local_planes(points)
         self.queries = self.surface.points[draw_by_area(self.surface, _QUERIES, generator)]
         self._tree = cKDTree(self.surface.points)
         part = generator.permutation(len(points)) % _PARTS
         self._parts = []
         for number in range(_PARTS):
-            moved, target = read_surface(points[part == number], _MOVED_NEIGHBORS), read_surface(points[part != number])
+            moved, target = local_planes(points[part == number], _MOVED_NEIGHBORS), local_planes(points[part != number])
             queries = moved.points[draw_by_area(moved, _QUERIES // _PARTS, generator)]
             self._parts.append((queries, target, cKDTree(target.points)))
         spacing = np.median([np.median(target.spacing) for _, target, _ in self._parts])
@@ -146,7 +146,7 @@ class SymmetryTest:
         return motions
 
 
-def read_surface(points: Points, neighbors: tuple[int, int] = _NEIGHBORS) -> Neighborhoods:
+def local_planes(points: Points, neighbors: tuple[int, int] = _NEIGHBORS) -> Neighborhoods:
     """Return the surface about the points of a cloud, by planes through few enough of them for what it resolves."""
     return read_neighborhoods(points, count=int(np.clip(_MAX_PATCH * len(points), *neighbors)))
 

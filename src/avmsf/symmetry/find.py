@@ -10,7 +10,7 @@ from torch import Tensor
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import SceneError
 from avmsf.mesh.neighborhoods import NEIGHBORS
-from avmsf.symmetry.alignment import SymmetryTest, draw_by_area, read_surface
+from avmsf.symmetry.alignment import SymmetryTest, draw_by_area, local_planes
 from avmsf.symmetry.candidates import candidates
 from avmsf.symmetry.motions import Vector
 from avmsf.symmetry.search import find_group
@@ -53,7 +53,7 @@ def find_symmetries(
     random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
     places, middle, diagonal = _normalized(points)
     if len(places) > limit:
-        places = places[draw_by_area(read_surface(places), limit, random, max_ratio=9.0)]
+        places = places[draw_by_area(local_planes(places), limit, random, max_ratio=9.0)]
     test = SymmetryTest(places, random)
     group, rejected = None, [math.inf]
     if test.tolerance > 0.0:

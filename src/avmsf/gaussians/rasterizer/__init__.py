@@ -1,7 +1,7 @@
 """Rasterizers: from Gaussians to images, and from derivatives by pixels back to derivatives by the Gaussians.
 
-`protocol.Rasterizer` is the interface; `devices` has one for CPUs, `NumbaRasterizer`, and one for GPUs by gsplat. The
-steps on a CPU, forward and backward, are listed in `avmsf.gaussians`:
+`protocol.Rasterizer` is the interface; `rasterizers` has one for CPUs, `NumbaRasterizer`, and one for GPUs by
+gsplat. The steps on a CPU, forward and backward, are listed in `avmsf.gaussians`:
 
 - `projection`, with the loops of `ellipses` and `harmonics`: each Gaussian to an ellipse and a color.
 - `blending`, with the loops of `tiles` and `pixels`: the ellipses to the image. `pixels` has the derivative by alpha.

@@ -1,4 +1,4 @@
-"""What fits gain models: estimators, and the runs of training that they ask for, which a checkpoint may continue."""
+"""What fits gain models: the interface of estimators, and the training runs that they ask for, with checkpoints."""
 
 import math
 from abc import ABC, abstractmethod

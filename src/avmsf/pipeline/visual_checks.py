@@ -1,4 +1,4 @@
-"""What shows the object in a capture folder, by names and camera files, and whether it fits the contacts."""
+"""Checks of what shows the object in a capture folder: its names and camera files, and whether it fits the contacts."""
 
 import importlib.util
 import warnings
