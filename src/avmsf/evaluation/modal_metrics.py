@@ -134,7 +134,7 @@ class ModalRenderer(Protocol):
     def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
 
-        In the unit of the training sounds; `directions` are the unit vectors of the impacts, for methods that use them.
+        -i times `Extraction.gains`, in their unit. `directions` are the impacts' unit vectors, if a method uses them.
         """
 
 

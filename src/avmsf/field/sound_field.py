@@ -51,7 +51,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class GainPosterior:
-    """The posterior distribution of complex gains A, which sound as the real part of A exp((-d + 2 pi i f) t)."""
+    """The posterior of complex gains A, -i times `Extraction.gains`: real parts of A exp((-d + 2 pi i f) t) sound."""
 
     __repr__ = short_repr
 
@@ -174,7 +174,7 @@ class SoundField:
     ) -> Complex[Tensor, "contacts modes"]:
         """Return amplitudes A at the contacts: their sounds are the real part of the sum of A exp((-d + 2 pi i f) t).
 
-        Contacts, directions and unit as in `gains`; dampings d are those of the contacts.
+        -i times `Extraction.gains`; contacts, directions and unit as in `gains`, dampings d those of the contacts.
         """
         places, ways = self._impacts(contacts, directions)
         return self._amplitudes(self.known(places, directions=ways).parts)

@@ -79,7 +79,7 @@ class DiffSound:
     def complex_gains(
         self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
     ) -> Complex[Tensor, "contacts modes"]:
-        """Return amplitudes A: sounds are the real part of the sum of A exp((-d + 2 pi i f) t)."""
+        """Return amplitudes A, -i times `gains`: sounds are the real part of the sum of A exp((-d + 2 pi i f) t)."""
         gains = self.gains(contacts, directions=directions)
         return torch.complex(torch.zeros_like(gains), -gains)
 
