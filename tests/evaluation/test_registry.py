@@ -1,6 +1,7 @@
 """A new method or metric is a function and a line, as the tutorial has them."""
 
 import json
+import pickle
 import re
 from pathlib import Path
 from unittest.mock import patch
@@ -53,3 +54,8 @@ def test_every_import_path_leads_to_a_function() -> None:
         assert callable(resolve(entry.make or entry.fit)), name
         assert entry.path or method_named(name).name == name
     assert all(callable(resolve(entry.function)) for entry in METRICS.values() if entry.function is not None)
+
+
+def test_every_method_can_be_sent_to_a_worker() -> None:
+    methods = [method_named(name) for name, entry in METHODS.items() if not entry.path]
+    assert [each.name for each in pickle.loads(pickle.dumps(methods))] == [each.name for each in methods]

@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -237,14 +237,13 @@ class Generated:
 
 def edit_method(name: str, *, edit: str, **settings: Any) -> FunctionMethod:
     """Return the method that calls the function `edit` of this module with what a task asks, and with settings."""
-    change: Callable[..., Edited | Generated] = globals()[edit]
+    return FunctionMethod(name, partial(_edited, globals()[edit], settings))
 
-    def fit(task: Task) -> Edited | Generated:
-        if task.edit is None:
-            raise EvaluationError.expected("the protocol edit", name="protocol", advice="choose other methods")
-        return change(task.edit, **settings)
 
-    return FunctionMethod(name, fit)
+def _edited(change: Callable[..., Edited | Generated], settings: Mapping[str, Any], task: Task) -> Edited | Generated:
+    if task.edit is None:
+        raise EvaluationError.expected("the protocol edit", name="protocol", advice="choose other methods")
+    return change(task.edit, **settings)
 
 
 def unedited(request: EditRequest) -> Edited:
