@@ -14,7 +14,7 @@ import pytest
 
 import avmsf
 from avmsf.capture import CaptureSettings
-from avmsf.cli import options_of
+from avmsf.cli import VERBS, options_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
@@ -61,6 +61,16 @@ def test_the_docs_give_every_setting_of_a_capture_and_its_default(tmp_path: Path
     CaptureSettings.read(tmp_path / "capture.toml")
     named = {*tomllib.loads(defaults), *tomllib.loads(others)}
     assert named == {field.name for field in dataclasses.fields(CaptureSettings)}
+
+
+@pytest.mark.parametrize(
+    "page", sorted((REPOSITORY / "src" / "avmsf").rglob("*/__init__.py")), ids=lambda page: page.parent.name
+)
+def test_each_module_is_named_by_its_packages_page(page: Path) -> None:
+    text = " ".join(re.findall(r"`([^`]+)`", ast.get_docstring(ast.parse(page.read_text())) or ""))
+    # The command's page has its subcommands as a table.
+    verbs = VERBS if page.parent.name == "cli" else {}
+    assert {path.stem for path in page.parent.glob("*.py")} - {"__init__", *verbs} <= set(re.findall(r"\w+", text))
 
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))

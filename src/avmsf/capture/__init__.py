@@ -10,8 +10,8 @@ Onsets are found here in each recording alone, to a few samples. The recordings 
 phases of their modes (`avmsf.modal.extraction.alignment`); for it `Impacts.before` and `after` keep 20 ms on either
 side of each sound.
 
-    table -> audio -> prepare (onset, highpass, force) -> preprocess -> Impacts
-    table, surface -> checks (placement) -> what is wrong
+`settings`, `table`, `audio` -> `prepare` (`onset`, highpass, force) -> `preprocess` -> `Impacts`;
+`filenames`, `table`, surface -> `checks` (`placement`) -> `issues`, what is wrong.
 
 - `prepare`: an onset by the first sample above a tenth of the peak and the noise, or by the hammer's pulse; division by
   the peak force, or deconvolution by the pulse (Tikhonov-regularized); a zero-phase Butterworth highpass.

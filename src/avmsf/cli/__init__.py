@@ -4,7 +4,8 @@ What goes in are words; what comes out are files, text on the standard error and
 tables for people or with `--json` as one object. Each module of a verb has `Options`, a frozen dataclass of which tyro
 makes the command line, and `run(options)`, which imports what computes, calls the package and prints: start reading
 with `render`. `options` parses and checks before anything is loaded, `settings` reads `--set` and `--config`, `paths`
-says what files and folders have to be, `many` runs a verb for each of several inputs, `output` prints.
+says what files and folders have to be, `many` runs a verb for each of several inputs, `contacts` reads positions,
+`report` and `edit_report` say what fields and edits are, `writing` has wav files, `output` prints.
 """
 
 import _thread

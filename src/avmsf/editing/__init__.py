@@ -11,7 +11,7 @@ done is the last entry of `origin.report["edits"]`.
 - `guided`: `edit_towards` optimizes a `ModalEdit` with Adam towards a guide's target sounds by the multi-scale spectral
   loss.
 - `reference`, `distillation`, `stable_audio`: the guides: recordings or the statistics of a material; a text, by
-  decoder distillation (Audio-SDS) of Stable Audio.
+  decoder distillation (Audio-SDS) of Stable Audio. `config`: their settings.
 
 Start reading at `modal_edit`, whose `edited` all edits end in, then `material`, then `guided`.
 """

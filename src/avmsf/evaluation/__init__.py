@@ -8,7 +8,7 @@ In go recordings with their contacts; out come one value for each metric, method
 - `splits`: farthest-point, leave-one-out and other splits of contacts, `Case`s as data. `scores`: a renderer's values.
 - Metrics: spectral, log-mel and envelope distance (`metrics`); CDPAM (`cdpam`; Manocha et al., ICASSP 2021); CLAP score
   (`clap`); modal assurance criterion and errors of modes and gains against a simulation's (`modal_metrics`); error of
-  located contacts (`localization`).
+  located contacts (`localization`); edits to another material (`editing`, `mode_embedding`).
 - `methods`: all methods by name, those of the sound field as configurations of the pipeline. Their renderers: k nearest
   recordings, mean gains, thin-plate splines (`simple_methods`), DiffSound and SonicGauss (`avmsf.baselines`), files.
 - `plan_evaluation` (`plan`) makes an `Evaluation`; `objects` makes what its methods read of objects. `run_objects`

@@ -5,19 +5,19 @@ what their format cannot represent (`Written`). All formats but the web page sta
 dampings, and a sine and a cosine amplitude of each mode at each point, of which `SampledField.render` is the reference
 that every file is compared with.
 
-- `write_webpage`, `make_bundle`: the studio's page with one field, as a folder or a single file.
-- `write_gltf`: the object and its modes in the draft extension KHR_audio_rigid_bodies.
-- `write_faust`: a bank of resonators as a Faust program.
-- `write_grid`: wav files of chosen contacts and forces, with a table and an SFZ instrument.
-- `write_universal`: nodes, mode shapes and frequency response functions in the universal file format (UFF).
-- `write_demo`: the layout of the paper's web demo.
+- `web.write_webpage`, `bundle.make_bundle`: the studio's page with one field, as a folder or a single file.
+- `gltf.write_gltf`: the object (`geometry`) and its modes in the draft extension KHR_audio_rigid_bodies.
+- `faust.write_faust`: a bank of resonators as a Faust program.
+- `samples.write_grid`: wav files of chosen contacts and forces, with a table and an SFZ instrument.
+- `uff.write_universal`: nodes, mode shapes and frequency response functions in the universal file format (UFF).
+- `paper_demo.write_demo`: the layout of the paper's web demo.
 
 A new format is a writer here, a name in `writing.Format`, an entry in `writing.FORMATS`, and in `avmsf.cli.export` the
 options that it uses (`_USED`, `Options`), what to do with its files (`_NEXT`) and its settings (`_prepared`).
 
-`avmsf.write` chooses the writer by a file's ending. Files and folders are written atomically, and replaced only with
-`overwrite=True`. Start reading at `sampled_field`, then `one_phase` for formats with real amplitudes only, then any
-writer.
+`write.write` (`avmsf.write`) chooses the writer by a file's ending. Files and folders are written atomically, and
+replaced only with `overwrite=True`. Start reading at `sampled_field`, then `one_phase` for formats with real amplitudes
+only, then any writer.
 """
 
 import lazy_loader

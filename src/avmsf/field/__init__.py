@@ -20,8 +20,10 @@ a kernel K with a noise share q, the scale s^2 integrated out:
   means k' C^-1 y and variances Q/n (k0 - k' C^-1 k), Q = y' C^-1 y (R&W 2.25, 2.26, with s^2 by its posterior);
   leave-one-place-out errors follow in closed form (R&W 5.4.2) and give `quality`, outliers and `next_contacts`.
 
-Types: `GainModel` with `AttentionGains` (the paper's network), `MixtureGains`, `BodyGains` (a guess without recordings)
-and `ScaledGains` (edits); their estimators `Attention` and `MixtureEstimator`; `FitConfig`; `store` has the file.
+Types: `SoundField` (`sound_field`); `GainModel` with `AttentionGains` (the paper's network), `MixtureGains`,
+`BodyGains` (a guess without recordings) and `ScaledGains` (edits); their `estimators`; `FitConfig` (`config`). `store`
+has the file, `header` its record. `positions`: whether contacts lie on the object; `hammer_access`: which can be
+struck; `probable_body`: the body of most evidence.
 """
 
 import lazy_loader

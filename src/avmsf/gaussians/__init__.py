@@ -1,7 +1,7 @@
 """3D Gaussians of an object: their files, their fit to photographs, and what they show of its surface.
 
-In go photographs with cameras and masks (`avmsf.photographs`), or a `.ply` of 3DGS; out come a `GaussianCloud`, and
-images, depth maps and the points that a camera sees (`visibility`) of it.
+In go photographs with cameras and masks (`avmsf.photographs`), or a `.ply` of 3DGS (`ply`, `ply_header`); out come a
+`GaussianCloud`, and images, depth maps and the points that a camera sees (`visibility`) of it.
 
 `fit.splat` is 3D Gaussian Splatting (Kerbl et al. 2023): Gaussians start on the visual hull (`start_points`,
 `initialize`), images of them are compared with the photographs (`targets`, SSIM of Wang et al. 2004 in `ssim`), Adam
@@ -21,7 +21,8 @@ PyTorch's autograd, whose loops numba compiles.
 4. `ellipses.project_points_back` and `harmonics.shade_back` carry these derivatives on to centers, rotations, scales,
    opacities and harmonics by the chain rule, in the steps of `project_points` and `shade` in reverse.
 
-On a GPU gsplat does all of this. To start reading: `cloud`, then `fit.splat`, then `rasterizer.protocol`.
+On a GPU gsplat does all of this. Settings are in `config`. To start reading: `cloud`, then `fit.splat`, then
+`rasterizer.protocol`.
 """
 
 import lazy_loader

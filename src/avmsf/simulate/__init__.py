@@ -1,8 +1,8 @@
 """Simulated objects whose ground truth is known: struck, recorded and photographed.
 
 In goes an `ObjectRecipe`: a kind of shape or a mesh, a material, a hammer, imperfections, a seed. Out come a
-`Simulation`, and with `write_simulation` a capture folder as a user fills it, with `Truth` beside it: modes, amplitudes
-of every recording, true contacts. The same recipe gives the same bytes.
+`Simulation`, and with `simulation_folder` a capture folder as a user fills it, with `Truth` (`ground_truth`) beside it:
+modes, amplitudes of every recording, true contacts. The same recipe gives the same bytes.
 
 Core types: `ObjectRecipe`, `Imperfections`, `Hammer`, `Shape`, `SoundingBody`, `Simulation`, `Truth`.
 

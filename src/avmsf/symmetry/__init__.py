@@ -1,9 +1,9 @@
 """Symmetries of a shape: rotations and reflections that carry an object onto itself, found on a cloud of its surface.
 
-`find_symmetries` takes points [points, 3] in meters and returns `Symmetries`: each `RotationalSymmetry` has an axis and
-an order (None where every angle will do), each `MirrorSymmetry` a plane, and both an error in point spacings. Together
-they are always one point group, exactly. `characters.groups_of` returns its subgroups with the real characters by which
-mode shapes are even or odd.
+`find.find_symmetries` takes points [points, 3] in meters and returns `symmetries.Symmetries`: each `RotationalSymmetry`
+has an axis and an order (None where every angle will do), each `MirrorSymmetry` a plane, and both an error in point
+spacings. Together they are always one point group, exactly. `characters.groups_of` returns its subgroups with the real
+characters by which mode shapes are even or odd.
 
 1. `candidates`: planes and axes along the principal axes, and those by which pairs of points with similar neighborhoods
    would change places (Mitra, Guibas and Pauly, Partial and Approximate Symmetry Detection, 2006), ranked on a distance

@@ -6,11 +6,12 @@ In go `Impacts`; out comes an `Extraction`: a `ModalBank`, each recording's comp
    few samples. Here each recording gets one delay, so that every mode has one phase (modulo pi) in all of them, by
    maximum a posteriori with von Mises phases (`phase_likelihood`); then the start common to all is set where their mean
    power leaves the noise. `Impacts.delayed` cuts the recordings anew, between samples by a windowed sinc.
-   `Alignment.apply` aligns recordings that were held out.
+   `Alignment.apply` aligns recordings that were held out; `alignment_report` says what was done.
 2. `finders`: frequencies and dampings, by one of two methods. `HighResolution`: matrix pencils (ESPRIT) in subbands
    (`esprit`), forward selection by orthogonal least squares (`selection`, `forward`) and variable projection
    (`least_squares.refine`). `ShortTime`: the paper's regression in each bin of a short-time spectrum (`stft`).
-3. `least_squares.fit_gains`: the complex gains of these modes in each recording, whichever method found them.
+3. `least_squares.fit_gains`: the complex gains of these modes in each recording, whichever method found them; at poles
+   of each recording's own where frequencies shift between recordings (`frequency_shifts`).
 
 `quality` judges how well the recordings support each mode; `polarity` and `recorder_faults` find what is wrong with
 single recordings. Start reading at `extract.extract_modes`.
