@@ -17,16 +17,6 @@ from factories.capture_folder import RATE, fill, ring
 NAMES = ("a.wav", "b.wav", "c.wav")
 
 
-@pytest.mark.parametrize("rate", [100, 512, 192_000])
-def test_any_rate_from_100_hz_to_192_khz_is_kept(tmp_path: Path, rate: int) -> None:
-    seconds = max(1.0, 200 / rate)
-    sounds = {name: ring(seconds, rate=rate, seed=seed) for seed, name in enumerate(("a.wav", "b.wav", "c.wav"))}
-    folder = fill(tmp_path, replace=sounds, rate=rate)
-    impacts = read_capture(folder, CaptureSettings(align=False)).impacts
-    assert impacts.sample_rate == rate
-    assert torch.equal(impacts.sounds[1], torch.from_numpy(sounds["b.wav"].astype(np.float32)))
-
-
 def test_channels_are_counted_from_one(tmp_path: Path) -> None:
     both = np.stack([ring(seed=0), ring(seed=1)], axis=1)
     folder = fill(tmp_path, replace=dict.fromkeys(NAMES, both))
@@ -118,13 +108,3 @@ def test_channels_of_one_sound_are_read_and_named_once(tmp_path: Path, kind: str
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.array_equal(read_capture(folder, chosen).impacts.sounds.numpy(), sounds)
-
-
-def test_a_soft_recording_s_channels_differ_by_their_rounding_alone(tmp_path: Path) -> None:
-    # Its peak is 40 steps of 16 bits, so that rounding is more than a hundredth of it.
-    files = {}
-    for seed, name in enumerate(NAMES):
-        sound = ring(noise=0.0, seed=seed) * 80 / 32768
-        files[name] = np.stack([sound, second_channel(sound, "dither")], axis=1)
-    folder = fill(tmp_path, replace=files, subtype="PCM_16")
-    assert all(row.readable for row in check(folder).recordings)

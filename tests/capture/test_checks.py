@@ -12,10 +12,9 @@ import trimesh
 
 from avmsf.capture import CaptureSettings, check, read_capture
 from avmsf.capture.checks import expect_held
-from avmsf.capture.issues import shared_problems
 from avmsf.errors import CaptureError
 from avmsf.mesh.surface import Surface
-from factories.capture_folder import HEADER, RATE, ROWS, fill, ring
+from factories.capture_folder import RATE, ROWS, fill, ring
 from factories.raising import raises
 
 
@@ -35,18 +34,6 @@ def test_a_good_folder_has_no_problem_and_true_figures(tmp_path: Path) -> None:
     assert first.onset_seconds == pytest.approx(0.25, abs=5 / RATE)
     assert first.clipped == 0
     assert first.double_hit_seconds is None
-
-
-def test_noise_is_that_of_the_quietest_part_after_the_settings_highpass(tmp_path: Path) -> None:
-    time = np.arange(RATE) / RATE
-    rumble = 0.05 * np.sin(2 * np.pi * 11 * time)
-    sounds = {"a.wav": ring(1.0, noise=1e-3), "b.wav": ring(1.0, before=0.4, seed=1) + rumble}
-    folder = fill(tmp_path, replace=sounds)
-    plain, filtered = (check(folder, CaptureSettings(highpass=each)).recordings for each in (0.0, 60.0))
-    # The quietest tenth of blocks of 80 samples lies 1.3 x 20 / ln 10 / sqrt(160) = .9 dB under the mean one.
-    expected = 20 * np.log10(1e-3 / np.abs(sounds["a.wav"]).max()) - 0.9
-    assert plain[0].noise_db == pytest.approx(expected, abs=1)
-    assert filtered[1].noise_db < plain[1].noise_db - 15
 
 
 def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
@@ -120,30 +107,6 @@ def test_rows_in_the_order_of_text_and_not_of_numbers_are_remarked_on(tmp_path: 
     for way, remarked in ((sorted(names), True), (names, False), (names[::-1], False)):
         report = check(fill(tmp_path / f"{way[1]}{way[2]}", sounds={name: sounds[name] for name in way}))
         assert any("order of text" in each for each in report.remarks) is remarked
-
-
-def test_what_many_recordings_share_is_one_message_and_each_row_has_its_report(tmp_path: Path) -> None:
-    far = check(fill(tmp_path / "far", rows=(ROWS[0], "b.wav,0,200,0", "c.wav,0,0,-300"))).recordings
-    missing = [*ROWS, *(f"aa{number}.wav,0,0,0.1" for number in range(200))]
-    # Also one that names a file again.
-    gone = check(fill(tmp_path / "gone", rows=(*missing, missing[-1]))).recordings
-    for reports, good, message in ((far, 1, "of 2"), (gone[:-1], 3, "200 of 203")):
-        assert [row.line for row in reports] == list(range(2, 2 + len(reports)))
-        assert [row.readable for row in reports] == [True] * good + [False] * (len(reports) - good)
-        (line,) = shared_problems(reports)
-        assert message in line
-
-
-def test_recordings_in_a_subfolder_are_read_once_the_table_names_it(tmp_path: Path) -> None:
-    folder = fill(tmp_path)
-    (folder / "taps").mkdir()
-    for row in ROWS:
-        (folder / row[:5]).rename(folder / "taps" / row[:5])
-    report = check(folder)
-    messages = [*report.problems, *(problem for row in report.recordings for problem in row.problems)]
-    assert any("write taps/a.wav" in message for message in messages)
-    (folder / "impacts.csv").write_text("\n".join([HEADER, *(f"taps/{row}" for row in ROWS)]))
-    assert check(folder).readable
 
 
 def test_a_point_far_from_the_object_does_not_hold_it() -> None:

@@ -78,14 +78,6 @@ def test_a_written_capture_reads_back_bit_for_bit(tmp_path: Path, sample_rate: f
             assert_same(read_capture(tmp_path / f"{number}/cup"), capture)
 
 
-def test_a_read_capture_writes_and_reads_back_bit_for_bit(tmp_path: Path) -> None:
-    rows = ("a.wav,0.1,0.7,0,1,2,3,5.3", "b.wav,0,0.2,0,-1,0.1,0,0.7", "c.wav,1e-3,0,0.3,0,1,0,1.1")
-    folder = fill(tmp_path / "old", header="file,x,y,z,nx,ny,nz,force_newtons", rows=rows)
-    capture = read_capture(folder)
-    write_capture(capture, tmp_path / "again")
-    assert_same(read_capture(tmp_path / "again"), replace(capture))
-
-
 @pytest.mark.parametrize("names", [("strike 1", "strike 2"), ("../a.wav", "b.wav"), ("a.wav", "A.WAV"), ("a.wav", " ")])
 def test_names_that_cannot_be_files_become_numbers(tmp_path: Path, names: tuple[str, ...]) -> None:
     write_capture(invented(names=names), tmp_path / "cup")

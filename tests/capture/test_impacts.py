@@ -48,13 +48,6 @@ def test_what_a_file_does_not_hold_is_zero() -> None:
     assert torch.equal(cut, torch.cat([torch.zeros(1, 4), torch.ones(1, 96)], dim=1))
 
 
-def test_the_rows_keep_their_margins() -> None:
-    file = torch.arange(300.0).reshape(3, 100)
-    taken = impacts(file, file - 1, file + 1).take([2, 0])
-    assert torch.equal(taken.before, file[[2, 0]] - 1)
-    assert torch.equal(taken.after, file[[2, 0]] + 1)
-
-
 def test_delays_are_numbers() -> None:
     with raises(ArrayError, row=0, name="delays"):
         impacts(torch.ones(1, 100)).delayed(torch.tensor([math.nan], dtype=torch.float64))

@@ -131,16 +131,6 @@ def test_contacts_of_another_object_are_not_explained() -> None:
     assert explained <= 1
 
 
-def test_a_surface_is_covered_by_points_always_the_same() -> None:
-    box = trimesh.creation.box((0.2, 0.2, 0.2))
-    surface = Surface(torch.tensor(box.vertices).float(), torch.tensor(box.faces))
-    points = surface_points(surface)
-    assert torch.equal(points, surface_points(surface))
-    assert bool(((points.abs().amax(dim=1) - 0.1).abs() < 1e-7).all())
-    # 20,000 points on .24 m^2 lie 3.5 mm apart.
-    assert check_placement(torch.tensor([[0.1, 0.013, -0.052], [0.03, -0.1, 0.02]]), points).distances.max() < 0.01
-
-
 def test_few_contacts_close_together_or_on_few_points_are_judged_too() -> None:
     near = CLOUD[(CLOUD - CLOUD[0]).norm(dim=1).argsort()[:3]]
     corners = torch.tensor(trimesh.creation.box((0.2, 0.2, 0.2)).vertices)

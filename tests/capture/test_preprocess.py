@@ -250,16 +250,6 @@ def test_the_margins_are_what_the_files_hold_around_the_sounds(tmp_path: Path, n
         torch.testing.assert_close(whole, torch.from_numpy(held).float(), rtol=2e-7, atol=0, equal_nan=True)
 
 
-def test_cut_at_the_true_starts_the_sounds_are_those_of_files_without_a_lead(tmp_path: Path) -> None:
-    leads = (30, 217, 1003)
-    impacts = read_capture(fill(tmp_path, replace=pre_triggered(*leads)), CaptureSettings(seconds=0.3)).impacts
-    onsets = torch.tensor([row.onset_seconds * RATE for row in check(tmp_path).recordings], dtype=torch.float64)
-    cut = impacts.delayed(torch.tensor(leads, dtype=torch.float64) - onsets.round())
-    # Without a lead the sounds hold other noise, 1e-4 root mean square, in 7200 samples.
-    clean = np.stack([ring(0.3, noise=0.0, seed=seed) for seed in range(3)])
-    assert np.abs(cut.sounds.numpy() - clean).max() < 6e-4
-
-
 @pytest.mark.parametrize("settings", [{"align": False}, {"time_zero": "peak"}])
 def test_sounds_that_are_not_aligned_or_start_at_their_peaks_are_final(tmp_path: Path, settings: dict) -> None:
     impacts = read_capture(fill(tmp_path), CaptureSettings(**settings)).impacts
@@ -351,25 +341,6 @@ def test_a_plate_s_responses_start_with_the_impact_at_any_rate(rate: float, cont
     files = [Recording("plate", each[None], rate, "FLOAT") for each in np.concatenate([noise, sounds], axis=1)]
     prepared = [prepare(each, CaptureSettings()) for each in files]
     assert start_with_impact(prepared) == (lead == 0)
-
-
-@pytest.mark.parametrize("leads", [(6, 6, 6), (3, 9, 5), (0, 0, 100)])
-def test_with_anything_before_the_impact_each_onset_is_found(tmp_path: Path, leads: tuple[int, ...]) -> None:
-    folder = fill(tmp_path, replace=pre_triggered(*leads))
-    report = check(folder)
-    assert report.remarks == ()
-    for row, lead in zip(report.recordings, leads, strict=True):
-        assert abs(row.onset_seconds * RATE - lead) <= 3
-
-
-def test_a_force_channel_says_where_an_impulse_response_starts(tmp_path: Path) -> None:
-    force = np.zeros(4000)
-    force[1:6] = [1, 3, 4, 3, 1]
-    files = {name: np.stack([force, ring(0.5, seed=seed)], axis=1) for seed, name in enumerate(NAMES)}
-    settings = CaptureSettings(force_channel=1)
-    report = check(fill(tmp_path, replace=files), settings)
-    assert report.remarks == ()
-    assert {row.onset_seconds for row in report.recordings} == {1 / RATE}
 
 
 def test_a_dataset_s_gain_is_divided_out_of_the_margins_too() -> None:

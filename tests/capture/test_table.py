@@ -7,8 +7,6 @@ import torch
 import trimesh
 
 from avmsf.capture import CaptureSettings, read_capture
-from avmsf.capture.settings import METRES
-from avmsf.capture.table import fitting_units
 from factories.capture_folder import ROWS, fill
 
 CONTACTS = torch.tensor([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]], dtype=torch.float64)
@@ -24,29 +22,19 @@ def test_rows_keep_their_order_and_contacts_are_meters(tmp_path: Path) -> None:
     assert capture.surface is None
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "\ufefffile,x,y,z\r\na.wav,0.1,0,0\r\nb.wav,0,0.2,0\r\nc.wav,0,0,0.3\r\n",
-        " File , X,Y , z\n a.wav , 0.1, 0 ,0\n\nb.wav,0,0.2,0\nc.wav,0,0,0.3",
-        "file;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
-        "file\tx\ty\tz\na.wav\t0.1\t0\t0\nb.wav\t0\t0.2\t0\nc.wav\t0\t0\t0.3\n",
-        "sep=;\nfile;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
-        "sep=,\n# a, b\nfile,x,y,z\na.wav,0.1,0,0\nb.wav,0,0.2,0\nc.wav,0,0,0.3\n",
-        "# bowl\n#\nfile,x,y,z\na.wav,0.1,\u22120,0\nb.wav,0,0.2,0\nc.wav,0,0,0.3\n",
-        'z,y,x,file\n0,0,0.1,"a.wav"\n0,0.2,0,.\\b.wav\n0.3,0,0,./c.wav\n,,,\n',
-    ],
-    ids=[
-        "bom and windows",
-        "spaces, case",
-        "semicolons",
-        "tabs",
-        "sep",
-        "sep, comment",
-        "comments, minus",
-        "order, quotes, backslash, empty row",
-    ],
-)
+SPREADSHEETS = {
+    "bom and windows": "\ufefffile,x,y,z\r\na.wav,0.1,0,0\r\nb.wav,0,0.2,0\r\nc.wav,0,0,0.3\r\n",
+    "spaces, case": " File , X,Y , z\n a.wav , 0.1, 0 ,0\n\nb.wav,0,0.2,0\nc.wav,0,0,0.3",
+    "semicolons": "file;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
+    "tabs": "file\tx\ty\tz\na.wav\t0.1\t0\t0\nb.wav\t0\t0.2\t0\nc.wav\t0\t0\t0.3\n",
+    "sep": "sep=;\nfile;x;y;z\na.wav;0,1;0;0\nb.wav;0;0,2;0\nc.wav;0;0;0,3\n",
+    "sep, comment": "sep=,\n# a, b\nfile,x,y,z\na.wav,0.1,0,0\nb.wav,0,0.2,0\nc.wav,0,0,0.3\n",
+    "comments, minus": "# bowl\n#\nfile,x,y,z\na.wav,0.1,\u22120,0\nb.wav,0,0.2,0\nc.wav,0,0,0.3\n",
+    "order, quotes, backslash, empty row": 'z,y,x,file\n0,0,0.1,"a.wav"\n0,0.2,0,.\\b.wav\n0.3,0,0,./c.wav\n,,,\n',
+}
+
+
+@pytest.mark.parametrize("text", SPREADSHEETS.values(), ids=SPREADSHEETS)
 def test_what_spreadsheets_write_is_read(tmp_path: Path, text: str) -> None:
     folder = fill(tmp_path)
     (folder / "impacts.csv").write_bytes(text.encode())
@@ -84,30 +72,6 @@ def test_directions_become_unit_vectors(tmp_path: Path) -> None:
     directions = read_capture(fill(tmp_path, header="file,x,y,z,nx,ny,nz", rows=rows)).impacts.directions
     assert directions is not None
     assert torch.allclose(directions, torch.tensor([[0, 0, -1.0], [0.6, 0, 0.8], [1, 0, 0]]), rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize(
-    ("written", "fitting"),
-    [(200.0, ["cm", "mm"]), (2.0, ["m", "cm", "in", "ft"]), (2e7, []), (22.4, ["cm", "mm", "in"])],
-)
-def test_units_that_fit_an_object_are_suggested(written: float, fitting: list[str]) -> None:
-    advice = fitting_units(written)
-    assert [unit for unit in METRES if f'"{unit}"' in advice] == fitting
-
-
-def test_keys_are_read_and_whole_numbers_serve_as_numbers(tmp_path: Path) -> None:
-    path = tmp_path / "capture.toml"
-    for text, settings in (
-        ("", CaptureSettings()),
-        (
-            'unit = "mm"\nseconds = 2\nforce_channel = 1\nresponse_channel = 2\nalign = false\nheld = [[0, 1.5, 2]]\n',
-            CaptureSettings(
-                unit="mm", seconds=2.0, force_channel=1, response_channel=2, align=False, held=((0.0, 1.5, 2.0),)
-            ),
-        ),
-    ):
-        path.write_text(text)
-        assert CaptureSettings.read(path) == settings
 
 
 @pytest.mark.parametrize(("unit", "meters"), [("m", 1), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254), ("ft", 0.3048)])
