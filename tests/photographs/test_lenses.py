@@ -115,13 +115,6 @@ def test_every_pixel_shows_something_and_little_is_lost(taken: tuple[Lens, Proje
     assert beyond(0.99) > 0.1
 
 
-def test_masks_are_undistorted_alike(taken: tuple[Lens, Project, np.ndarray]) -> None:
-    lens, _, image = taken
-    mask = np.where(image[..., 0] > 127, 255, 0).astype(np.uint8)
-    straight, _ = undistort(np.repeat(mask[..., None], 4, axis=2), lens)
-    assert np.array_equal(straight[..., 3], straight[..., 1])
-
-
 def test_a_pinhole_is_left_as_it_is() -> None:
     image = scene(plane_points(Lens(FOCAL, CENTER, WIDTH, HEIGHT))).reshape(HEIGHT, WIDTH, 3)
     lens = Lens(FOCAL, CENTER, WIDTH, HEIGHT, (0.0, 0.0, 0.0, 0.0, 0.0))

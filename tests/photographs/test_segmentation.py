@@ -132,27 +132,6 @@ def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped(views: lis
     assert min(overlap(view, row) for row, view in enumerate(found)) > 0.9
 
 
-def test_blur_at_the_outline_belongs_half_to_either_side(views: list[View]) -> None:
-    """A lens out of focus by a pixel or so moves no outline: where half of the object's light is left is its edge."""
-    blurred = [torch.from_numpy(cv2.GaussianBlur(view.image.numpy(), (0, 0), 1.3)) for view in views]
-    found = find_foreground([replace(view, image=image) for view, image in zip(views, blurred, strict=True)])
-    areas = [float(view.mask.sum()) / 255 / seen(row)[0].sum() for row, view in enumerate(found)]
-    # A rim of one pixel would be a fifth of the area.
-    assert 0.9 < np.mean(areas) < 1.1
-    assert np.mean([overlap(view, row) for row, view in enumerate(found)]) > 0.9
-
-
-def test_what_touches_the_object_in_one_view_alone_is_dropped(views: list[View]) -> None:
-    columns = np.flatnonzero(seen(4)[0].any(axis=0))
-    stand = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    stand[HEIGHT // 2 :, columns.mean().astype(int) - 2 : columns.mean().astype(int) + 3] = True
-    stand &= ~seen(4)[0]
-    views[4] = painted(views[4], stand, (200.0, 200.0, 200.0))
-    mask = find_foreground(views)[4].mask.numpy() > 127
-    # Some of it lies where the hull is loose: seen as object by all but one view.
-    assert mask[stand].mean() < 0.3
-
-
 def test_given_masks_stay(views: list[View]) -> None:
     given = torch.from_numpy(seen(5)[0].astype(np.uint8) * np.uint8(200))
     views[5] = replace(views[5], mask=given)

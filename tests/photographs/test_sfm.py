@@ -1,9 +1,7 @@
 """Cameras found from pictures alone, against those that took them; and whatever can go wrong on the way."""
 
-import json
 import math
 import subprocess
-import sys
 import textwrap
 import time
 import warnings
@@ -21,7 +19,7 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs import read_views
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import render_views
-from avmsf.photographs.sfm import WORKER, estimate_cameras
+from avmsf.photographs.sfm import estimate_cameras
 from factories.raising import raises
 
 VIEWS, SIZE = 10, 256
@@ -114,9 +112,9 @@ def test_only_the_model_is_left_and_images_without_a_camera_are_named(found: tup
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_masks_count(taken: tuple[View, ...], tmp_path: Path) -> None:
+def test_masks_count(taken: tuple[View, ...], tmp_path: Path) -> None:
     contents = []
-    for name in ("one", "two", "masked"):
+    for name in ("whole", "masked"):
         fill(tmp_path / name / "images", taken[:4])
         if name == "masked":
             mask = np.zeros((SIZE, SIZE), dtype=np.uint8)
@@ -126,9 +124,8 @@ def test_the_same_seed_gives_the_same_bytes_and_masks_count(taken: tuple[View, .
                 cv2.imwrite(str(tmp_path / name / "masks" / f"{view.name}.png"), mask)
         estimate_cameras(tmp_path / name / "images", tmp_path / name, features=512, threads=1, seed=5)
         contents.append((tmp_path / name / "sparse/0/images.bin").read_bytes())
-    assert contents[0] == contents[1]
     # Each feature is 24 bytes, x and y in float64 first, behind the image's 64 bytes, name and count.
-    for content, most in ((contents[0], SIZE), (contents[2], SIZE // 2)):
+    for content, most in zip(contents, (SIZE, SIZE // 2), strict=True):
         start = content.index(b".png\0") + len(b".png\0")
         count = int.from_bytes(content[start : start + 8], "little")
         rows = np.frombuffer(content[start + 8 : start + 8 + 24 * count], dtype=np.dtype("<f8, <f8, <u8"))
@@ -224,20 +221,6 @@ def test_time_ends_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         estimate_cameras(folder / "images", folder, timeout=3.0)
     assert gone(int((tmp_path / "pid").read_text()))
     assert [path.name for path in folder.iterdir()] == ["images"]
-
-
-def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path: Path) -> None:
-    fill(tmp_path / "images", taken)
-    names = sorted(path.name for path in (tmp_path / "images").iterdir())
-    job = {"names": dict(zip(names, names, strict=True)), "seed": 0, "features": 8192, "threads": 1}
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    command = [sys.executable, "-P", str(WORKER), str(tmp_path / "job.json")]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
-        assert worker.stdout.readline() == b"stage features\n"
-        # What a dying parent leaves behind: its end of the pipe, closed.
-        worker.stdin.close()
-        assert worker.wait(10) == 1
-    assert not (tmp_path / "result.json").exists()
 
 
 def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

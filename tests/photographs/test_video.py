@@ -2,16 +2,14 @@
 
 import struct
 from collections.abc import Iterable
-from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
-from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.photographs.video import pick_frames, sharpness
-from factories.raising import raises, warns
+from avmsf.errors import CaptureError
+from avmsf.photographs.video import pick_frames
+from factories.raising import raises
 
 SHARP = (2, 11, 13, 21, 28, 30)
 """Of 36 frames, one in each sixth that is not blurred."""
@@ -54,15 +52,6 @@ def test_the_sharp_frame_of_each_span_is_kept(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.avi", "images"]
 
 
-def test_blur_lowers_the_sharpness_at_any_size() -> None:
-    for size in (64, 700):
-        frame = picture(3, blurred=False, width=size, height=size)
-        values = [sharpness(cv2.GaussianBlur(frame, (0, 0), sigma)) for sigma in (0.5, 1.0, 2.0, 4.0)]
-        assert values == sorted(values, reverse=True)
-        assert values[-1] < 0.1 * values[0]
-    assert sharpness(np.full((32, 32, 3), 90, dtype=np.uint8)) == 0
-
-
 def turn(path: Path) -> None:
     """Write a turn by 90 degrees clockwise into the matrix of an MP4's track header."""
     content = bytearray(path.read_bytes())
@@ -82,29 +71,6 @@ def test_a_video_taken_upright_is_written_upright(tmp_path: Path) -> None:
     lying, upright = cv2.imread(str(plain)), cv2.imread(str(turned))
     assert lying.shape == (64, 96, 3)
     assert np.array_equal(upright, cv2.rotate(lying, cv2.ROTATE_90_CLOCKWISE))
-
-
-@pytest.mark.parametrize("claimed", [0, 5, 35, 37, 90])
-def test_spans_go_by_the_frames_that_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, claimed: int) -> None:
-    film(tmp_path / "a.avi")
-
-    opened = cv2.VideoCapture
-
-    class Claiming:
-        def __init__(self, path: str) -> None:
-            self.video = opened(path)
-
-        def get(self, what: int) -> float:
-            return claimed if what == cv2.CAP_PROP_FRAME_COUNT else self.video.get(what)
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(self.video, name)
-
-    monkeypatch.setattr(cv2, "VideoCapture", Claiming)
-    ended_early = warns(CaptureWarning, file="a.avi", name="frames", value=36) if claimed == 90 else nullcontext()
-    with ended_early:
-        picked = pick(tmp_path / "a.avi", tmp_path / "images", 6)
-    assert [path.name for path in picked] == names(SHARP)
 
 
 def test_what_cannot_be_picked_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
