@@ -108,6 +108,7 @@ def test_without_a_residual_none_is_kept():
     train, _ = parted(with_clicks(strikes(20)))
     field = fitted(train, replace(CONFIG, residual=False))
     assert field.residual.recordings is None
+    assert not field.residual.magnitude.any()
     assert set(field.origin.report["residual"]) == {"noise"}
 
 

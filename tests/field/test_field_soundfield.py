@@ -1,6 +1,5 @@
 """What a field renders: each contact's own sound, in whatever company, at whatever force."""
 
-from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -57,14 +56,6 @@ def test_gaussian_noise_is_the_draw_of_the_fits_seed():
     torch.testing.assert_close(rest, expected, rtol=0, atol=1e-3 * float(expected.std()))
 
 
-def test_fields_of_low_fluctuation_noise_differ_in_its_spectrum_alone():
-    config = replace(field().origin.config, seed=5)
-    other = replace(field(), origin=replace(field().origin, config=config))
-    assert field().origin.config.residual_noise == "low-fluctuation"
-    assert torch.equal(other.noise(), field().noise())
-    assert torch.equal(other.noise(6000)[:2400], field().noise())
-
-
 @pytest.mark.parametrize("rows", [[0], [7], [3, 39], list(range(39, -1, -1)), list(range(33))])
 def test_a_contacts_sound_does_not_depend_on_its_company(rows):
     """More contacts than one batch, one alone, the last one of a batch: to the rounding of other orders of sums."""
@@ -81,18 +72,3 @@ def test_force_scales_the_modes_and_leaves_the_background():
     assert torch.equal(field().render(CONTACTS, forces=0.0), (2.0 * noise).expand(40, -1))
     forces = torch.linspace(0.1, 4.0, 40)
     assert torch.equal(field().render(CONTACTS, forces=forces), forces[:, None] * modes + 2.0 * noise)
-
-
-def test_force_scales_noise_that_is_no_background():
-    trained = replace(field(), residual=replace(field().residual, force=None))
-    assert torch.equal(trained.render(CONTACTS, forces=4.0), 4.0 * trained.render(CONTACTS))
-
-
-def test_rendering_keeps_no_gradients_and_changes_no_chance():
-    before = torch.get_rng_state()
-    in_training = replace(field(), gain_field=deepcopy(field().gain_field).requires_grad_(True))
-    assert not in_training.render(CONTACTS).requires_grad
-    assert not in_training.gains(CONTACTS).requires_grad
-    assert not in_training.dampings(CONTACTS).requires_grad
-    assert not any(parameter.requires_grad for parameter in field().gain_field.parameters())
-    assert torch.equal(torch.get_rng_state(), before)

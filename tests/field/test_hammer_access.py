@@ -97,17 +97,6 @@ def test_the_axis_of_a_hammer_lies_clear_and_is_the_nearest_to_the_normal() -> N
     assert (axes[1:, 2] > 0).all()
 
 
-def test_suggestions_are_struck_along_the_axis_that_lies_clear(monkeypatch: pytest.MonkeyPatch) -> None:
-    contacts, leaning = bar_contacts(6), np.array([0.6, 0.0, 0.8])
-
-    def judge(access: MeshAccess, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return np.ones(len(places), dtype=bool), places, np.broadcast_to(leaning, places.shape)
-
-    monkeypatch.setattr(MeshAccess, "__call__", judge)
-    found = suggest(sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1))), 2).directions
-    assert torch.allclose(found, -torch.from_numpy(leaning).expand(2, 3))
-
-
 def test_the_floor_of_a_cup_is_struck_from_above_unless_the_hammer_is_too_thick() -> None:
     for inner, fits in ((2.0 * HAMMER_DIAMETER, True), (0.4 * HAMMER_DIAMETER, False)):
         struck, _, _ = by_mesh(cup(inner, 0.1))(np.array([[0.0, 0.0, WALL]]))

@@ -1,7 +1,5 @@
 """What gains are fitted to: signs by direction, alignment, and places that are held out."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -15,7 +13,7 @@ from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
-from factories.plate_field import QUICK, plate_extraction, plate_fit, plate_impacts
+from factories.plate_field import plate_impacts
 
 
 def _row(count: int) -> torch.Tensor:
@@ -82,14 +80,6 @@ def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(
     assert distance(*(torch.view_as_real(each.measured).flatten(1) for each in known)) < ALIGNED
 
 
-def test_recordings_in_double_precision_are_recognized_by_their_alignment(delayed: tuple[Impacts, Extraction]) -> None:
-    train = delayed[0]
-    double = replace(train, sounds=train.sounds.double(), before=train.before.double(), after=train.after.double())
-    modes = extract_modes(double)
-    aligned = double.delayed(modes.alignment.delays).sounds.float()
-    assert torch.equal(gain_data(double, FEATURES, modes, CONFIG).train.sounds, aligned)
-
-
 def test_aligned_recordings_are_not_delayed_again(delayed: tuple[Impacts, Extraction]) -> None:
     train, modes = delayed
     aligned = modes.aligned(train)
@@ -116,15 +106,3 @@ def test_repeats_are_held_out_with_their_places(apart: float) -> None:
     extent = (contacts.amax(0) - contacts.amin(0)).norm()
     again = contacts + apart * extent * torch.tensor([0.0, 0.0, 1.0], dtype=contacts.dtype)
     assert sorted(held_out(torch.cat([contacts, again]), 0.25)) == sorted(once + [row + COUNT for row in once])
-
-
-def test_a_fit_validates_at_places_it_does_not_learn_from() -> None:
-    impacts = plate_impacts(COUNT)
-    names = tuple(f"{row:02d}" for row in range(2 * COUNT))
-    twice = replace(impacts.take([*range(COUNT)] * 2), names=names)
-    config = replace(QUICK, damping="validated", warmup_steps=1, steps=1)
-    features = FeatureField.from_contacts(impacts.contacts)
-    report = plate_fit(config, train=twice, features=features, modes=plate_extraction(twice)).origin.report
-    held = {int(name) for name in report["validation_contacts"]}
-    assert len(held) == 6
-    assert {row % COUNT for row in held}.isdisjoint(row % COUNT for row in set(range(2 * COUNT)) - held)

@@ -90,13 +90,6 @@ def test_the_family_of_the_page_takes_part_in_fits_and_files(monkeypatch):
     assert torch.equal(back.predict(asked).mean, given.predict(asked).mean)
 
 
-def test_elastic_kernels_are_loadings_times_factors():
-    family, known, others = Elastic(impacts(6, seed=1), SIZE, plate()), impacts(4, seed=3), impacts(9, seed=2)
-    rows = torch.arange(len(family)).flip(0)
-    found = family.factors(others, known) @ family.loadings(known, rows).mT
-    assert torch.allclose(found, family.take(rows).between(others, known), rtol=1e-10, atol=1e-12)
-
-
 @every_kind
 @pytest.mark.parametrize("count", [4, 12])
 def test_kernels_are_covariances_of_mean_one_at_the_contacts(kind, count):

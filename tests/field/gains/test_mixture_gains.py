@@ -116,14 +116,6 @@ def test_covariances_are_those_of_the_most_probable_hypothesis(make):
         assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * noise
 
 
-def test_shares_are_of_the_families_that_modes_come_from():
-    shares = model().shares()
-    assert torch.allclose(shares.sum(0), torch.ones(MODES, dtype=torch.float64))
-    kinds = [family.kind for family in model().families]
-    assert [kinds[row] for row in shares.argmax(0).tolist()][:4] == ["elastic", "smooth", "elastic", "elastic"]
-    assert float(shares.amax(0)[:4].min()) > 0.9
-
-
 def test_one_contact_leaves_families_as_probable_as_they_were():
     """Its gain may be of any scale, so it says nothing of the kernels; families of one kind share its probability."""
     sites = impacts(1, seed=1)
@@ -167,18 +159,6 @@ def test_scaled_gains_scale_the_model(factor):
     assert torch.allclose(gains_at(other), factor * gains_at(one), rtol=1e-5, atol=1e-6 * abs(factor))
     assert torch.allclose(deviation_at(other), abs(factor) * deviation_at(one), rtol=1e-4, atol=1e-6 * abs(factor))
     assert torch.allclose(other.noise(), abs(factor) * one.noise(), rtol=1e-5)
-
-
-def test_take_takes_modes_in_their_order():
-    given, rows = replace(model(), measured=2.0 * model().values), torch.tensor([3, 0, 4])
-    taken = given.take(rows)
-    assert torch.equal(taken.values, given.values[:, rows])
-    assert torch.equal(taken.measured, given.measured[:, rows])
-    assert torch.allclose(gains_at(taken), gains_at(given)[:, rows], rtol=1e-6, atol=1e-7)
-    assert torch.allclose(deviation_at(taken), deviation_at(given)[:, rows], rtol=1e-5, atol=1e-7)
-    assert torch.allclose(taken.leave_one_out(), given.leave_one_out()[:, rows], rtol=1e-9)
-    assert torch.equal(taken.shares(), given.shares()[:, rows])
-    assert torch.equal(taken.noise(), given.noise()[rows])
 
 
 def test_without_contacts_the_rest_predicts():

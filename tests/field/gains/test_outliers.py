@@ -16,7 +16,6 @@ from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import (
     WIDE_NOISE_SHARES,
-    Credibility,
     Fit,
     Outlier,
     PredictiveRatios,
@@ -239,11 +238,6 @@ def test_leaving_wrong_labels_out_predicts_the_others_better_and_right_ones_not(
         fewer, whole = fit(rows, NOISE_SHARES), fit(torch.arange(CONTACTS), NOISE_SHARES)
         kept = replace(measured, values=measured.values[rows])
         assert predicts_better(fewer.leave_one_out(), whole.leave_one_out()[rows], kept) == better
-
-
-@pytest.mark.parametrize(("with_body", "without", "credible"), [(0.8, 0.4, True), (0.6, 0.1, False), (2.0, 1.9, False)])
-def test_body_has_to_predict_and_to_add(with_body: float, without: float, credible: bool) -> None:
-    assert Credibility(with_body, without).credible == credible
 
 
 def test_a_contact_near_a_support_does_not_outweigh_the_others():
