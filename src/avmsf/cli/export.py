@@ -24,10 +24,11 @@ from avmsf.pipeline.config import CACHE, SURFACE
 
 if TYPE_CHECKING:
     from avmsf.export.sampled_field import SampledField
+    from avmsf.export.writing import Written
     from avmsf.field.sound_field import SoundField
     from avmsf.mesh.surface import Surface
 
-    _Prepared = tuple[SoundField | SampledField, dict[str, Any]]
+    _Prepared = tuple[SampledField, dict[str, Any]]
     """What a writer writes, and its settings."""
 
 _CONTACTS = ("position", "contact_table", "unit")
@@ -162,9 +163,9 @@ def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
     if len(options.fields) > 1:
         return run_many("export", options, raising=ExportError)
+    from avmsf import export
     from avmsf.export.faust import contacts_path
     from avmsf.export.samples import INSTRUMENT
-    from avmsf.export.write import writer_of
     from avmsf.field.store import load
 
     for each in fields(options):
@@ -172,7 +173,9 @@ def run(options: Options) -> int:
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
     source, settings = _prepared(load(options.field), options)
-    written = writer_of(options.to)(source, options.output, overwrite=options.overwrite, **settings)
+    written: Written = getattr(export, FORMATS[options.to].writer)(
+        source, options.output, overwrite=options.overwrite, **settings
+    )
     for remark in written.remarks:
         note(remark)
     if written.error:
@@ -209,7 +212,7 @@ def _prepared(field: "SoundField", options: Options) -> "_Prepared":
     """Return what a format's writer writes, and its settings."""
     match options.to:
         case "web":
-            return field, _page_settings(field, options)
+            return _sampled(field, options), _page_settings(field, options)
         case "gltf":
             shown, meters = _object(field, options)
             return _sampled(field, options), {"object": shown, "meters": meters, "up": options.up}
@@ -308,7 +311,6 @@ def _page_settings(field: "SoundField", options: Options) -> dict[str, Any]:
         "meters": meters,
         "surface": None if isinstance(source, Surface) else field.gain_field.surface,
         "strikes": None if recorded is None else read_capture(recorded).impacts,
-        "limit": options.contacts or FORMATS["web"].points,
     }
 
 

@@ -20,9 +20,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
 from avmsf.export.geometry import ObjectKind, read_object
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import MAX_POINTS, Written, no_modes, pack, write_folder
-from avmsf.field.positions import points_on_object
-from avmsf.field.sound_field import SoundField
+from avmsf.export.writing import Written, no_modes, pack, write_folder
 from avmsf.mesh.surface import Surface
 
 FORMAT = 1
@@ -49,59 +47,50 @@ class Bundle:
 
 
 def make_bundle(
-    field: SoundField | SampledField,
+    field: SampledField,
     *,
     object: Path | Surface | None = None,
     meters: float = 1.0,
     surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
-    limit: int = MAX_POINTS,
     mute: bool = False,
 ) -> Bundle:
-    """Return a field's bundle at `limit` contacts at most.
+    """Return a field's bundle.
 
     `object` is the geometry to show: a mesh with coordinates in units of `meters`, Gaussians, or by default the
     contacts. `surface`, in meters, is an alternative to switch to, such as the surface of the field's body. `strikes`
     are recorded impacts for comparison. A field without modes is allowed if `mute`, for an object that is not recorded
     yet. Raises `ExportError`.
     """
-    remarks: tuple[str, ...] = ()
-    if isinstance(field, SoundField):
-        points = points_on_object(field.gain_field)
-        count, sampled = len(points), SampledField.of(field, points, limit=limit)
-    else:
-        count, sampled = len(field), field if len(field) <= limit else field.take(field.spread(limit))
-    if len(sampled) < count:
-        remarks = (f"{len(sampled):,} of the field's {count:,} contacts are exported, spread evenly",)
-    if len(sampled.frequency) == 0 and not mute:
+    if len(field.frequency) == 0 and not mute:
         raise no_modes()
-    kind, shown, notes = read_object(object, sampled.points, meters=meters)
-    other, triangles, further_notes = read_object(surface, sampled.points)
-    content, places = pack(_tensors(sampled))
+    kind, shown, notes = read_object(object, field.points, meters=meters)
+    other, triangles, further_notes = read_object(surface, field.points)
+    content, places = pack(_tensors(field))
     files, name = {"field.bin": content}, _OBJECTS[kind]
     if name is not None:
         files[name] = shown
     if other == "mesh":
         files[SURFACE] = triangles
-    records, sounds = _strikes(strikes, sampled)
+    records, sounds = _strikes(strikes, field)
     manifest = {
         "format": FORMAT,
         "package": version("avmsf"),
-        "name": sampled.name,
-        "sampleRate": sampled.sample_rate,
-        "samples": sampled.samples,
-        "perNewton": sampled.per_newton,
-        "modes": len(sampled.frequency),
-        "supporting": list(sampled.supporting),
-        "points": len(sampled),
-        "damping": "shared" if sampled.shared_damping else "perContact",
+        "name": field.name,
+        "sampleRate": field.sample_rate,
+        "samples": field.samples,
+        "perNewton": field.per_newton,
+        "modes": len(field.frequency),
+        "supporting": list(field.supporting),
+        "points": len(field),
+        "damping": "shared" if field.shared_damping else "perContact",
         "tensors": {name: {"file": "field.bin", **place} for name, place in places.items()},
         "object": {"kind": kind, "file": name},
         "strikes": records,
         "live": None,
         "surface": {"kind": "mesh", "file": SURFACE} if SURFACE in files else None,
     }
-    return Bundle(manifest, {**files, **sounds}, remarks + notes + further_notes)
+    return Bundle(manifest, {**files, **sounds}, notes + further_notes)
 
 
 def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:

@@ -23,7 +23,6 @@ from avmsf.errors import ExportError
 from avmsf.export.bundle import Bundle, make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Written, generator, write_files, write_folder
-from avmsf.field.sound_field import SoundField
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 """The import map, which has the addresses of three and spark."""
@@ -52,13 +51,11 @@ MEDIA_TYPES = {
 """Media types of the page's files by suffix; no other files are included or served."""
 
 
-def write_webpage(
-    field: SoundField | SampledField, output: str | Path, *, overwrite: bool = False, **options: Any
-) -> Written:
+def write_webpage(field: SampledField, output: str | Path, *, overwrite: bool = False, **options: Any) -> Written:
     """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
 
-    `options` are those of `make_bundle`, whose errors are raised: `object`, `surface` and `strikes` to show, `limit` of
-    contacts. What exists is replaced only with `overwrite`.
+    `options` are those of `make_bundle`, whose errors are raised: `object`, `surface` and `strikes` to show. What
+    exists is replaced only with `overwrite`.
     """
     output, bundle = Path(output), make_bundle(field, **options)
     if output.suffix.lower() in FORMATS["web"].suffixes:

@@ -1,6 +1,5 @@
 """A field in any format of other tools, by the ending of a file's name or the format's."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +42,8 @@ def write(
             file=output,
             name="to",
         )
-    limit = FORMATS[kind].points if contacts is None else contacts
-    if kind == "web":
-        return export.write_webpage(field, output, limit=limit, **options)
-    sampled = SampledField.of(field, limit=limit)
+    sampled = SampledField.of(field, limit=FORMATS[kind].points if contacts is None else contacts)
     if kind == "wavs" or (kind == "faust" and contacts is not None):
         options = {"contacts": len(sampled), **options}
-    return writer_of(kind)(sampled, output, **options)
-
-
-def writer_of(kind: Format) -> Callable[..., Written]:
-    """Return the writer of a format, of a field at points of the object; the page's takes the field itself too."""
-    writer: Callable[..., Written] = getattr(export, FORMATS[kind].writer)
-    return writer
+    written: Written = getattr(export, FORMATS[kind].writer)(sampled, output, **options)
+    return written

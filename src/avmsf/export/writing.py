@@ -25,7 +25,7 @@ class Target(NamedTuple):
     """What belongs to a format."""
 
     writer: str
-    """Function of `avmsf.export`, see `write.writer_of`."""
+    """Function of `avmsf.export`, of a field at points of the object."""
     points: int
     """Default number of contacts, which its tools read quickly."""
     suffixes: tuple[str, ...] = ()

@@ -6,10 +6,9 @@ undamped natural frequencies, and mass-normalized shapes on the surface, of whic
 Core types: `Solid` (`solid`), `Material` (`material`), `ElasticModes` (kept by `elastic_store`), `CandidateBodies`, of
 which each body is a hypothesis of what lies behind a surface, `Vibration`, damped modes.
 
-- Meshes: `meshing` repairs a surface (generalized cross-validation against noise, quadric decimation), `remeshing`
-  splits and collapses edges, `tetrahedra` fills by fTetWild (Hu et al. 2020; in a process, `tetrahedra_worker`),
-  `walls` makes layers of prisms along thin walls, where tetrahedra lock; `body_meshes` does so with a wanted number of
-  degrees of freedom.
+- Meshes: `meshing` repairs a surface (generalized cross-validation for noise, quadric decimation), `remeshing` splits
+  and collapses edges, `tetrahedra` (`tetrahedra_worker`) fills by fTetWild (Hu et al. 2020), `walls` makes layers
+  of prisms along thin walls, where tetrahedra lock; `body_meshes` does so with a wanted number of degrees of freedom.
 - Modes: quadratic tetrahedra (`elements`), block Lanczos (`eigen`) beside the motions of a rigid body. `isotropic` has
   them for every isotropic material by a reduced basis (Noor and Peters 1980).
 - An object that is partly known: `candidate_bodies` computes bodies by thickness and by where they are held

@@ -21,8 +21,7 @@ PyTorch's autograd, whose loops numba compiles.
 4. `ellipses.project_points_back` and `harmonics.shade_back` carry these derivatives on to centers, rotations, scales,
    opacities and harmonics by the chain rule, in the steps of `project_points` and `shade` in reverse.
 
-On a GPU gsplat does all of this. Settings are in `config`. To start reading: `cloud`, then `fit.splat`, then
-`rasterizer.protocol`.
+On a GPU gsplat does all of this. To start reading: `cloud`, `fit.splat` and its `config`, `rasterizer.protocol`.
 """
 
 import lazy_loader

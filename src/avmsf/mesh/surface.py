@@ -117,11 +117,9 @@ def sample_surface(surface: Surface, count: int, *, seed: Seed) -> Float[Tensor,
 
 def surface_points(surface: Surface, *, count: int = MOST_POINTS) -> Float[Tensor, "points 3"]:
     """Return points all over a surface, always the same: `count` on its triangles, evenly by area, and its vertices."""
-    vertices = surface.vertices.double()
-    if not len(surface.faces):
-        return vertices
     import trimesh
 
+    vertices = surface.vertices.double()
     mesh = trimesh.Trimesh(vertices.numpy(), surface.faces.numpy(), process=False)
     if not mesh.area > 0:
         return vertices

@@ -12,7 +12,6 @@ comes a `SoundField`. Start reading at `fit.fit`, which `avmsf.fit` and `avmsf f
 - `bodies`: the finite-element models that a surface may enclose, and the field of one of a known material without
   recordings. `fit`: modes and gains.
 - `config`: settings of all stages, and the presets `default` and `paper`. `record`: what a field's file says of them.
-- `progress`: what the stages report, and how it is shown.
 
 Raises AvmsfError, by its kind: CaptureError, SceneError, SimulationError, ExtractionError, FitError, FolderInUseError.
 """

@@ -23,9 +23,8 @@ class Gains:
     """How strongly impacts at some contacts excite each mode."""
 
     mean: Inexact[Tensor, "contacts modes"]
-    """Signed amplitudes of what starts with each mode's phase, in the unit of the training sounds; the imaginary part
-    is what is a quarter of a period ahead of that. Real where there is nothing of it. Times exp(i phase) they are
-    `Extraction.gains`."""
+    """Signed amplitudes, in the unit of the training sounds, of what starts with each mode's phase; the imaginary part
+    is a quarter of a period ahead. Real where there is none. Times exp(i phase) they are like `Extraction.gains`."""
     _: KW_ONLY
     damping: Float[Tensor, "contacts modes"] | None = None
     """Factors on the modes' dampings; None where these are the same everywhere."""
