@@ -24,7 +24,6 @@ from avmsf.pipeline.config import CACHE, SURFACE
 
 if TYPE_CHECKING:
     from avmsf.export.sampled_field import SampledField
-    from avmsf.export.writing import Written
     from avmsf.field.sound_field import SoundField
     from avmsf.mesh.surface import Surface
 
@@ -163,9 +162,9 @@ def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
     if len(options.fields) > 1:
         return run_many("export", options, raising=ExportError)
-    from avmsf import export
     from avmsf.export.faust import contacts_path
     from avmsf.export.samples import INSTRUMENT
+    from avmsf.export.write import WRITERS
     from avmsf.field.store import load
 
     for each in fields(options):
@@ -173,9 +172,7 @@ def run(options: Options) -> int:
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
     source, settings = _prepared(load(options.field), options)
-    written: Written = getattr(export, FORMATS[options.to].writer)(
-        source, options.output, overwrite=options.overwrite, **settings
-    )
+    written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
     for remark in written.remarks:
         note(remark)
     if written.error:

@@ -1,15 +1,25 @@
 """A field in any format of other tools, by the ending of a file's name or the format's."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from avmsf import export
 from avmsf.errors import ExportError
+from avmsf.export import write_demo, write_faust, write_gltf, write_grid, write_universal, write_webpage
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Format, Written
 from avmsf.field.sound_field import SoundField
 
 _OF_SUFFIX: dict[str, Format] = {suffix: name for name, each in FORMATS.items() for suffix in each.suffixes}
+WRITERS: dict[Format, Callable[..., Written]] = {
+    "web": write_webpage,
+    "gltf": write_gltf,
+    "faust": write_faust,
+    "avmsf-demo": write_demo,
+    "wavs": write_grid,
+    "uff": write_universal,
+}
+"""The writers, of a field at points of the object."""
 
 
 def write(
@@ -45,5 +55,4 @@ def write(
     sampled = SampledField.of(field, limit=FORMATS[kind].points if contacts is None else contacts)
     if kind == "wavs" or (kind == "faust" and contacts is not None):
         options = {"contacts": len(sampled), **options}
-    written: Written = getattr(export, FORMATS[kind].writer)(sampled, output, **options)
-    return written
+    return WRITERS[kind](sampled, output, **options)

@@ -24,8 +24,6 @@ MAX_POINTS = 20_000
 class Target(NamedTuple):
     """What belongs to a format."""
 
-    writer: str
-    """Function of `avmsf.export`, of a field at points of the object."""
     points: int
     """Default number of contacts, which its tools read quickly."""
     suffixes: tuple[str, ...] = ()
@@ -33,12 +31,12 @@ class Target(NamedTuple):
 
 
 FORMATS: dict[Format, Target] = {
-    "web": Target("write_webpage", MAX_POINTS, (".html", ".htm")),
-    "gltf": Target("write_gltf", 2000, (".glb",)),
-    "faust": Target("write_faust", 64, (".dsp", ".lib")),
-    "avmsf-demo": Target("write_demo", 10_000),
-    "wavs": Target("write_grid", 16),
-    "uff": Target("write_universal", 1000, (".uff", ".unv")),
+    "web": Target(MAX_POINTS, (".html", ".htm")),
+    "gltf": Target(2000, (".glb",)),
+    "faust": Target(64, (".dsp", ".lib")),
+    "avmsf-demo": Target(10_000),
+    "wavs": Target(16),
+    "uff": Target(1000, (".uff", ".unv")),
 }
 MANIFEST = "manifest.json"
 
