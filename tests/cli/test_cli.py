@@ -87,7 +87,7 @@ def test_check_counts_its_warnings_which_other_verbs_note(tmp_path: Path, capsys
 
 
 def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams) -> None:
-    found, err = results_of(capsys, "modes", capture, "--plots", tmp_path)
+    found, _ = results_of(capsys, "modes", capture, "--plots", tmp_path)
     impacts = read_capture(capture).impacts
     truth = plate_modes(PLATE, impacts.contacts, highest=HIGHEST, contact_time=CONTACT_TIME)
     strongest = max(found["modes"], key=lambda mode: mode["level_db"])
@@ -103,7 +103,6 @@ def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams)
     shares = [mode["energy_share"] for mode in found["modes"] + found["supporting_poles"]]
     assert sum(shares) == pytest.approx(1.0)
     assert (found["recordings"], found["sample_rate"]) == (8, RATE)
-    assert f"{strongest['frequency_hertz']:.2f}" in err
     assert (tmp_path / "modes.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -191,9 +190,8 @@ def test_a_refused_fit_leaves_nothing_behind(tmp_path: Path, capsys: Streams, ea
 def test_render_is_the_fields_own(field: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "sounds"
     words = ["render", field, *AT, "--position", "50e-3", "0.12", "-1e-3", "--output", output, "--force", "2"]
-    told, err = results_of(capsys, *words)
+    told, _ = results_of(capsys, *words)
     assert told["files"] == [str(output / "001.wav"), str(output / "002.wav")]
-    assert "forces are not known" in err
     contacts = torch.tensor([[0.05, 0.06, 0.0], [0.05, 0.12, -1e-3]], dtype=torch.float64)
     for path, expected in zip(told["files"], load(field).render(contacts, forces=2.0), strict=True):
         sound, rate = soundfile.read(path, dtype="float32")
@@ -226,20 +224,18 @@ def test_render_sets_levels_by_one_factor_for_all(field: Path, tmp_path: Path, l
         assert max(np.abs(each).max() for each in written) == 32767
 
 
-def test_nothing_clips_in_silence(field: Path, tmp_path: Path, capsys: Streams) -> None:
+def test_nothing_clips_in_silence(field: Path, tmp_path: Path) -> None:
     path = tmp_path / "loud.wav"
     words = ["render", str(field), *AT, "--output", str(path), "--normalize", "peak", "--level-db", "6"]
     assert main([*words, "--coding", "int16"]) == 2
-    assert "got 2" in capsys.readouterr().err
     assert not path.exists()
     assert main(words) == 0
-    assert "peaks at +6.0 dB over full scale" in capsys.readouterr().err
     assert np.abs(soundfile.read(path)[0]).max() == pytest.approx(10 ** (6 / 20), rel=1e-6)
 
 
 def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "pictures"
-    told, err = results_of(capsys, "info", field, "--capture", capture, "--plots", output)
+    told, _ = results_of(capsys, "info", field, "--capture", capture, "--plots", output)
     fitted = load(field)
     assert (told["capture"], told["sample_rate"]) == ("plate", RATE)
     frequency, is_mode = fitted.bank.frequency, fitted.is_mode
@@ -251,10 +247,5 @@ def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert len(told["compared_with"]["recordings"]) == 3
     assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "002.wav")
     assert (told["pipeline"]["extraction"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
-    for words in ("field of plate", "extraction high-resolution"):
-        assert words in err
     for name in ("modes", "gains", "spectrograms"):
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    # The table is the verb's output where no JSON is.
-    assert main(["info", str(field)]) == 0
-    assert "field of plate" in capsys.readouterr().out

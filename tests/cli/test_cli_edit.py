@@ -77,7 +77,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> list[int]:
 def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, capsys: Streams) -> None:
     folder, output = field.parent / "look", field.with_name("new.safetensors")
     words = ["edit", field, "-o", output, "--to", "Wood", "--from", "ceramic", "--scale", "2", "--plots", folder]
-    told, err = results_of(capsys, *words)
+    told, _ = results_of(capsys, *words)
     new = load(output)
     expect_same(new, change_material(ceramic(), CERAMIC, WOOD, size=2.0))
     assert told["edits"][0]["to"]["name"] == "wood"
@@ -89,7 +89,6 @@ def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, ca
         ("level_change_db", change),
     ):
         assert [row[name] for row in told["modes"]] == pytest.approx(values.tolist(), abs=1e-4)
-    assert "Poisson's ratio changes from 0.19 to 0.25" in err
     for name in ("modes.png", "spectrograms.png"):
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
     before, after = (soundfile.read(folder / f"{name}.wav")[0] for name in ("before", "after"))
@@ -109,10 +108,9 @@ def test_constants_stand_in_place_of_the_tables(field: Path) -> None:
     expect_same(other, change_material(ceramic(), CERAMIC, replace(GLASS, density=5000.0)))
 
 
-def test_the_old_material_is_told_by_the_dampings_or_the_last_edit(field: Path, capsys: Streams) -> None:
+def test_the_old_material_is_told_by_the_dampings_or_the_last_edit(field: Path) -> None:
     wood = edited(field, "--to", "wood", name="wood")
     assert wood.origin.report[EDITS][0]["from"]["name"] == "ceramic"
-    assert "ceramic assumed" in capsys.readouterr().err
     edited(field.with_name("wood.safetensors"), "--pitch", "1.5", name="high")
     back = edited(field.with_name("high.safetensors"), "--to", "ceramic", name="back")
     assert back.origin.report[EDITS][2]["from"]["name"] == "wood"

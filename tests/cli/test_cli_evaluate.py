@@ -29,16 +29,13 @@ def plates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_dataset_becomes_tables_and_a_page(plates: Path, tmp_path: Path, capsys: Streams) -> None:
     words = [str(plates), *CHEAP, "--output", str(tmp_path / "results")]
-    printed, err = results_of(capsys, "evaluate", "farthest", *words)
+    printed, _ = results_of(capsys, "evaluate", "farthest", *words)
     kept = json.loads((tmp_path / "results" / "summary.json").read_text())
     assert {key: printed[key] for key in kept} == kept
     assert list(kept["methods"]) == ["knn3", "nearest", "white-noise"]
     assert set(kept["methods"]["knn3"]) == {"l1", "l1_log", "envelope", "relative_stft"}
     assert kept["ratio_to_knn3"]["knn3"]["l1"] == 1.0
     assert (kept["dataset"], kept["objects"], kept["test_contacts"]) == ("plates", 2, 16)
-    assert "b: done (2 of 2, " in err
-    assert "L1-log" in err
-    assert err.splitlines()[-1].startswith("next: avmsf evaluate ")
     assert "# farthest on plates" in (tmp_path / "results" / "report.md").read_text()
     before = (tmp_path / "results" / "objects" / "a.json").read_bytes()
     assert run_verb("evaluate", "farthest", *words) == 0

@@ -76,7 +76,7 @@ def located(place: Place, capsys: Streams, *words: str, code: int = 0) -> tuple[
 
 
 def test_an_impact_is_found_drawn_and_told(place: Place, hit: str, tmp_path: Path, capsys: Streams) -> None:
-    printed, err = located(place, capsys, hit, "--output", str(tmp_path / "maps"))
+    printed, _ = located(place, capsys, hit, "--output", str(tmp_path / "maps"))
     (impact,) = printed["impacts"]
     assert impact["position"] == pytest.approx(place.points[STRUCK].tolist(), abs=1e-6)
     assert impact["recording"] == hit
@@ -84,8 +84,6 @@ def test_an_impact_is_found_drawn_and_told(place: Place, hit: str, tmp_path: Pat
     assert impact["mismatch_ratio"] < 0.01
     # The field's own contacts, left out, are badly predicted by the others: the region is as wide as that makes it.
     assert 0.0 < impact["credible_region"]["surface_fraction"] < 0.7
-    assert f"{hit}: impact at (" in err
-    assert f"{100 * impact['explained_energy']:.0f} % of the sound" in err
     assert (tmp_path / "maps" / "hit.png").read_bytes().startswith(b"\x89PNG")
     cloud = trimesh.load(tmp_path / "maps" / "hit.ply")
     likeliest = int(np.argmax(cloud.metadata["_ply_raw"]["vertex"]["data"]["probability"]))
@@ -129,22 +127,19 @@ def test_recordings_without_an_impact_on_the_object_have_no_place(
         place.wav("noise.wav", noise): " dB",
         place.wav("other.wav", place.impact(STRUCK, bank=other)): "a mismatch ratio of",
     }
-    printed, err = located(place, capsys, *cases, "--output", str(tmp_path), code=2)
-    for values, (path, reason) in zip(printed["impacts"], cases.items(), strict=True):
+    printed, _ = located(place, capsys, *cases, "--output", str(tmp_path), code=2)
+    for values, reason in zip(printed["impacts"], cases.values(), strict=True):
         assert (values["status"], values["position"]) == ("not located", None)
         assert reason in values["reason"]
-        assert f"{path}: not located: " in err
-    assert "next: " not in err
     assert not list(tmp_path.iterdir())
 
 
 def test_one_bad_recording_does_not_cost_the_others(place: Place, hit: str, capsys: Streams) -> None:
     unreadable, missing = place.folder / "text.wav", [str(place.folder / "missing.wav"), str(place.folder)]
     unreadable.write_text("no sound")
-    printed, err = located(place, capsys, str(unreadable), *missing, hit, code=2)
+    printed, _ = located(place, capsys, str(unreadable), *missing, hit, code=2)
     assert [(impact["recording"], impact["status"]) for impact in printed["impacts"]] == [(hit, "located")]
     assert [each["recording"] for each in printed["failures"]] == [str(unreadable), *missing]
-    assert "text.wav" in err
 
 
 @pytest.mark.parametrize("several", [(), ("--several",)])
@@ -191,13 +186,12 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_
     lines = [",".join([str(name), *(f"{1000 * value:.9g}" for value in where.tolist())]) for name, where in rows]
     table.write_text("\n".join(["file,x,y,z", *lines]))
     paths = [str(tmp_path / name) for name in names]
-    results, err = located(place, capsys, *paths, "--true-contact-table", str(table), "--unit", "mm")
+    results, _ = located(place, capsys, *paths, "--true-contact-table", str(table), "--unit", "mm")
     first, second, third, fourth = results["impacts"]
     distance = float((points[STRUCK] - points[SECOND_PLACE]).norm())
     assert (first["error"], second["error"]) == pytest.approx((0.0, distance), abs=1e-6)
     assert (first["in_region"], second["in_region"]) == (True, False)
     assert [each.get("training") for each in (first, second, third, fourth)] == [False, False, None, True]
-    assert "1 training recording not counted" in err
     relative = 0.5 * distance / float((points.amax(0) - points.amin(0)).norm())
     wanted = {"impacts": 2, "training": 1, "median_error": 0.5 * distance, "in_region": 0.5}
     wanted |= {"rmed": relative, "rmed_posterior": relative}

@@ -39,8 +39,6 @@ def test_the_demo_goes_all_the_way(
     printed = [shlex.split(line[2:]) for line in out.splitlines() if line.startswith("$ ")]
     assert printed == [["avmsf", *shlex.split(each.format(shlex.quote(str(folder))))] for each in demo.COMMANDS]
     assert (folder / "capture" / "001.wav").is_file()
-    assert f"{shlex.quote(str(folder))}/capture/001.wav" in out
-    assert "4 positions not trained on, 12 trained on" in out
     assert len(load(folder / "mug.safetensors").origin.trained_on) == 12
     assert len(read_splats(folder / "mug.ply")) > 100
     assert {"mug.html", "mug-surface.ply", "capture"} < {each.name for each in folder.iterdir()}

@@ -51,9 +51,8 @@ def test_pictures_become_a_closed_surface_that_is_kept(tmp_path: Path) -> None:
 def test_a_fit_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     write_surface_file(folder)
-    values, err = results_of(capsys, "fit", folder, "--gain-model", "smooth", *TINY)
+    values, _ = results_of(capsys, "fit", folder, "--gain-model", "smooth", *TINY)
     assert values["surface"] == str(folder / ".avmsf" / "surface.ply")
-    assert values["surface"] in err
     assert torch.equal(read_surface(values["surface"]).vertices, slab().vertices)
     assert "surface" in [each["stage"] for each in values["stages"]]
 
@@ -84,9 +83,8 @@ def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Pa
     folder = tmp_path / "slab"
     folder.mkdir()
     write_surface_file(folder)
-    values, err = results_of(capsys, "fit", folder, "--until", "surface", "--plots", tmp_path)
+    values, _ = results_of(capsys, "fit", folder, "--until", "surface", "--plots", tmp_path)
     assert (values["kind"], values["triangles"]) == ("surface", len(slab().faces))
-    assert "closed, volume" in err
     assert (tmp_path / "surface.png").read_bytes().startswith(b"\x89PNG")
     contacts = bar_contacts(6)
     for name, made in (("with", elastic_field), ("without", positional_field)):
