@@ -79,14 +79,6 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
-def test_features_serve_the_fit_of_another_command(kept: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
-    output = tmp_path / "field.safetensors"
-    words = ["fit", str(capture), "--features", str(kept / "features.safetensors"), "--output", str(output), *TINY]
-    assert main([*words, "--gain-model", "network"]) == 0
-    capsys.readouterr()
-    assert torch.equal(load(output).gain_field.points, load(kept / "field.safetensors").gain_field.points)
-
-
 def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(
     kept: Path, capture: Path, tmp_path: Path, capsys: Streams
 ) -> None:

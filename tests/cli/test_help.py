@@ -13,7 +13,6 @@ from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.options import Configured
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
-from avmsf.fem.material import material_named
 from avmsf.simulate.recipe import named_recipe
 from factories.raising import raises
 
@@ -27,12 +26,6 @@ def test_names_of_earlier_versions_lead_to_those_of_today(capsys: Streams) -> No
     for word, command in words.items():
         assert main(command) == 2
         assert RENAMED.get(word, "--position") in capsys.readouterr().err
-
-
-def test_a_similar_material_is_suggested() -> None:
-    with raises(AvmsfError, name="--to", value="wodo") as caught:
-        material_named("wodo", option="--to")
-    assert str(caught.value).endswith("wood?")
 
 
 @pytest.mark.parametrize("verb", VERBS)

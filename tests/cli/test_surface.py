@@ -16,7 +16,7 @@ from avmsf.mesh import Surface, read_surface
 from avmsf.photographs.folder import write_views
 from avmsf.plotting.surfaces import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
-from factories.plate_capture import PLATE, TINY, fill_plate
+from factories.plate_capture import PLATE
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
 from factories.verbs import results_of
 
@@ -46,15 +46,6 @@ def test_pictures_become_a_closed_surface_that_is_kept(tmp_path: Path) -> None:
     assert mesh.is_watertight
     # A pixel of the pictures is 9 mm.
     assert mesh.extents.tolist() == pytest.approx([PLATE.length, PLATE.width, THICKNESS], abs=0.02)
-
-
-def test_a_fit_leaves_its_surface_and_says_where(tmp_path: Path, capsys: Streams) -> None:
-    folder = fill_plate(tmp_path / "plate", surface=False)
-    write_surface_file(folder)
-    values, _ = results_of(capsys, "fit", folder, "--gain-model", "smooth", *TINY)
-    assert values["surface"] == str(folder / ".avmsf" / "surface.ply")
-    assert torch.equal(read_surface(values["surface"]).vertices, slab().vertices)
-    assert "surface" in [each["stage"] for each in values["stages"]]
 
 
 def test_a_surface_is_drawn_with_two_cuts_through_its_middle(tmp_path: Path) -> None:

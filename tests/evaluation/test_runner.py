@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -333,54 +331,6 @@ def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_ow
     assert fitted == ["paper"]
     before, paper, after = (each.fit_seconds for each in outcomes)
     assert paper > max(before, after)
-
-
-KILLED = """
-import os, random, signal, sys, time
-from pathlib import Path
-sys.path[:0] = [sys.argv[1], f"{sys.argv[1]}/evaluation"]
-from test_runner import evaluate_plates
-chance = random.Random(0)
-for _ in range(5):
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        evaluate_plates(Path(sys.argv[2]), Path(sys.argv[3]), lambda *progress: os.write(write, b"."))
-        os._exit(0)
-    os.close(write)
-    for _ in range(chance.randint(3, 12)):
-        os.read(read, 1)
-    time.sleep(chance.uniform(0, 0.02))
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    os.close(read)
-    print(sum(path.read_text().count('"method"') for path in Path(sys.argv[3]).glob("objects/[!.]*.json")))
-"""
-"""Begins an evaluation five times, and kills it at a random moment after it has begun a random number of methods."""
-
-
-def evaluate_plates(data: Path, results: Path, progress: Progress = lambda *event: None) -> None:
-    evaluation = planned(data, protocol="leave-one-out")
-    run_objects(evaluation, evaluation.dataset.objects(), ResultsFolder(results), progress=progress)
-    summed(results)
-
-
-@pytest.mark.slow
-def test_killed_five_times_it_comes_to_the_same_summary(tmp_path: Path) -> None:
-    plates = fill_plates(tmp_path / "plates", count=6)
-    evaluate_plates(plates, tmp_path / "whole")
-    place = tmp_path / "killed"
-    command = [sys.executable, "-c", KILLED, str(Path(__file__).parents[1]), str(plates), str(place)]
-    ran = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
-    # The kills came midway, not before or after all work, and nothing that was there was lost.
-    counts = [int(word) for word in ran.stdout.split()]
-    assert counts == sorted(counts)
-    assert 0 < counts[0] < counts[4] < 3 * 6 * len(CHEAP)
-    assert not (place / "summary.json").exists()
-    evaluate_plates(plates, place)
-    whole, resumed = (json.loads((folder / "summary.json").read_text()) for folder in (tmp_path / "whole", place))
-    assert resumed == whole
-    assert set(whole["methods"]) == set(CHEAP)
 
 
 @pytest.mark.slow
