@@ -9,7 +9,6 @@ paper's tables allow, is given too.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from statistics import fmean, geometric_mean, median, stdev
 from typing import Any
 
@@ -242,40 +241,26 @@ def sections(
     return [*parts, report.times(), report.failures()]
 
 
-@dataclass(frozen=True)
 class _Report:
-    records: Sequence[ObjectRecord]
-    identity: Mapping[str, Any]
-    missing: Mapping[str, Sequence[str]]
+    """What the parts of a report have in common."""
 
-    @cached_property
-    def tables(self) -> dict[str, Values]:
-        """Values of each experiment by its label, the main one first, with the methods in the requested order."""
-        return {label: self._ordered(values_of(self.records, label)) for label in labels_of(self.records)}
+    def __init__(
+        self, records: Sequence[ObjectRecord], identity: Mapping[str, Any], missing: Mapping[str, Sequence[str]]
+    ) -> None:
+        self.records, self.identity, self.missing = records, identity, missing
+        self.experiment = str(identity["dataset"]), str(identity["protocol"])
+        # Values of each experiment by its label, the main one first, with the methods in the requested order.
+        self.tables = {label: self._ordered(values_of(records, label)) for label in labels_of(records)}
+        self.label: str | None = next(iter(self.tables), None)
+        self.main: Values = next(iter(self.tables.values()), {})
+        known = {metric for methods in self.main.values() for values in methods.values() for metric in values}
+        self.shown = [metric for metric, entry in METRICS.items() if metric in known and entry.heading]
 
     def _ordered(self, table: Values) -> Values:
         order = [*self.identity["methods"], CHOSEN_ON_TEST]
         return {
             name: {method: values[method] for method in order if method in values} for name, values in table.items()
         }
-
-    @property
-    def label(self) -> str | None:
-        return next(iter(self.tables), None)
-
-    @property
-    def main(self) -> Values:
-        return next(iter(self.tables.values()), {})
-
-    @property
-    def shown(self) -> list[str]:
-        """Metrics with a column."""
-        known = {metric for methods in self.main.values() for values in methods.values() for metric in values}
-        return [metric for metric, entry in METRICS.items() if metric in known and entry.heading]
-
-    @property
-    def experiment(self) -> tuple[str, str]:
-        return str(self.identity["dataset"]), str(self.identity["protocol"])
 
     def opening(self) -> Section:
         dataset, name = self.experiment
