@@ -30,8 +30,7 @@ class Options(Configured):
     --like or --like-material, with a preview next to the output. The pattern of each mode over the object stays.
     """
 
-    field: tyro.conf.Positional[FieldFile]
-    """Field file, as `avmsf fit` writes it."""
+    field: FieldFile
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), New((".safetensors",))]
     """File to write the edited field to."""
     to: _MaterialName = None

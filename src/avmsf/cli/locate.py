@@ -40,8 +40,7 @@ class Options(Common):
     Each recording holds one impact, of any force and polarity; with --several, any number of them.
     """
 
-    field: tyro.conf.Positional[FieldFile]
-    """Field file, as `avmsf fit` writes it."""
+    field: FieldFile
     recordings: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RECORDING.wav ...")]]
     """Recordings of impacts on the same object: wav, flac or another format that libsndfile reads."""
     settings: SettingsFile = None

@@ -97,10 +97,12 @@ def arg(metavar: str, *aliases: str, name: str | None = None) -> Any:
     return tyro.conf.arg(name=name, metavar=metavar, aliases=aliases or None, help_behavior_hint="")
 
 
-FieldFile = Annotated[
-    Path,
-    tyro.conf.arg(metavar="FIELD.safetensors"),
-    Existing("a sound field, as avmsf fit writes it", ("a sound field",)),
+FieldFile = tyro.conf.Positional[
+    Annotated[
+        Path,
+        tyro.conf.arg(metavar="FIELD.safetensors", help="Field file, as `avmsf fit` writes it."),
+        Existing("a sound field, as avmsf fit writes it", ("a sound field",)),
+    ]
 ]
 FieldFiles = Annotated[
     tuple[Path, ...],

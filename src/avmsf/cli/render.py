@@ -27,8 +27,7 @@ class Options(Common):
     nx,ny,nz, such as a capture's impacts.csv. An impact without a direction is perpendicular to the surface.
     """
 
-    field: tyro.conf.Positional[FieldFile]
-    """Field file, as `avmsf fit` writes it."""
+    field: FieldFile
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER|FILE.wav"), New((".wav",), or_folder=True)]
     """Folder for the sounds; for one contact also a wav file."""
     position: PositionList = ()

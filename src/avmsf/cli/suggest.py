@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import tyro
-
 from avmsf._utils.text import counted, format_number
 from avmsf.cli.options import Common, Flag, expect_capture, read_settings
 from avmsf.cli.output import doing, next_step, print_json, say, show, table
@@ -38,8 +36,7 @@ class Options(Common):
     and repeat. Needs a field whose gains have a posterior, as all but `--gain-model network` have.
     """
 
-    field: tyro.conf.Positional[FieldFile]
-    """Field file, as `avmsf fit` writes it."""
+    field: FieldFile
     count: int = 5
     """Number of contacts."""
     candidates: OtherCapture = None
