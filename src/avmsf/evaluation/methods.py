@@ -316,8 +316,12 @@ class FieldMethod:
 
     def fit(self, task: Task) -> SoundField:
         """Fit the field, whose report has what was chosen. Raises AvmsfError where a stage cannot be made."""
-        features, modes, config = task.features(self.visual_input), self._modes(task), self.pipeline.fit
-        report: dict[str, Any] = {}
+        features, config, report = task.features(self.visual_input), self.pipeline.fit, dict[str, Any]()
+        if self.published:
+            finder = finder_named(self.pipeline.extraction, self.pipeline.modes)
+            modes = extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
+        else:
+            modes = task.modes()
         if self.grid is not None:
             config, report["grid"] = self._choose(self.grid, task, features, modes)
         if not self.informed:
@@ -328,12 +332,6 @@ class FieldMethod:
             config = replace(config, warmup_steps=0, steps=steps, correction_rate=_UNINFORMED_RATE)
         found = self._fitted(task, task.train, features, modes, config)
         return replace(found, origin=replace(found.origin, report={**found.origin.report, **report}))
-
-    def _modes(self, task: Task) -> Extraction:
-        if not self.published:
-            return task.modes()
-        finder = finder_named(self.pipeline.extraction, self.pipeline.modes)
-        return extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
 
     def _fitted(
         self, task: Task, train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig
