@@ -1,6 +1,5 @@
 """The object's surface as an output of its own: alone, in three formats, and of a reconstruction."""
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import torch
 import trimesh
 
 from avmsf.cli import main
-from avmsf.cli.info import gains_at
 from avmsf.errors import EvaluationError
 from avmsf.field.store import save
 from avmsf.mesh import Surface, read_surface
@@ -83,12 +81,3 @@ def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Pa
         assert main(["info", str(tmp_path / f"{name}.safetensors"), "--plots", str(tmp_path / name)]) == 0
     assert (tmp_path / "with" / "surface.png").is_file()
     assert not (tmp_path / "without" / "surface.png").exists()
-
-
-def test_points_of_a_field_off_its_surface_are_drawn_without_a_warning() -> None:
-    contacts = bar_contacts(6)
-    field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1)))
-    above = contacts.float() + torch.tensor([0.0, 0.0, 0.1])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert gains_at(field, above).shape == (6, len(field.bank))

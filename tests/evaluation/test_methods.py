@@ -183,12 +183,6 @@ def test_methods_with_modes_render_them_and_the_residual(name):
     assert not torch.allclose(other, modes + noise, rtol=0, atol=0.1 * magnitude)
 
 
-def test_a_random_impact_is_the_other_objects_recording_everywhere():
-    _, test = parts()
-    sounds = made("random-impact").render(test.contacts)
-    assert torch.equal(sounds, torch.linspace(-1, 1, SAMPLES).expand(len(test), -1))
-
-
 def test_fields_read_what_their_names_say():
     asked = []
 

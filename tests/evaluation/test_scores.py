@@ -2,9 +2,11 @@
 
 import csv
 import math
+import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,6 +40,18 @@ def test_scores_have_means_and_standard_errors():
     # Sum of squares 14 over 3, over 4.
     assert scores.standard_error()["l1"] == pytest.approx(math.sqrt(14 / 12), rel=1e-12)
     assert math.isnan(Scores(("a",), {"l1": values["l1"][:1]}).standard_error()["l1"])
+
+
+def test_scores_are_a_data_frame_where_pandas_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = Scores(("a.wav", "b.wav"), {"l1": torch.tensor([1.0, 2.0]), "envelope": torch.tensor([3.0, 4.0])})
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with raises(EvaluationError, name="pandas"):
+        scores.to_frame()
+    stand_in = SimpleNamespace(DataFrame=lambda columns, index: (columns, index))
+    monkeypatch.setitem(sys.modules, "pandas", stand_in)
+    columns, index = scores.to_frame()
+    assert index == ["a.wav", "b.wav"]
+    assert {name: each.tolist() for name, each in columns.items()} == {"l1": [1.0, 2.0], "envelope": [3.0, 4.0]}
 
 
 class Silent:
