@@ -87,5 +87,5 @@ def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path)
     begin("knn3", None)
     begin("field", DESCRIPTORS)
     begin("knn3", DESCRIPTORS)
-    with raises(EvaluationError, name="field"):
+    with raises(EvaluationError, name="methods.field.encoder", value=DESCRIPTORS):
         begin("field", DINO)

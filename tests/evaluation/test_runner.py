@@ -170,7 +170,10 @@ def test_results_of_different_evaluations_are_not_mixed(
         "dataset": (replace(plan, title="plots"), "plates"),
         "metrics.cdpam_contacts": (replace(plan, metric_settings=replace(NO_CDPAM, cdpam_contacts=3)), 8),
         "settings.views": (replace(plan, settings={"views": 3}), None),
-        "knn3": (planned(plates, replace(asking(str, "knn3"), weights="others")), held["methods"]["knn3"]),
+        "methods.knn3.settings": (
+            planned(plates, replace(asking(str, "knn3"), weights="others")),
+            held["methods"]["knn3"]["settings"],
+        ),
         "a": (planned(fill_plates(tmp_path / "other", ("x", "a")), "knn3"), json.loads(before)["digest"]),
     }
     for name, (evaluation, value) in others.items():

@@ -15,7 +15,7 @@ from avmsf.evaluation.editing import Edits
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
 from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, table_modules
-from avmsf.evaluation.results import ENCODER, SPACES, ResultsFolder, write_json
+from avmsf.evaluation.results import SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import shared_cdpam
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.features.descriptors import ImageDescriptors
@@ -77,10 +77,9 @@ class Evaluation:
         if self.edits is not None:
             write_json(results.path / SPACES, {name: space.record() for name, space in self.edits.spaces.items()})
 
-    def _described(self, method: Method) -> str:
+    def _described(self, method: Method) -> dict[str, str | None]:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        read = self.encoder is not None and input_of(method) != "surface"
-        return f"{method!r}{ENCODER}{self.encoder}" if read else repr(method)
+        return {"settings": repr(method), "encoder": None if input_of(method) == "surface" else self.encoder}
 
 
 def _plain(settings: Any) -> dict[str, Any]:

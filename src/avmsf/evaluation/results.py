@@ -26,8 +26,6 @@ from avmsf.evaluation.splits import Case
 
 IDENTITY, SPACES, OBJECTS = "protocol.json", "spaces.json", "objects"
 """The files that identify the evaluation and embed the objects of `edit`, and the folder of the objects' files."""
-ENCODER = ", encoder "
-"""What comes between a method's description and the encoder of the features that it reads."""
 _MAX_BYTES = 64 << 20
 """Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
 _MAX_SHOWN = 160
@@ -121,7 +119,7 @@ class ResultsFolder:
 
     path: Path
 
-    def begin(self, identity: Mapping[str, Any], methods: Mapping[str, str]) -> None:
+    def begin(self, identity: Mapping[str, Any], methods: Mapping[str, Mapping[str, str | None]]) -> None:
         """Use the folder for results of this identity, or continue with those that it holds.
 
         `identity` holds plain values that determine the results; `methods` describes each method. Methods may be added
@@ -130,28 +128,20 @@ class ResultsFolder:
         wanted, path = json.loads(json.dumps(dict(identity))), self.path / IDENTITY
         # A kill may leave a hidden part of the file behind.
         if not path.exists() and self.path.is_dir() and any(self.path.glob("[!.]*")):
-            asked, advice = f"an empty folder or one with {IDENTITY}", "choose a new --output"
-            raise EvaluationError.expected(asked, got="other files", file=self.path, name="output", advice=advice)
+            empty, advice = f"an empty folder or one with {IDENTITY}", "choose a new --output"
+            raise EvaluationError.expected(empty, got="other files", file=self.path, name="output", advice=advice)
         known = self.identity() if path.exists() else {**wanted, "methods": {}}
         stored = known.pop("methods")
-        if wanted != known:
-            name, ours, theirs = _first_difference(wanted, known)
-            differing = f"of {name} {_brief(ours)}", _brief(theirs)
+        shared = {name: dict(methods[name]) for name in methods if name in stored}
+        asked, found = {**wanted, "methods": shared}, {**known, "methods": {name: stored[name] for name in shared}}
+        if asked != found:
+            name, ours, theirs = _first_difference(asked, found)
+            made, got = f"results of {name} {_brief(ours)}", _brief(theirs)
             if name == "source":
-                differing = "made by this version of avmsf", "those of another, whose code differs"
-            raise self._of_another(name, theirs, *differing)
-        for name in methods:
-            if stored.get(name, methods[name]) != methods[name]:
-                (ours, _, encoder), (theirs, _, other) = (each[name].partition(ENCODER) for each in (methods, stored))
-                made = "these settings and weights", "others"
-                if ours == theirs:
-                    made = f"--set lift.encoder={encoder}", f"--set lift.encoder={other}"
-                raise self._of_another(name, stored[name], f"of {name} made with {made[0]}", f"those with {made[1]}")
+                made, got = "results made by this version of avmsf", "those of another, whose code differs"
+            advice = "give the same options, or choose another --output"
+            raise EvaluationError.expected(made, theirs, got=got, file=self.path, name=name, advice=advice)
         write_json(path, {**wanted, "methods": {**stored, **methods}})
-
-    def _of_another(self, name: str, value: object, wanted: str, found: str) -> EvaluationError:
-        advice = "give the same options, or choose another --output"
-        return EvaluationError.expected(f"results {wanted}", value, got=found, file=self.path, name=name, advice=advice)
 
     def identity(self) -> dict[str, Any]:
         """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
