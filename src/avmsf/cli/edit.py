@@ -144,7 +144,7 @@ def run(options: Options) -> int:
     contact = contact_of_sounds(old, options.position)
     new = _edited(options, old)
     save(new, options.output)
-    for ending in ("checkpoint", "preview.wav", "clap.json") if options.guides else ():
+    for ending in ("checkpoint", "preview.wav", "clap") if options.guides else ():
         options.part(ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = ModeLevels.of(old), ModeLevels.of(new)
@@ -221,7 +221,7 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
     settings, preview, checkpoint = options.all_settings, options.part("preview.wav"), options.part("checkpoint")
     curve: ClapCurve | None = None
     if settings.prompt.clap is not None and options.prompt is not None:
-        clap, kept = Clap.load(settings.prompt.clap), options.part("clap.json")
+        clap, kept = Clap.load(settings.prompt.clap), options.part("clap")
         curve = ClapCurve(clap, options.prompt, field, kept, resumed=checkpoint.exists())
     # After CLAP: a wrong name of its network is refused before the large model is loaded.
     guide: Guide

@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf._utils.files import model_folder, write_whole
-from avmsf._utils.text import read_json
+from avmsf._utils.checkpoint import Checkpoint
+from avmsf._utils.files import model_folder
 from avmsf.editing.guided import GuidedEditProgress
 from avmsf.editing.modal_edit import EDITS
 from avmsf.errors import EditError, EvaluationError, download_failure, from_extra
@@ -157,8 +157,10 @@ class ClapCurve:
 
         Raises EditError for a file that is damaged or has scores of another network.
         """
-        self.clap, self.prompt, self.field, self.kept = clap, prompt, field, kept
-        self.scores = _read_scores(kept, clap) if resumed and kept is not None and kept.is_file() else {}
+        self.clap, self.prompt, self.field = clap, prompt, field
+        self.kept = Checkpoint(kept, {"network": clap.digest}, what="the CLAP scores", raising=EditError)
+        state = self.kept.read() if resumed else None
+        self.scores: dict[int, float] = {} if state is None else state["scores"]
 
     def add(self, progress: GuidedEditProgress) -> None:
         """Score a preview, and the unedited field before the first one. Silent sounds have no score."""
@@ -167,9 +169,7 @@ class ClapCurve:
         if not self.scores:
             self._score(0, self.field.render(progress.place[None])[0])
         self._score(progress.step, progress.preview)
-        if self.kept is not None:
-            text = json.dumps({"digest": self.clap.digest, "scores": list(self.scores.items())})
-            write_whole(self.kept, text, raising=EditError)
+        self.kept.save({"scores": self.scores})
 
     def recorded_in(self, edited: SoundField) -> SoundField:
         """Return the edited field with the steps and scores in the record of its last edit."""
@@ -181,16 +181,3 @@ class ClapCurve:
     def _score(self, step: int, sound: Float[Tensor, " samples"]) -> None:
         if bool(sound.any()):
             self.scores[step] = float(self.clap.score(sound[None], [self.prompt], sample_rate=self.field.sample_rate))
-
-
-def _read_scores(path: Path, clap: Clap) -> dict[int, float]:
-    try:
-        read = read_json(path)
-        scores, digest = {int(step): float(score) for step, score in read["scores"]}, read["digest"]
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        advice = "delete the file to continue"
-        raise EditError.expected("CLAP scores", got=str(error), file=path, advice=advice) from error
-    if digest != clap.digest:
-        got, advice = "those of another network", "give that network"
-        raise EditError.expected(f"scores of {clap.name}", digest, got=got, file=path, name="digest", advice=advice)
-    return scores
