@@ -102,14 +102,19 @@ def read_json(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
     return parse_json(read_text(path, max_bytes=max_bytes), max_characters=max_bytes)
 
 
-def read_json_object(path: Path, *, raising: type[AvmsfError]) -> dict[str, Any]:
+def read_json_object(
+    path: Path,
+    *,
+    raising: type[AvmsfError],
+    advice: str = "copy or export it again",
+    max_bytes: int = MAX_TEXT_BYTES,
+) -> dict[str, Any]:
     """Return the object that a JSON file holds; raises `raising` where it cannot be read or holds something else."""
     try:
-        record = read_json(path)
+        record = read_json(path, max_bytes=max_bytes)
     except (OSError, ValueError) as error:
-        raise raising.expected("a JSON file", got=str(error), file=path, advice="copy or export it again") from error
+        raise raising.expected("a JSON file", got=str(error), file=path, advice=advice) from error
     if not isinstance(record, dict):
-        advice = "copy or export it again"
         raise raising.expected("a JSON object", type(record).__name__, file=path, advice=advice)
     return record
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import format_number, read_json
+from avmsf.capture.audio import Recording
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
 from avmsf.evaluation.registry import METRICS
@@ -28,8 +29,8 @@ from avmsf.evaluation.results import (
     ObjectRecord,
     Outcome,
     ResultsFolder,
-    StoredSound,
     file_word,
+    read_sound,
     write_json,
 )
 from avmsf.evaluation.splits import evenly_spaced
@@ -141,15 +142,16 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[
 
 def _cards(contact: _StoredContact, folder: Path) -> Iterator[_Card]:
     name, file, made = contact
-    recorded = StoredSound.read(folder / file)
-    loudest, seconds = float(picture_levels(recorded).max()), len(recorded.samples) / recorded.sample_rate
+    recorded = read_sound(folder / file)
+    loudest = float(picture_levels(recorded).max())
 
-    def card(title: str, caption: str, sound: StoredSound) -> _Card:
-        picture = draw_spectrogram(picture_levels(sound), loudest=loudest)
-        return {"title": title, "caption": caption, "picture": picture, "sound": _address("audio/flac", sound.content)}
+    def card(title: str, caption: str, path: Path) -> _Card:
+        picture = draw_spectrogram(picture_levels(read_sound(path)), loudest=loudest)
+        sound = _address("audio/flac", path.read_bytes())
+        return {"title": title, "caption": caption, "picture": picture, "sound": sound}
 
     band = "{:.0f} Hz to {:.0f} Hz".format(*_band(recorded.sample_rate))
-    yield card(RECORDED, f"{seconds:.2g} s, {band}", recorded)
+    yield card(RECORDED, f"{recorded.duration:.2g} s, {band}", folder / file)
     several = len({case.label for case, _ in made}) > 1
     for case, outcome in made:
         row = case.test.index(name)
@@ -159,7 +161,7 @@ def _cards(contact: _StoredContact, folder: Path) -> Iterator[_Card]:
             if entry.function is not None and metric in outcome.values
         ]
         title = f"{outcome.method}, {case.label}" if several else outcome.method
-        yield card(title, ", ".join(scores), StoredSound.read(folder / outcome.sounds[name]))
+        yield card(title, ", ".join(scores), folder / outcome.sounds[name])
 
 
 def _band(sample_rate: float) -> tuple[float, float]:
@@ -167,11 +169,10 @@ def _band(sample_rate: float) -> tuple[float, float]:
     return min(_LOWEST_HZ, sample_rate / 100), sample_rate / 2
 
 
-def picture_levels(sound: StoredSound) -> Float64[Tensor, "height width"]:
+def picture_levels(sound: Recording) -> Float64[Tensor, "height width"]:
     """Return the levels of a sound's picture, dB, from the lowest frequency up to half the sample rate."""
-    lowest, highest = _band(sound.sample_rate)
-    rate = sound.sample_rate
-    return log_spectrogram(sound.samples, sample_rate=rate, lowest=lowest, highest=highest, width=240, height=120)
+    (lowest, highest), samples, rate = _band(sound.sample_rate), torch.tensor(sound.channels[0]), sound.sample_rate
+    return log_spectrogram(samples, sample_rate=rate, lowest=lowest, highest=highest, width=240, height=120)
 
 
 def draw_spectrogram(levels: Float64[Tensor, "height width"], *, loudest: float) -> str:
@@ -235,9 +236,9 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> Iterator[Path]:
             made = {each.method: each.sounds[recording] for case, each in predicted if case.label == label}
             if made:
                 files = {RECORDED: recorded, **made}
-                sounds = {name: StoredSound.read(folder / file) for name, file in files.items()}
+                sounds = {name: read_sound(folder / file) for name, file in files.items()}
                 rate = sounds[RECORDED].sample_rate
-                rows[recording] = {name: sound.samples for name, sound in sounds.items()}
+                rows[recording] = {name: torch.tensor(sound.channels[0]) for name, sound in sounds.items()}
         if rows:
             methods = list(dict.fromkeys(method for row in rows.values() for method in row))
             name = record.identifier if len(labels) == 1 else f"{record.identifier} {file_word(label)}"

@@ -9,19 +9,20 @@ import re
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import soundfile
-import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text import json_text, read_json
-from avmsf.errors import AvmsfError, EvaluationError
+from avmsf._utils.text import json_text, read_json_object
+from avmsf.capture.audio import Recording, read_recording
+from avmsf.errors import AvmsfError, CaptureError, EvaluationError
 from avmsf.evaluation.splits import Case
 
 IDENTITY, SPACES, OBJECTS = "protocol.json", "spaces.json", "objects"
@@ -145,7 +146,7 @@ class ResultsFolder:
 
     def identity(self) -> dict[str, Any]:
         """Return the evaluation that the folder holds, with its methods. Raises EvaluationError where there is none."""
-        read = self._read(self.path / IDENTITY)
+        read = _read(self.path / IDENTITY)
         if not isinstance(read.get("methods"), dict):
             raise _damaged(self.path / IDENTITY, "it names no methods")
         return read
@@ -168,7 +169,7 @@ class ResultsFolder:
         return self.path / OBJECTS / f"{identifier}.json"
 
     def _record(self, path: Path) -> ObjectRecord:
-        read = self._read(path)
+        read = _read(path)
         try:
             cases = [{**each, "train": tuple(each["train"]), "test": tuple(each["test"])} for each in read.pop("cases")]
             outcomes = [
@@ -179,15 +180,6 @@ class ResultsFolder:
             return ObjectRecord(**read, cases=parts[0], outcomes=parts[1])
         except (KeyError, TypeError, AttributeError) as error:
             raise _damaged(path, error) from error
-
-    def _read(self, path: Path) -> dict[str, Any]:
-        try:
-            read = read_json(path, max_bytes=_MAX_BYTES)
-        except (OSError, ValueError) as error:
-            raise _damaged(path, error) from error
-        if not isinstance(read, dict):
-            raise _damaged(path, "no JSON object")
-        return read
 
 
 def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
@@ -209,30 +201,20 @@ def write_flac(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: flo
     write_whole(path, memory.getvalue(), raising=EvaluationError)
 
 
-@dataclass(frozen=True, eq=False)
-class StoredSound:
-    """A stored sound."""
+def read_sound(path: Path) -> Recording:
+    """Read a sound file. Raises EvaluationError where it is gone or damaged."""
+    try:
+        return read_recording(path)
+    except CaptureError as error:
+        raise EvaluationError(str(error), **{**error.attributes, "file": path}) from error
 
-    content: bytes
-    """The file as it lies on the disk."""
-    samples: Float64[Tensor, " samples"]
-    sample_rate: float
 
-    @classmethod
-    def read(cls, path: Path) -> "StoredSound":
-        """Read a file that `write_flac` wrote. Raises EvaluationError where it is gone or damaged."""
-        try:
-            content = path.read_bytes()
-            samples, rate = soundfile.read(io.BytesIO(content), dtype="float64")
-        except (OSError, soundfile.LibsndfileError) as error:
-            advice = "delete the object's file to compute it again"
-            raise EvaluationError.expected("a stored sound", got=str(error), file=path, advice=advice) from error
-        return cls(content, torch.from_numpy(samples), float(rate))
+_AGAIN = "delete the file to compute them again, or choose another --output"
+_read = partial(read_json_object, raising=EvaluationError, advice=_AGAIN, max_bytes=_MAX_BYTES)
 
 
 def _damaged(path: Path, error: object) -> EvaluationError:
-    advice = "delete the file to compute them again, or choose another --output"
-    return EvaluationError.expected("results of this version", got=str(error), file=path, advice=advice)
+    return EvaluationError.expected("results of this version", got=str(error), file=path, advice=_AGAIN)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
