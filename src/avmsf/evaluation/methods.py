@@ -5,7 +5,6 @@ are others. Methods that share modes have noise too, as the field has: without i
 L1-log is lost.
 """
 
-import hashlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -51,6 +50,7 @@ from avmsf.modal.extraction.finders import finder_named, lowest_frequency
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.config import PRESETS, PipelineConfig
+from avmsf.pipeline.stages import digest_files, digest_of
 
 NEIGHBORS = 3
 """Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
@@ -100,7 +100,7 @@ def method_named(name: str) -> Method:
         made: Method = resolve(entry.make)(name, **entry.settings, **settings)
         return made
     if entry.path:
-        weights = folder_digest(path) if entry.is_folder else hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        weights = folder_digest(path) if entry.is_folder else digest_of(path)[:16]
     return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings, **settings), weights, entry.visual_input)
 
 
@@ -182,12 +182,9 @@ class RecordedMethod:
 
     def digest(self, name: str) -> str:
         """Return a digest of an object's wavs, which decide its figures."""
-        digest, folder = hashlib.sha256(), self.path / name
-        for file in sorted(folder.rglob("*")):
-            if file.suffix.lower() == ".wav" and file.is_file():
-                digest.update(f"{file.relative_to(folder).as_posix()}\0{file.stat().st_size}\0".encode())
-                digest.update(file.read_bytes())
-        return digest.hexdigest()
+        folder = self.path / name
+        wavs = (each for each in folder.rglob("*") if each.suffix.lower() == ".wav" and each.is_file())
+        return digest_files(wavs, root=folder)
 
     def fit(self, task: Task) -> "Recorded":
         """Find the object's folder. Raises EvaluationError where there is none."""
