@@ -21,6 +21,7 @@ from avmsf.localization.locator import Locator
 from avmsf.mesh.points import farthest_points
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.spectra import magnitude_stft
 
 CANDIDATES = 2000
 """Candidate points: 2 % of the diagonal apart, which is less than the smallest errors."""
@@ -175,9 +176,7 @@ def _signature(sound: Sound, sample_rate: float) -> Float64[Tensor, " bins"]:
     """Return the log of the mean power spectrum, of mean zero and norm one; 0 for silence."""
     size = scaled_fft_size(_FFT_SIZE, sample_rate=sample_rate)
     padded = torch.nn.functional.pad(sound.double(), (0, max(0, size - len(sound))))
-    # Frames from before the onset on, so that its window weighs the beginning of the sound too.
-    frames = torch.nn.functional.pad(padded, (size // 2, size // 2)).unfold(0, size, size // 4)
-    power = torch.fft.rfft(frames * torch.hann_window(size, dtype=torch.float64)).abs().square().mean(dim=0)
+    power = magnitude_stft(padded[None], fft_size=size, hop=size // 4)[0].square().mean(dim=1)
     if not float(power.max()) > 0.0:
         return torch.zeros_like(power)
     level = torch.log(power.clamp_min(_POWER_FLOOR * float(power.max())))
