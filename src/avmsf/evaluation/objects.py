@@ -29,7 +29,7 @@ from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface
-from avmsf.modal.clips import resampled
+from avmsf.modal.clips import resampled, with_length
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.scene import FEATURES, SceneStages
@@ -165,9 +165,8 @@ def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, s
         except AvmsfError:
             continue
         row = int(torch.randint(len(impacts), (), generator=generator))
-        (sound,) = resampled(impacts.sounds[row][None], sample_rate=impacts.sample_rate, wanted=train.sample_rate)
-        samples = train.sounds.shape[1]
-        return torch.nn.functional.pad(sound, (0, max(0, samples - len(sound))))[:samples].to(train.sounds.dtype)
+        sounds = resampled(impacts.sounds[row][None], sample_rate=impacts.sample_rate, wanted=train.sample_rate)
+        return with_length(sounds, train.sounds.shape[1])[0].to(train.sounds.dtype)
     raise EvaluationError.expected(
         f"another readable object in {dataset.name}", name=identifier, advice="download more of the dataset"
     )
