@@ -3,9 +3,10 @@
 And one of warnings, `AvmsfWarning`: what goes on all the same, and the user should know.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -56,6 +57,13 @@ class _Located(Exception):  # noqa: N818 - warnings have it too
         found = got or ("none" if value is None else shown)
         message = f"{place}: expected {wanted}, got {found}{advice and f'; {advice}'}"
         return cls(message, file=file, row=row, name=name, value=value)
+
+    @classmethod
+    def unknown(cls: type[_Kind], value: str, known: Collection[str], *, name: str, cutoff: float = 0.6) -> _Kind:
+        """Return one for a value that is none of the known ones, with the one that is most similar (`difflib`)."""
+        near = get_close_matches(value.lower(), known, n=1, cutoff=cutoff)
+        advice = f"did you mean {near[0]}?" if near else ""
+        return cls.expected(f"one of {', '.join(known)}", value, name=name, advice=advice)
 
     @property
     def attributes(self) -> dict[str, Any]:

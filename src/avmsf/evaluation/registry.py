@@ -4,9 +4,8 @@ A row has a title and the import path of what makes it, and is all that a new me
 function. Importing this module loads nothing that computes.
 """
 
-import difflib
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -287,7 +286,7 @@ def table_modules() -> list[str]:
 def protocol_named(name: str) -> Protocol:
     """Return the protocol of this name. Raises EvaluationError that lists the known ones."""
     if name not in PROTOCOLS:
-        raise _unknown("protocol", name, PROTOCOLS)
+        raise EvaluationError.unknown(name, PROTOCOLS, name="protocol")
     return PROTOCOLS[name]
 
 
@@ -295,7 +294,8 @@ def method_entry(name: str) -> MethodEntry:
     """Return the row of a method, with or without its path. Raises EvaluationError that lists the known ones."""
     kind = kind_of(name)
     if kind not in METHODS or (kind != name and not METHODS[kind].path):
-        raise _unknown("method", name, [f"{each}:PATH" if row.path else each for each, row in METHODS.items()])
+        known = [f"{each}:PATH" if row.path else each for each, row in METHODS.items()]
+        raise EvaluationError.unknown(name, known, name="method")
     return METHODS[kind]
 
 
@@ -314,12 +314,6 @@ def expect_suited(method: str, protocol: str) -> None:
 def kind_of(method: str) -> str:
     """Return a method's name without the file or folder that it reads."""
     return method.partition(":")[0]
-
-
-def _unknown(kind: str, name: str, known: Iterable[str]) -> EvaluationError:
-    near = difflib.get_close_matches(name, known, n=1)
-    wanted, advice = f"one of {', '.join(known)}", f"did you mean {near[0]}?" if near else ""
-    return EvaluationError.expected(wanted, name, name=kind, advice=advice)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 from avmsf.errors import SimulationError
 
@@ -81,7 +80,5 @@ def material_named(name: str, *, option: str = "material") -> Material:
     """
     if name.lower() not in MATERIALS:
         # Brass is not glass.
-        near = get_close_matches(name.lower(), MATERIALS, n=1, cutoff=0.7)
-        advice = f"did you mean {near[0]}?" if near else ""
-        raise SimulationError.expected(f"one of {', '.join(MATERIALS)}", name, name=option, advice=advice)
+        raise SimulationError.unknown(name, MATERIALS, name=option, cutoff=0.7)
     return MATERIALS[name.lower()]

@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass, field, fields, replace
-from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -274,7 +273,5 @@ def named_recipe(name: str) -> ObjectRecipe:
     """Return the recipe of one of the sets' objects. Raises SimulationError with the names there are."""
     known = SIM20 | HELD_OUT
     if name not in known:
-        near = get_close_matches(name, known, n=1)
-        advice = f"did you mean {near[0]}?" if near else "check the name"
-        raise SimulationError.expected(f"one of {', '.join(known)}", name, name="object", advice=advice)
+        raise SimulationError.unknown(name, known, name="object")
     return known[name]
