@@ -161,7 +161,7 @@ def _views(folder: Path, path: Path) -> None:
 def _field(folder: Path, path: Path) -> None:
     output = folder / "sounds"
     run_verb("info", str(path))
-    run_verb("render", str(path), "--position", "0.05", "0.05", "0.05", "--output", str(output))
+    run_verb("render", str(path), "--position", "0.05", "0.05", "0.002", "--output", str(output))
 
 
 def _splats(_: Path, path: Path) -> None:

@@ -12,14 +12,11 @@ from typing import Any
 
 import numpy as np
 import soundfile
-import torch
 
-from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
 
-from .valid_files import mixture_gains
+from .capture_folder import fill
+from .made_fields import elastic, sounding
 
 RATE = 8000
 _BODY_BYTES = 1 << 18
@@ -180,19 +177,10 @@ def fuzz(ask: Ask, *, count: int, seed: int = 0) -> dict[str, float]:
 
 def write_object(folder: Path) -> Path:
     """Write a capture folder of three strikes and a field of five modes into it, and return the field's file."""
-    folder.mkdir(parents=True)
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(300, 3, generator=generator) * torch.tensor([0.24, 0.17, 0.004])
-    frequency = torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64)
-    bank = ModalBank(frequency, 0.02 * frequency)
-    contacts = points[:12].double()
-    gains = mixture_gains(contacts, bank, points)
-    noise = Residual(torch.full((9,), 1e-6))
-    made = SoundField(bank, gains, torch.zeros_like(frequency), noise, float(RATE), 2400, Origin("plate"))
-    rows = ["file,x,y,z"]
-    for name, contact, sound in zip(("a", "b", "c"), contacts, made.render(contacts[:3].float()), strict=False):
-        soundfile.write(folder / f"{name}.wav", 0.5 * sound.numpy() / float(sound.abs().max()), RATE, subtype="FLOAT")
-        rows.append(f"{name}.wav,{','.join(map(str, contact.tolist()))}")
-    (folder / "impacts.csv").write_text("\n".join([*rows, ""]))
+    made = sounding(elastic())
+    contacts, names = made.gain_field.points[:3], ("a.wav", "b.wav", "c.wav")
+    sounds = made.render(contacts).numpy()
+    rows = [f"{name},{','.join(map(str, each.tolist()))}" for name, each in zip(names, contacts, strict=True)]
+    fill(folder, rows=rows, replace=dict(zip(names, 0.5 * sounds / np.abs(sounds).max(), strict=True)))
     save(made, folder / "plate.safetensors")
     return folder / "plate.safetensors"

@@ -21,7 +21,8 @@ from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from factories.made_modes import sliding_plate
+
+from .made_modes import sliding_plate
 
 SIDES = (0.24, 0.17, 0.004)
 SIZE = float(torch.tensor(SIDES, dtype=torch.float64).norm())

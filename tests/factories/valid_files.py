@@ -1,9 +1,6 @@
 """Small valid files of every kind that the package reads, to be damaged: all within one folder, in a second."""
 
-import json
 import math
-import shutil
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,30 +9,26 @@ import numpy as np
 import soundfile
 import torch
 import trimesh
-from torch import Tensor
 
-from avmsf.features.feature_field import FeatureField
-from avmsf.fem.elastic_modes import elastic_modes
-from avmsf.fem.material import NOMINAL
-from avmsf.fem.walls import shell
-from avmsf.field.config import AttentionShape
-from avmsf.field.gains.attention import AttentionGains
-from avmsf.field.gains.elastic import Elastic
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
-from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats
-from avmsf.mesh import Surface
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
+
+from .made_fields import attention, elastic, sounding
+from .views_folder import (
+    HEIGHT,
+    WIDTH,
+    frames,
+    ring,
+    write_colmap_binary,
+    write_colmap_text,
+    write_image,
+    write_transforms,
+)
 
 RATE = 8000
 CONTACTS = ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))
 SURFACES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
-PICTURE = 32
 
 
 def write_seeds(folder: Path) -> None:
@@ -52,7 +45,8 @@ def write_seeds(folder: Path) -> None:
     rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(40, 1)
     cloud = GaussianCloud(points, rotations, points - 4, points[:, 0], torch.zeros(40, 4, 3))
     write_splats(cloud, folder / "splats.ply")
-    _write_fields(folder)
+    for name, gains in (("attention", attention()), ("mixture", elastic())):
+        save(sounding(gains), folder / f"{name}.safetensors")
 
 
 def write_capture_folder(folder: Path) -> None:
@@ -84,78 +78,15 @@ def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
 
 def _write_views(folder: Path) -> None:
     """Write four photographs with masks and cameras, in the layouts of nerfstudio and of COLMAP, text and binary."""
-    picture = np.full((PICTURE, PICTURE, 3), 20, np.uint8)
-    cv2.circle(picture, (PICTURE // 2, PICTURE // 2), PICTURE // 4, (40, 200, 90), -1)
-    mask = np.where(picture[..., 1] > 100, 255, 0).astype(np.uint8)
-    frames, lines = [], []
-    for number, suffix in enumerate((".png", ".jpg", ".webp", ".png")):
-        angle = number * math.pi / 2
-        pose = np.eye(4)
-        cosine, sine = math.cos(angle), math.sin(angle)
-        pose[:3, :3] = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
-        pose[:3, 3] = 0.5 * pose[:3, 2]
-        for place in ("transforms", "colmap"):
-            for kind, pixels in (("images", picture), ("masks", mask)):
-                path = folder / place / kind / f"{number}{suffix if kind == 'images' else '.png'}"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(cv2.imencode(path.suffix, pixels)[1].tobytes())
-        frames.append({"file_path": f"images/{number}{suffix}", "transform_matrix": pose.tolist()})
-        turn = (math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0)
-        lines += [f"{number + 1} {' '.join(map(str, turn))} 0 0 0.5 1 {number}{suffix}", "1.5 2.5 -1"]
-    camera = {"fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 16.0, "w": PICTURE, "h": PICTURE, "k1": 0.01}
-    record = {"camera_model": "OPENCV", **camera, "ply_file_path": "../surface.ply", "frames": frames}
-    (folder / "transforms" / "transforms.json").write_text(json.dumps(record))
-    sparse = folder / "colmap" / "sparse" / "0"
-    sparse.mkdir(parents=True)
-    (sparse / "cameras.txt").write_text(f"1 OPENCV {PICTURE} {PICTURE} 40 40 16 16 0.01 0 0 0\n")
-    (sparse / "images.txt").write_text("\n".join([*lines, ""]))
-    (sparse / "points3D.txt").write_text("1 0.1 0 0 200 100 50 0.5 1 0\n2 0 0.1 0 200 100 50 0.5 2 0\n")
-    _write_binary_model(folder / "colmap", folder / "colmap_binary")
-
-
-def _write_binary_model(text: Path, binary: Path) -> None:
-    """Write the same model in COLMAP's binary form."""
-    shutil.copytree(text, binary)
-    sparse = binary / "sparse" / "0"
-    cameras = struct.pack("<QIiQQ8d", 1, 1, 4, PICTURE, PICTURE, 40, 40, 16, 16, 0.01, 0, 0, 0)
-    images = struct.pack("<Q", 4)
-    for row, line in enumerate((sparse / "images.txt").read_text().splitlines()[::2]):
-        *numbers, _, name = line.split()
-        images += struct.pack("<I7dI", row + 1, *map(float, numbers[1:]), 1) + name.encode() + b"\0"
-        images += struct.pack("<Q2dQ", 1, 1.5, 2.5, 2**64 - 1)
-    points = struct.pack("<QQ3d3BdQII", 1, 1, 0.1, 0, 0, 200, 100, 50, 0.5, 1, 1, 0)
-    for name, content in (("cameras", cameras), ("images", images), ("points3D", points)):
-        (sparse / f"{name}.txt").unlink()
-        (sparse / f"{name}.bin").write_bytes(content)
-
-
-def _write_fields(folder: Path) -> None:
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(60, 3, dtype=torch.float64, generator=generator) / 5
-    bank = ModalBank(
-        torch.tensor([400.0, 900.0, 1500.0], dtype=torch.float64), torch.tensor([20.0, 30.0, 50.0], dtype=torch.float64)
-    )
-    shape = AttentionShape(4, 1, 4, 6, 1, feature_scale=4.0)
-    network = AttentionGains(
-        FeatureField.from_points(points), gain_scale=torch.ones(3), shape=shape, generator=generator
-    )
-    mixture = mixture_gains(points[:12], bank, points.float())
-    for name, gains in (("attention", network.eval().requires_grad_(False)), ("mixture", mixture)):
-        residual = Residual(torch.full((17,), 1e-3))
-        phase = torch.zeros(3, dtype=torch.float64)
-        save(SoundField(bank, gains, phase, residual, 8000.0, 800, Origin("ball")), folder / f"{name}.safetensors")
-
-
-def mixture_gains(contacts: Tensor, bank: ModalBank, points: Tensor) -> MixtureGains:
-    """Return a gain model of every family, with a sheet of 0.2 m as the body."""
-    size = float((points.amax(0) - points.amin(0)).norm())
-    sites = Sites(contacts, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(len(contacts), 3))
-    corners = 0.2 * torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    sheet = shell(Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]])), thickness=0.004, detail=0.5)
-    body = Elastic(sites, size, elastic_modes(sheet, NOMINAL, count=5))
-    families = [*(each(sites, size) for each in (Unstructured, Smooth, ThinPlate)), body]
-    # The body's own gains, or its family would be left out.
-    values = body.modes.gains(sites.points, sites.directions)[:, : len(bank)].to(torch.complex128)
-    variance = torch.full((len(bank),), 1e-4, dtype=torch.float64)
-    measured = MeasuredGains(values, variance, bank.frequency, bank.damping)
-    return fit_mixture(families, measured, points, directional=True)
+    names, cameras = ["0.png", "1.jpg", "2.webp", "3.png"], ring(4)
+    mask = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (WIDTH // 2, HEIGHT // 2), HEIGHT // 4, 255, -1)
+    for place in ("transforms", "colmap", "colmap_binary"):
+        for name in names:
+            write_image(folder / place / "images" / name)
+            write_image(folder / place / "masks" / f"{name[0]}.png", mask)
+    rows = [row | {"file_path": f"images/{name}"} for row, name in zip(frames(cameras), names, strict=True)]
+    settings = {"camera_model": "OPENCV", "k1": 0.01, "ply_file_path": "../surface.ply"}
+    write_transforms(folder / "transforms", rows, images=False, **settings)
+    lens = ("OPENCV", (40.0, 40.0, 16.0, 16.0, 0.01, 0.0, 0.0, 0.0))
+    write_colmap_text(folder / "colmap" / "sparse" / "0", cameras, names, lens)
+    write_colmap_binary(folder / "colmap_binary" / "sparse" / "0", cameras, names, lens)
