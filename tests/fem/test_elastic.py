@@ -9,10 +9,9 @@ import scipy.linalg
 import scipy.optimize
 import scipy.sparse.linalg
 import torch
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from avmsf.errors import SimulationError
-from avmsf.fem.eigen import lowest_vibrations, one_blas_thread, rigid_motions
+from avmsf.fem.eigen import lowest_vibrations, rigid_motions
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
@@ -226,23 +225,10 @@ def test_bodies_in_parts_and_positions_that_are_no_numbers_are_refused(bracket, 
     parts = Solid.build(apart, torch.cat([bracket.cells, bracket.cells + len(bracket.points)]))
     with raises(SimulationError, name="parts", value=2):
         elastic_modes(parts, STEEL, count=4)
+    with pytest.raises(SimulationError):
+        isotropic_modes(parts, count=3)
     with raises(SimulationError, name="places", row=1, value=pytest.approx([math.nan, 0.0, 0.0], nan_ok=True)):
         modes.at(torch.tensor([[0.0, 0.0, 0.0], [math.nan, 0.0, 0.0]]))
-
-
-def test_the_limit_on_blas_is_taken_back_whichever_thread_ends_last():
-    def threads() -> set[int]:
-        return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
-
-    with threadpool_limits(limits=2, user_api="blas"):
-        before, (first, second) = threads(), (one_blas_thread(), one_blas_thread())
-        first.__enter__()
-        second.__enter__()
-        assert threads() == {1}
-        first.__exit__(None, None, None)
-        assert threads() == {1}
-        second.__exit__(None, None, None)
-        assert threads() == before == {2}
 
 
 @cache
@@ -284,10 +270,3 @@ def test_the_gradient_by_poissons_ratio_is_that_of_differences():
         above, below = (weights @ body().squares(ratio + step) for step in (1e-5, -1e-5))
     assert ratio.grad is not None
     torch.testing.assert_close(ratio.grad, (above - below) / 2e-5, rtol=1e-5, atol=0.0)
-
-
-def test_a_body_of_two_parts_is_refused():
-    one = solid()
-    two = Solid.build(torch.cat([one.points, one.points + 1.0]), torch.cat([one.cells, one.cells + len(one.points)]))
-    with pytest.raises(SimulationError):
-        isotropic_modes(two, count=3)

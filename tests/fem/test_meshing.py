@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import fast_simplification
 import numpy as np
 import pytest
 import torch
@@ -183,45 +182,6 @@ def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch:
     before = np.sqrt((surface(clean.vertices + noise).distances ** 2).mean())
     assert np.sqrt((surface(found.vertices).distances ** 2).mean()) < 0.35 * before
     assert found.volume == pytest.approx(clean.volume, rel=0.01)
-
-
-def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
-    side = np.linspace(0.0, 1.0, 61)
-    sheet = weld(sheet_over(side, side))
-    limit(monkeypatch, 1000)
-    found = thinned(sheet, log=lambda words: None)
-    assert len(found.faces) <= 1000
-    # Each corner may lose a triangle, with sides of about .045 now.
-    assert found.area == pytest.approx(1.0, abs=4 * 0.045**2 / 2)
-    assert np.ptp(found.vertices, axis=0) == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
-    assert 0 < len(boundary_edges(found)) < len(boundary_edges(sheet))
-
-
-def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: pytest.MonkeyPatch) -> None:
-    ball = ellipsoid(4)
-
-    def tearing(points: np.ndarray, faces: np.ndarray, *, target_count: int) -> tuple[np.ndarray, np.ndarray]:
-        return points, faces if target_count >= 4000 else faces[:target_count]
-
-    monkeypatch.setattr(fast_simplification, "simplify", tearing)
-    limit(monkeypatch, 1000)
-    found = thinned(ball, log=lambda words: None)
-    assert np.array_equal(found.faces, ball.faces)
-    limit(monkeypatch, 3000)
-    assert thinned(ball, log=lambda words: None) is ball
-
-
-def test_fewer_triangles_of_a_thin_shell_keep_its_volume() -> None:
-    outer, inner = ellipsoid(4), ellipsoid(4)
-    count = len(outer.vertices)
-    shell = mesh_of(
-        np.concatenate([outer.vertices, 0.95 * inner.vertices]),
-        np.concatenate([outer.faces, count + inner.faces[:, ::-1]]),
-    )
-    found = simplified(shell, 1200)
-    assert 1000 < len(found.faces) <= 1200
-    assert len(boundary_edges(found)) == 0
-    assert found.volume == pytest.approx(shell.volume, rel=0.05)
 
 
 def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is_filled() -> None:

@@ -10,7 +10,7 @@ import trimesh
 
 from avmsf.errors import SimulationError
 from avmsf.fem import body_meshes, candidate_bodies
-from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
+from avmsf.fem.candidate_bodies import SurfaceBodies
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.mesh.surface import Surface, read_surface
@@ -160,62 +160,3 @@ def test_settings_that_make_no_sense_are_named(settings: dict, row: int | None, 
     [name] = settings
     with raises(SimulationError, name=name, row=row, value=pytest.approx(value, nan_ok=True)):
         computed(sheet(), **settings)
-
-
-@pytest.fixture(scope="module")
-def coarse() -> CandidateBody:
-    elastic = computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies[0].elastic
-    return CandidateBody(0.004, elastic, fine=False)
-
-
-@pytest.mark.parametrize("error", [None, MemoryError(), SimulationError("badly shaped")])
-def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory_or_fails(
-    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody, error: Exception | None
-):
-    def fail(*solid: object, **settings: object) -> None:
-        assert error is not None
-        raise error
-
-    monkeypatch.setattr(candidate_bodies, "elastic_modes", fail)
-    if error is None:
-        monkeypatch.setattr(body_meshes, "free_memory", lambda: 1e9)
-    messages: list[str] = []
-    bodies = SurfaceBodies(sheet(), count=4, dofs=3000 if error else 400_000, log=messages.append)
-    assert bodies.refined(coarse) is coarse
-    assert messages[-1].startswith("wall of 4 mm: ")
-
-
-def test_the_only_body_that_is_left_stays_in_use_where_it_cannot_be_made_finer(monkeypatch: pytest.MonkeyPatch):
-    """A wall that does not fit is refused once it is made, so that a single one of several is left."""
-    made, messages = candidate_bodies.elastic_modes, []
-
-    def fail(solid: object, *material: object, count: int, **kept: object) -> object:
-        if candidate_bodies.count_dofs(solid) > 3000:  # type: ignore[arg-type]
-            raise MemoryError
-        if abs(solid.volumes.sum() - 0.24 * 0.17 * 0.004) > 1e-5:  # type: ignore[attr-defined]
-            raise SimulationError("of no use")
-        return made(solid, *material, count=count, **kept)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(candidate_bodies, "elastic_modes", fail)
-    monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 2000)
-    found = computed(sheet(), thicknesses=[0.004, 0.012], count=4, dofs=4000, log=messages.append)
-    assert [(body.thickness, body.fine) for body in found.bodies] == [(0.004, False)]
-    assert any(message.startswith("wall of 4 mm: ") for message in messages)
-    assert list(found.refused) == [0.012]
-
-
-def test_the_memory_is_asked_for_what_is_computed_and_for_nothing_that_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    walls, settings = [0.004, 0.006], {"count": 4, "dofs": 80_000, "cache": tmp_path}
-    monkeypatch.setattr(candidate_bodies, "COARSE_DOFS", 2000)
-    # Enough for the few degrees of freedom that two bodies are compared with.
-    monkeypatch.setattr(body_meshes, "free_memory", lambda: 377e6)
-    found = computed(sheet(), thicknesses=walls, **settings)
-    assert [body.thickness for body in found.bodies] == walls
-    monkeypatch.setattr(body_meshes, "free_memory", lambda: 0.0)
-    again = computed(sheet(), thicknesses=walls, **settings)
-    assert torch.equal(again.bodies[1].elastic.shapes, found.bodies[1].elastic.shapes)
-    with raises(SimulationError, name="memory") as caught:
-        computed(sheet(), thicknesses=[0.005, 0.007], **settings)
-    assert all("got 0 GB" in reason for reason in caught.value.value)

@@ -96,12 +96,6 @@ def test_of_open_and_closed_walls_those_like_the_most_probable_one_are_searched(
     assert all(body.closed for body in found)
 
 
-def test_other_thicknesses_are_tried_where_a_body_cannot_be_had() -> None:
-    _, thickness, asked = searched(lambda log: -((log - math.log(0.0029)) ** 2), made=False)
-    assert len({round(each, 9) for each in asked}) == len(asked) > 1
-    assert thickness.low < 0.0029 < thickness.high
-
-
 def test_the_right_wall_of_every_material_is_within_the_range_of_factors() -> None:
     speeds = [math.sqrt(each.young / each.density * NOMINAL.density / NOMINAL.young) for each in MATERIALS.values()]
     low, high = factor_range()
