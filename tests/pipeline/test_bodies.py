@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import pytest
 import torch
@@ -136,26 +135,6 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
 
 
-def test_a_fine_body_is_not_computed_again() -> None:
-    candidates = Asked()
-    MixtureEstimator(bodies=candidates).solve(case())
-    assert candidates.asked == []
-
-
-def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
-    assert estimator().digest() == estimator().digest()
-    finer = [CandidateBodies(bodies()) for _ in range(2)]
-    finer[0].dofs, finer[1].dofs = 20_000, 40_000
-    made = (estimator(), estimator(*bodies()[:2]), *(MixtureEstimator(bodies=each) for each in finer))
-    assert len({each.digest() for each in made}) == len(made)
-
-
-def test_reasons_against_other_bodies_are_reported() -> None:
-    known = CandidateBodies(bodies()[1:2], {None: "the mesh is open"})
-    report = MixtureEstimator(bodies=known).solve(case())[0].report
-    assert report["unavailable"] == {"solid body": "the mesh is open"}
-
-
 @pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])
 def test_impacts_of_unknown_direction_go_straight_into_the_body(directions: torch.Tensor | None) -> None:
     found = estimator().solve(case(directions=directions))[0].training.directions
@@ -229,21 +208,6 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
         with raises(SimulationError, name=name, value=value):
             estimator_for(model, make)
     estimator_for("smooth", make)
-
-
-def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.fem.body_meshes.free_memory", lambda: 1000.0)
-    with raises(SimulationError, name="memory"):
-        candidate_bodies(dome(), BodyConfig(wall=0.004))
-
-
-def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
-    told: list[str] = []
-    surface = Surface(1000.0 * dome().vertices, dome().faces)
-    with raises(FitError, name="contacts") as caught:
-        candidate_bodies(surface, impacts=recorded(12)[0], log=told.append)
-    assert 'unit "mm"' in str(caught.value)
-    assert told == []
 
 
 SIDES = (0.08, 0.06, 0.05)
@@ -330,24 +294,3 @@ def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity(
     assert (known.searches_thickness, [each.thickness for each in known.bodies]) == (False, [0.005])
     solid = candidate_bodies(Cup(thickness_range=None), config)
     assert (solid.searches_thickness, [each.thickness for each in solid.bodies]) == (False, [None])
-
-
-@pytest.mark.slow
-def test_bodies_of_a_shape_are_read_again_and_those_of_another_shape_are_not(tmp_path: Path) -> None:
-    said: list[str] = []
-
-    def frequency(shape: Cup) -> torch.Tensor:
-        said.clear()
-        made = SurfaceBodies(shape, thicknesses=[0.009], count=6, dofs=2000, cache=tmp_path, log=said.append)
-        return made.bodies[0].elastic.frequency
-
-    def computed() -> int:
-        return sum("elastic modes of" in words for words in said)
-
-    first = frequency(Cup())
-    assert computed() == 1
-    # Tetrahedra come out a little different each time; what is read is the same to the last bit.
-    assert torch.equal(first, frequency(Cup()))
-    assert computed() == 0
-    frequency(Cup(most=0.019))
-    assert computed() == 1

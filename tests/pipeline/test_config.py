@@ -14,30 +14,10 @@ from avmsf.errors import AvmsfError, FitError, SceneError
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.gaussians.config import SplatConfig
-from avmsf.modal.extraction.finders import ShortTime, finder_named
 from avmsf.pipeline.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.record import recorded, with_record
 from factories.plate_field import plate_impacts
 from factories.raising import raises
-
-PUBLISHED = ("warmup_gains", "warmup_weights", "spectral_norm", "residual_start", "projection")
-"""Settings that were made for the paper's values."""
-
-
-def test_the_paper_preset_deviates_nowhere_that_there_is_a_switch_for() -> None:
-    paper, usual = PRESETS["paper"], FitConfig()
-    assert finder_named(paper.extraction, paper.modes) == ShortTime(modes=128)
-    assert paper.gain_model == "network"
-    assert all(getattr(paper.fit, name) != getattr(usual, name) for name in PUBLISHED)
-    assert (paper.fit.clusters, paper.fit.learning_rate, paper.fit.steps) == (256, 5e-3, 10000)
-    assert paper.fit.early_weight == 1
-    assert (paper.fit.phase, paper.fit.residual_noise) == ("sine", "gaussian")
-    assert paper.fit.bands > 0
-    lift = paper.scene.lift
-    assert (lift.onto, lift.weighting, lift.encoder_background) == ("gaussians", "plain", "kept")
-    assert (lift.components, lift.positions, lift.reach) == (0, False, 0.0)
-    # Refused where it cannot be had, which `auto` is not.
-    assert lift.encoder == "facebook/dinov2-base"
 
 
 def test_commands_start_from_the_preset_and_change_what_is_said() -> None:

@@ -3,41 +3,27 @@
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partialmethod
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from types import ModuleType
 from typing import Any
 
 import pytest
-import torch
 import trimesh
 
 import avmsf.pipeline.fit as module
 from avmsf._utils.progress import ProgressListener
 from avmsf.capture import read_capture
 from avmsf.cli import main
-from avmsf.editing import guided
 from avmsf.errors import CaptureError, FolderInUseError, SimulationError
-from avmsf.fem import candidate_bodies as nominal
-from avmsf.fem.candidate_bodies import CandidateBodies, SurfaceBodies
-from avmsf.field import fit as field_fit
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.config import FitConfig
-from avmsf.field.fit import fingerprint
-from avmsf.field.gains.data import gain_data
-from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.store import load
-from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import CACHE, BodyConfig, PipelineConfig
 from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.stages import Pipeline, Stage, StageFolder, digest_files, digest_of
-from avmsf.simulate import recipe
+from avmsf.pipeline.stages import Pipeline, Stage, StageFolder
 from factories.plate_capture import fill_plate
-from factories.plate_field import plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
-from factories.ringing_field import ringing_field
 
 
 class Maker:
@@ -149,17 +135,6 @@ def test_a_folder_counts_by_the_names_and_contents_of_its_files(tmp_path: Path) 
     assert folder.keep(stage(make, name="frames")).fresh
 
 
-def test_the_order_of_files_does_not_matter_but_what_stands_in_which_does(tmp_path: Path) -> None:
-    for name, words in (("a", "1"), ("b", "2"), ("c", "12")):
-        (tmp_path / name).write_text(words)
-    a, b = tmp_path / "a", tmp_path / "b"
-    digest = digest_files([a, b], root=tmp_path)
-    assert digest == digest_files([b, a], root=tmp_path)
-    a.write_text("2")
-    b.write_text("1")
-    assert digest != digest_files([a, b], root=tmp_path)
-
-
 def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed(tmp_path: Path) -> None:
     folder = StageFolder(tmp_path)
     checkpoint = folder.checkpoint("cloud.ply")
@@ -188,52 +163,6 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with raises(CaptureError, file=tmp_path / "cloud.ply"):
         StageFolder(tmp_path).keep(stage(make))
     assert make.runs == 0
-
-
-def body_key() -> set[str]:
-    """Return the names of the cached files of the bodies of a triangle with a wall."""
-    with TemporaryDirectory() as folder:
-        surface = Surface(torch.eye(3), torch.tensor([[0, 1, 2]]))
-        SurfaceBodies(surface, count=2, dofs=1000, cache=Path(folder)).modes(0.01)
-        return {each.name for each in Path(folder).iterdir()}
-
-
-def fit_key() -> str:
-    impacts = plate_impacts(6, seconds=0.1)
-    case = gain_data(impacts, plate_features(60), plate_extraction(impacts), FitConfig())
-    return fingerprint(case, MixtureEstimator())
-
-
-def edit_key() -> dict[str, str]:
-    field = ringing_field()
-    return guided.checkpoint_identity(field, field.gain_field.points[:2], {}, {})
-
-
-@pytest.mark.parametrize(
-    ("module", "key"),
-    [
-        (recipe, lambda: recipe.ObjectRecipe().elastic_values()),
-        (nominal, body_key),
-        (field_fit, fit_key),
-        (guided, edit_key),
-    ],
-    ids=["elastic modes", "body", "fit", "edit"],
-)
-def test_other_code_has_another_key(
-    module: ModuleType, key: Callable[[], object], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = key()
-    assert key() == before
-    monkeypatch.setattr(module, "source_digest", lambda module: "changed")
-    assert key() != before
-
-
-def test_the_checkpoint_of_an_edit_is_of_one_field_alone() -> None:
-    field, changed = ringing_field(), ({"pitch": 1.001}, {"damping": 1.001}, {"level": 1.001}, {"seconds": 0.501})
-    others = [*(ringing_field(**each) for each in changed), replace(field, phase=field.phase + 0.001)]
-    contacts = field.gain_field.points[:2]
-    keys = [guided.checkpoint_identity(each, contacts, {}, {})["field"] for each in (field, *others)]
-    assert len(set(keys)) == len(keys)
 
 
 @pytest.mark.slow
@@ -306,33 +235,9 @@ def test_a_command_is_refused_while_another_one_makes_stages(stage: str, tmp_pat
     assert not (tmp_path / CACHE / "views").exists()
 
 
-def test_a_folder_that_shows_nothing_is_left_as_it_is(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    assert main(["fit", str(tmp_path), "--until", "gaussians"]) == 2
-    assert [each.name for each in tmp_path.iterdir()] == ["notes.txt"]
-
-
-def test_only_the_cache_that_is_written_is_locked(tmp_path: Path) -> None:
-    with held(tmp_path / "one" / "cache"), StageFolder(tmp_path / "other" / "cache").lock("me", wait=0.0):
-        assert (tmp_path / "other" / "cache").is_dir()
-
-
 def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path) -> None:
     capture = read_capture(fill_plate(tmp_path / "plate"))
     with held(tmp_path / "cache"), pytest.raises(FolderInUseError) as refused:
         fit_in_stages(capture, PipelineConfig("smooth", modes=4), StageFolder(tmp_path / "cache"))
     assert refused.value.value["command"] == "avmsf fit mug"
     assert sorted(each.name for each in (tmp_path / "cache").iterdir()) == ["stages.lock"]
-
-
-def test_a_folder_behind_a_link_counts_for_the_digest_once(tmp_path: Path) -> None:
-    folder, elsewhere = tmp_path / "capture", tmp_path / "views"
-    folder.mkdir()
-    elsewhere.mkdir()
-    (elsewhere / "1.png").write_bytes(b"1")
-    (folder / "views").symlink_to(elsewhere)
-    (elsewhere / "back").symlink_to(folder)
-    before = digest_of(folder)
-    assert digest_of(folder) == before
-    (elsewhere / "1.png").write_bytes(b"2")
-    assert digest_of(folder) != before
