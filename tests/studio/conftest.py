@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from avmsf.studio.opening import Opened
-from plate_page import Open, Serve, plate_site, visiting
+from plate_page import Open, lay_out, plate_object, plate_strikes, plate_table, visiting
 from served import Served, served
 
 if TYPE_CHECKING:
@@ -65,20 +65,31 @@ def serve() -> Iterator[Callable[[Path], str]]:
 
 
 @pytest.fixture(scope="session")
-def site(serve: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Serve:
-    """Return a function that gives the address of the plate's page."""
-    return plate_site(serve, tmp_path_factory)
+def site(serve: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+    """Return a function that gives the address of the plate's page; the same one twice for the same wishes."""
+
+    @functools.cache
+    def address(kind: str = "points", *, surface: bool = False, strikes: bool = False, live: bool = False) -> str:
+        table, files = plate_table(), tmp_path_factory.mktemp("object")
+        bundle = {
+            "object": plate_object(kind, files),
+            "surface": plate_object("surface", files) if surface else None,
+            "strikes": plate_strikes(table) if strikes else None,
+        }
+        return serve(lay_out(files / "site", table, live=live, **bundle))
+
+    return address
 
 
 @pytest.fixture
-def visit(browser: "Browser", site: Serve) -> Iterator[Open]:
+def visit(browser: "Browser", site: Callable[..., str]) -> Iterator[Open]:
     """Return a function that opens the plate's page in a browser of its own."""
     with visiting(browser, site) as open_page:
         yield open_page
 
 
 @pytest.fixture(scope="module")
-def plain(browser: "Browser", site: Serve) -> Iterator["Page"]:
+def plain(browser: "Browser", site: Callable[..., str]) -> Iterator["Page"]:
     """Return one page of the plate's contacts without a server, for tests that leave no more behind than a blow."""
     with visiting(browser, site) as open_page:
         yield open_page()

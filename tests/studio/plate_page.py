@@ -1,7 +1,6 @@
 """A plate in closed form and its page: a folder to be served, a browser of its own, and answers for the server."""
 
 import contextlib
-import io
 import json
 import math
 import shutil
@@ -10,9 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import pytest
-import soundfile
 import torch
 import trimesh
 
@@ -22,6 +18,7 @@ from avmsf.export.sampled_field import SampledField
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.studio.routes import PAGE
+from opened_plate import blow
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Route
@@ -37,11 +34,10 @@ RATE = 16_000.0
 FIELD_ABILITIES = ["locate", "edit", "save", "like"]
 LIVE = {"revision": 1, "undo": False, "abilities": FIELD_ABILITIES, "mode": "field", "rows": [0, 1, 2, 3, 4, 5]}
 LIVE |= {"materials": ["ceramic", "glass", "wood", "iron", "steel"], "oldMaterial": "Present material"}
-Serve = Callable[..., str]
 Open = Callable[..., "Page"]
 
 
-def plate_table(*, pitch: float = 1.0) -> SampledField:
+def plate_table() -> SampledField:
     """Return a plate struck on a regular grid: cosines whose pitches are 400 Hz apart, all in sine phase."""
     x, y = torch.meshgrid(
         torch.linspace(-0.5, 0.5, ALONG) * SIDES[0], torch.linspace(-0.5, 0.5, ACROSS) * SIDES[1], indexing="ij"
@@ -54,7 +50,7 @@ def plate_table(*, pitch: float = 1.0) -> SampledField:
     return SampledField(
         points,
         normals,
-        400.0 * order * pitch,
+        400.0 * order,
         4.0 * order,
         plate_shapes(points) / order.float() + 0j,
         torch.zeros(8000),
@@ -95,37 +91,17 @@ def plate_object(kind: str, folder: Path) -> Path | None:
     return path
 
 
-def lay_out(folder: Path, table: SampledField, *, live: dict[str, Any] | None = None, **bundle: Any) -> Path:
-    """Write the page with a field, and with what a server would tell of itself."""
+def lay_out(folder: Path, table: SampledField, *, live: bool, **bundle: Any) -> Path:
+    """Write the page with a field, and if `live` with what a server would tell of itself."""
     made = make_bundle(table, **bundle)
-    replace(made, manifest={**made.manifest, "live": live}).write(folder)
+    replace(made, manifest={**made.manifest, "live": LIVE if live else None}).write(folder)
     shutil.copy(PAGE / "index.html", folder)
     shutil.copytree(PAGE, folder / "page")
     return folder
 
 
-def plate_site(serve: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Serve:
-    """Return a function that gives the address of the plate's page; the same one twice for the same wishes."""
-    known: dict[str, str] = {}
-
-    def address(
-        kind: str = "points", *, surface: bool = False, strikes: bool = False, live: dict[str, Any] | None = None
-    ) -> str:
-        name = repr((kind, surface, strikes, live))
-        if name not in known:
-            folder = tmp_path_factory.mktemp("page")
-            table = plate_table()
-            files = tmp_path_factory.mktemp("object")
-            seen = {"object": plate_object(kind, files), "surface": plate_object("surface", files) if surface else None}
-            measured = plate_strikes(table) if strikes else None
-            known[name] = serve(lay_out(folder / "site", table, strikes=measured, live=live, **seen))
-        return known[name]
-
-    return address
-
-
 @contextlib.contextmanager
-def visiting(browser: "Browser", site: Serve) -> Iterator[Open]:
+def visiting(browser: "Browser", site: Callable[..., str]) -> Iterator[Open]:
     """Yield a function that opens the plate's page in a browser of its own, after `before(page)`."""
     with contextlib.ExitStack() as opened:
 
@@ -152,15 +128,8 @@ def words_on(page: "Page", kind: str = ".word") -> str:
     return " ".join(page.locator(f"#words {kind}").all_inner_texts())
 
 
-def wav(seconds: float = 0.5) -> bytes:
-    memory = io.BytesIO()
-    time = np.arange(round(seconds * RATE)) / RATE
-    soundfile.write(memory, 0.5 * np.exp(-9 * time) * np.sin(2600 * time), round(RATE), "PCM_16", format="WAV")
-    return memory.getvalue()
-
-
 def upload(name: str = "blow.wav", content: bytes | None = None) -> Any:
-    return {"name": name, "mimeType": "audio/wav", "buffer": wav() if content is None else content}
+    return {"name": name, "mimeType": "audio/wav", "buffer": blow() if content is None else content}
 
 
 def answer(route: "Route", content: Any, status: int = 200) -> None:

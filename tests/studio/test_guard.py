@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, new_token
-from opened_plate import blow, open_plate
-from served import Served, run_async, served
+from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, new_token
+from opened_plate import open_plate
+from served import Served, served
 
 LARGEST = 200_000
 
@@ -21,15 +21,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     (home / "inside" / "secret.js").write_text("beside the field")
     with served(opened, home / "files", largest=LARGEST) as running:
         yield running
-
-
-def test_the_page_and_its_data_are_there_under_the_token(server: Served) -> None:
-    page = server.get("")
-    assert page.status == 200
-    assert b"<!doctype html>" in page.content
-    assert server.get("page/main.js").headers["content-type"].startswith("text/javascript")
-    assert server.get("manifest.json").words["live"]["mode"] == "field"
-    assert len(server.get("field.bin").content) > 1000
 
 
 def test_without_the_token_nothing_is_told(server: Served) -> None:
@@ -140,27 +131,3 @@ def test_the_token_does_not_leak_to_other_sites(server: Served) -> None:
         assert answer.headers["x-content-type-options"] == "nosniff"
         assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
         assert "access-control-allow-origin" not in answer.headers
-
-
-def test_other_methods_and_places_are_answered_in_words(server: Served) -> None:
-    for method, place in (("DELETE", "manifest.json"), ("PUT", "edit"), ("GET", "edit"), ("POST", "capture/strikes")):
-        answer = server.ask(method, place, blow() if method == "POST" else None)
-        assert 400 <= answer.status < 500
-        assert answer.words["error"]
-
-
-def test_sockets_of_another_protocol_are_closed() -> None:
-    sent: list[dict[str, object]] = []
-
-    async def application(*arguments: object) -> None:
-        raise AssertionError("let in")
-
-    async def receive() -> dict[str, object]:
-        return {"type": "websocket.connect"}
-
-    async def send(message: dict[str, object]) -> None:
-        sent.append(message)
-
-    guard = Guard(application, token="token", port=80)
-    run_async(guard({"type": "websocket", "path": "/token/", "headers": []}, receive, send))
-    assert sent == [{"type": "websocket.close", "code": 1008}]

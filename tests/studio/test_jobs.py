@@ -106,26 +106,6 @@ def test_a_result_that_cannot_be_taken_is_an_error_and_the_next_job_runs(raised:
     assert second == [{"taken": {}}]
 
 
-def test_a_result_that_is_being_taken_is_told_to_whoever_stops_the_job() -> None:
-    async def stop_late() -> tuple[bool, list[Any]]:
-        begun, go = asyncio.Event(), asyncio.Event()
-
-        async def slow(result: Any) -> Any:
-            begun.set()
-            await go.wait()
-            return {"revision": 2}
-
-        job = Jobs(script("say(result={})")).start("test", TEST, slow)
-        await begun.wait()
-        stopping = asyncio.create_task(job.cancel())
-        await asyncio.sleep(0.05)
-        assert not stopping.done()
-        go.set()
-        return await stopping, job.events
-
-    assert run_async(asyncio.wait_for(stop_late(), 30)) == (False, [{"revision": 2}])
-
-
 def test_who_comes_later_gets_what_was_missed() -> None:
     async def listen() -> list[list[Any]]:
         job = Job("test", TEST, same, script("for n in range(4): say(done=n)\nsay(result={})"))

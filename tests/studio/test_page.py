@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-import soundfile
 import torch
 
-from plate_page import LIVE, SIDES, Open, answer, on_screen, plate_shapes, plate_table, words_on
+from plate_page import SIDES, Open, on_screen, plate_shapes, plate_table, words_on
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page, Request, Route
+    from playwright.sync_api import Page
 
 pytestmark = pytest.mark.page
 
@@ -125,45 +124,6 @@ def test_the_table_tells_pitch_decay_and_level_at_the_contact(plain: "Page") -> 
     assert first == str(int(table.gains[row].abs().argmax()))
 
 
-def test_the_microphone_records_what_is_heard(visit: Open) -> None:
-    sent: list[bytes] = []
-
-    def locate(route: "Route", request: "Request") -> None:
-        sent.append(request.post_data_buffer or b"")
-        answer(route, {"impacts": []})
-
-    def before(page: "Page") -> None:
-        page.route("**/locate", locate)
-        page.add_init_script(
-            """navigator.mediaDevices.getUserMedia = async () => {
-                 const context = new AudioContext();
-                 const sine = new OscillatorNode(context, { frequency: 500 });
-                 const heard = new MediaStreamAudioDestinationNode(context, { channelCount: 1 });
-                 sine.connect(heard);
-                 sine.start();
-                 return heard.stream;
-               };"""
-        )
-
-    page = visit(live=LIVE, before=before)
-    page.click("#tab-find")
-    page.click("text=● Record")
-    page.wait_for_selector("text=impact detected")
-    page.wait_for_timeout(300)
-    page.click("text=■ Stop")
-    page.wait_for_selector("text=No impact detected")
-    samples, rate = soundfile.read(io.BytesIO(sent[0]))
-    assert samples.ndim == 1
-    assert len(samples) > 0.2 * rate
-    spectrum = np.abs(np.fft.rfft(samples[-round(0.2 * rate) :]))
-    assert np.argmax(spectrum) / 0.2 == pytest.approx(500, abs=10)
-
-
-def test_a_page_without_a_server_offers_nothing_that_needs_one(plain: "Page") -> None:
-    page = plain
-    assert page.locator("#tabs button").all_inner_texts() == ["Strike", "Modes"]
-
-
 def block_webgl(page: "Page") -> None:
     page.add_init_script(
         """const get = HTMLCanvasElement.prototype.getContext;
@@ -193,13 +153,3 @@ def test_what_the_browser_lacks_is_said_and_the_rest_works(visit: Open, before: 
     assert page.evaluate("avmsf.studio.last.force") == 1
     page.click("#tab-modes")
     assert page.locator("tbody tr").count() == 6
-
-
-def test_all_fits_on_a_telephone(visit: Open) -> None:
-    page = visit(live=LIVE, viewport={"width": 390, "height": 760})
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    page.mouse.click(*on_screen(page, (0.0, 0.0, 0.01)))
-    assert last_place(page).norm() < 0.02
-    for name in ("modes", "find", "edit"):
-        page.click(f"#tab-{name}")
-        assert page.evaluate("document.getElementById('sheets').scrollWidth") <= 390

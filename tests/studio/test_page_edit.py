@@ -16,7 +16,7 @@ from plate_page import answer, upload, words_on
 from served import Served
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page, Request, Route
+    from playwright.sync_api import Locator, Page, Request
 
 pytestmark = pytest.mark.page
 
@@ -123,20 +123,6 @@ def test_another_tabs_edit_is_shown_and_not_overwritten(edits: Edits, act: str, 
     assert (sliders["size"], sliders["pitch"]) == (2.0, 1.25), "on top of the other tab's"
 
 
-def test_another_tabs_edit_right_after_ones_own_is_told_and_kept(edits: Edits) -> None:
-    page, server = edits
-
-    def overtake(route: "Route") -> None:
-        response = route.fetch()
-        edit_elsewhere(server, size=2.0)
-        route.fulfill(response=response)
-
-    page.route("**/edit", overtake)
-    move(page, "Pitch")
-    page.wait_for_selector("text=Another tab has changed this field")
-    assert shown(page, "Size", "Pitch") == ["× 2.00", "× 1.00"]
-
-
 def test_undo_waits_for_the_edit_that_it_undoes(edits: Edits) -> None:
     page, _ = edits
     asked, held = requests_of(page), list[Any]()
@@ -182,39 +168,6 @@ def test_a_guided_edit_takes_the_sliders_along_and_holds_them_meanwhile(edits: E
     until_revision(page, 4)
 
 
-def test_a_guided_edit_under_way_is_followed_by_a_page_opened_later(
-    serving: Any, visit_studio: Any, tmp_path: Path
-) -> None:
-    server = serving(open_plate(tmp_path / "home"))
-    finish = guide(server, tmp_path)
-    assert server.ask("POST", "lead?base=1", blow()).status == 200
-    page = visit_studio(server)
-    page.click("#tab-edit")
-    assert page.locator("#sheet-edit button:visible", has_text="Stop").count() == 1
-    assert slider(page, "Pitch").locator("input").is_disabled()
-    finish()
-    until_revision(page, 2)
-    assert not slider(page, "Pitch").locator("input").is_disabled()
-    assert pitch_of_page(page) == pytest.approx(1.25)
-
-
-def test_an_answer_that_is_cut_is_no_success(edits: Edits) -> None:
-    page, server = edits
-
-    def cut(route: "Route") -> None:
-        route.fetch()
-        route.fulfill(status=200, content_type="application/json", body='{"revi')
-        page.unroute("**/edit", cut)
-
-    page.route("**/edit", cut)
-    move(page, "Pitch")
-    page.wait_for_selector("text=The server does not answer")
-    page.click("text=Try again")
-    page.wait_for_selector("text=or your last change was made although its answer was lost")
-    assert server.manifest()["live"]["revision"] == 2
-    assert shown(page, "Pitch") == ["× 1.01"]
-
-
 def test_an_edit_that_is_refused_is_neither_saved_nor_kept(edits: Edits, tmp_path: Path) -> None:
     page, _ = edits
     refuse = {"error": "pitch: expected modes below half the sample rate"}
@@ -227,21 +180,3 @@ def test_an_edit_that_is_refused_is_neither_saved_nor_kept(edits: Edits, tmp_pat
     assert not (tmp_path / "home" / "mine.safetensors").exists(), "what is not heard is not saved"
     page.click("text=Revert it")
     assert shown(page, "Pitch") == ["× 1.00"]
-
-
-def test_what_an_object_is_of_changes_nothing_by_itself(edits: Edits) -> None:
-    page, _ = edits
-    asked = requests_of(page)
-    page.get_by_label("Present material").select_option("wood")
-    page.wait_for_timeout(500)
-    assert asked == []
-    move(page, "Pitch")
-    until_revision(page, 2)
-    page.get_by_label("Present material").select_option("iron")
-    page.wait_for_timeout(500)
-    assert [words["material"] for _, words in asked] == [None], "the pitch is the same of any material"
-    move(page, "Size")
-    until_revision(page, 3)
-    page.get_by_label("Present material").select_option("steel")
-    until_revision(page, 4)
-    assert [words["material"]["from"] for _, words in asked[1:]] == ["iron", "steel"]

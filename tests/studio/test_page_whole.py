@@ -16,32 +16,13 @@ from avmsf.studio.guard import policy_of
 from avmsf.studio.opening import open_target
 from avmsf.studio.routes import PAGE
 from opened_plate import open_plate, plate_field, wav
-from plate_page import on_screen, plate_object, plate_table, words_on
-from served import wait_until
+from plate_page import plate_object, plate_table, words_on
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Route
+    from playwright.sync_api import Browser
 
 pytestmark = pytest.mark.page
 WATCH = "window.refused = []; addEventListener('securitypolicyviolation', (e) => refused.push(e.violatedDirective));"
-
-
-@pytest.mark.slow
-def test_pictures_that_show_nothing_are_said_to_and_can_be_tried_again(
-    serving: Any, visit_studio: Any, tmp_path: Path
-) -> None:
-    home = tmp_path / "home"
-    (home / "images").mkdir(parents=True)
-    for number in range(3):
-        Image.fromarray(np.full((24, 32, 3), 128, dtype=np.uint8)).save(home / "images" / f"{number}.png")
-    server = serving(open_target(home))
-    wait_until(lambda: server.manifest()["live"]["job"] is None, 60)
-    page = visit_studio(server)
-    said = page.locator("#words .bad", has_text="the reconstruction from the images failed")
-    assert "images" in said.inner_text()
-    said.locator("text=Try again").click()
-    page.wait_for_selector("#words .word:has-text('being reconstructed')")
-    assert page.evaluate("avmsf.studio.live.job") is not None
 
 
 def test_a_field_is_struck_and_a_dropped_recording_of_it_located(
@@ -54,15 +35,7 @@ def test_a_field_is_struck_and_a_dropped_recording_of_it_located(
     sound = torch.tensor(page.evaluate(f"avmsf.renderOffline([{{ row: {row} }}]).then((sound) => [...sound])"))
     expected = plate_field("elastic").render(place[None])[0]
     assert (sound - expected).abs().max() < 1e-4 * expected.abs().max()
-    recording, other = wav(expected.numpy()), plate_field().gain_field.points[100].tolist()
-
-    def ambiguous(route: "Route") -> None:
-        answer = route.fetch().json()
-        point = {"position": other, "probability": 0.2, "message": "mirrored"}
-        answer["impacts"][0] |= {"equivalent_points": [point], "notes": ["Quiet: less certain."]}
-        route.fulfill(json=answer)
-
-    page.route("**/locate", ambiguous)
+    recording = wav(expected.numpy())
     page.evaluate(
         """(text) => {
              const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -77,21 +50,7 @@ def test_a_field_is_struck_and_a_dropped_recording_of_it_located(
     probability = np.frombuffer(base64.b64decode(found["probability"]), "<f4")
     expected_paint = 1 + np.log10(np.maximum(probability / probability.max(), 1e-4)) / 4
     np.testing.assert_allclose(page.evaluate("[...avmsf.painted().values]"), expected_paint, atol=1e-5)
-    text = page.inner_text("#sheet-find")
-    for words in (
-        f"{1000 * found['credible_region']['radius']:.1f} mm radius",
-        "20 %: mirrored",
-        "Quiet: less certain.",
-    ):
-        assert words in text
-    # Labels are put in their places when the next picture is drawn.
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    for label, position in (("estimate", found["position"]), ("equivalent", other)):
-        box = page.locator(".mark .label", has_text=label).bounding_box()
-        x, y = on_screen(page, position)
-        assert box is not None
-        assert abs(box["y"] + box["height"] / 2 - y) < 3
-        assert 0 < box["x"] - x < 30
+    assert f"{1000 * found['credible_region']['radius']:.1f} mm radius" in page.inner_text("#sheet-find")
 
 
 def test_the_page_needs_no_more_than_it_is_allowed(serving: Any, browser: "Browser", tmp_path: Path) -> None:

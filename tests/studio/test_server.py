@@ -1,6 +1,5 @@
 """The server as the page uses it: struck, located, edited, recorded, and ended."""
 
-import asyncio
 import base64
 import io
 import json
@@ -10,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,18 +24,14 @@ import trimesh
 
 from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
-from avmsf.errors import LocationError, StudioError
+from avmsf.errors import StudioError
 from avmsf.fem.material import CERAMIC, WOOD
-from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.localization.contact_map import enlarged
 from avmsf.localization.locate import locate_impacts
 from avmsf.localization.locator import Locator
-from avmsf.studio.jobs import Threads
 from avmsf.studio.opening import open_target
 from avmsf.studio.server import listen, serve
 from avmsf.studio.studio import StudioConfig
-from avmsf.symmetry.find import find_symmetries
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
 from factories.raising import raises
@@ -144,16 +138,6 @@ def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served)
     assert found["position"] == pytest.approx(points[33].tolist(), abs=1e-7)
 
 
-def test_only_the_last_revisions_are_kept_and_all_can_be_undone(plate: Served) -> None:
-    for number in range(1, 8):
-        plate.ask("POST", "edit", {"base": number, "pitch": 1.0 + 0.01 * number})
-    assert plate.get("revisions/1/field.bin").content == plate.get("revisions/8/field.bin").content
-    assert plate.get("revisions/5/field.bin").content != plate.get("revisions/8/field.bin").content
-    for number in range(8, 15):
-        assert plate.ask("POST", "undo", {"base": number}).status == 200
-    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("elastic").bank.frequency)
-
-
 def test_words_need_their_model(plate: Served) -> None:
     assert "words" not in plate.manifest()["live"]["abilities"]
     answer = plate.ask("POST", "edit", {"base": 1, "prompt": "a wooden bowl is hit"})
@@ -190,47 +174,6 @@ def test_a_guided_edit_that_another_tab_has_overtaken_is_taken_and_its_change_co
     assert torch.equal(plate.studio.session.current.require_field().bank.frequency, led.bank.frequency)
     assert plate.ask("POST", "undo", {"base": 3}).status == 200
     assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
-
-
-def test_of_edits_in_quick_succession_the_last_is_prepared_and_an_error_is_only_reported(
-    plate: Served, capfd: pytest.CaptureFixture[str]
-) -> None:
-    prepared: list[SoundField] = []
-    edited = threading.Event()
-
-    class Held(Threads):
-        async def run(self, kind: Any, act: Any, *arguments: Any) -> Any:
-            prepared.append(act.__self__.field)
-            while not edited.is_set():
-                await asyncio.sleep(0.01)
-            if len(prepared) == 1:
-                raise LocationError("no mode is left to locate by")
-            return await super().run(kind, act, *arguments)
-
-    searches, session = plate.studio.searches, plate.studio.session
-    searches.threads = Held()
-    wait_until(lambda: bool(prepared))
-    first = searches.finder_of(session.current)
-    for number in range(1, 6):
-        plate.ask("POST", "edit", {"base": number, "material": {"from": "ceramic"}, "size": 1.0 + number / 10})
-    edited.set()
-    wait_until(lambda: len(prepared) == 2 and not searches.threads.busy)
-    assert prepared[1] is session.current.field
-    assert "LocationError: no mode is left to locate by" in capfd.readouterr().err
-    # Symmetries are searched once for all revisions of an opened field.
-    assert searches.finder_of(session.current).find_symmetries is first.find_symmetries
-
-
-@pytest.mark.slow
-def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
-    grid = torch.cartesian_prod(torch.linspace(-0.1, 0.1, 21), torch.linspace(-0.06, 0.06, 13))
-    points = torch.cat([grid, torch.full((len(grid), 1), 0.03)], dim=1) + torch.tensor([0.2, 0.0, 0.0])
-    larger, expected = enlarged(find_symmetries(points, seed=0), 1.5), find_symmetries(1.5 * points, seed=0)
-    assert len(larger.mirrors) == len(expected.mirrors) > 0
-    assert larger.spacing == pytest.approx(expected.spacing, rel=1e-5)
-    for kind in ("mirrors", "rotations"):
-        for one, other in zip(getattr(larger, kind), getattr(expected, kind), strict=True):
-            assert torch.allclose(one.point.double(), other.point.double(), atol=1e-3)
 
 
 def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:

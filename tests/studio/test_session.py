@@ -77,11 +77,18 @@ def test_sliders_are_read_back_and_change_nothing_at_rest() -> None:
         ({"modes": [{"mode": 0, "db": -900}]}, "db", -900.0),
         ({"brightness": 400}, "brightness", 400.0),
         ({"louder": 2}, "an edit", ["louder"]),
+        ({"modes": [{"mode": k, "pitch": 1.1} for k in range(6)]}, "modes", 6),
+        ({"modes": [{"mode": 1, "db": -100.0}] * 2}, "modes", [1]),
+        ({"modes": [{"mode": 10**400}]}, "mode", 10**400),
+        ({"material": {"to": "w" * 500_000}}, "material.to", "w" * 500_000),
+        *(({name: each}, name, each) for name in ("size", "pitch", "decay") for each in (1e308, 1e-4, 0.0, -1.0)),
+        *(({"modes": [{"mode": 0, name: each}]}, name, each) for name in ("pitch", "decay") for each in (1e308, 0.0)),
     ],
+    ids=lambda value: str(value)[:40],
 )
 def test_what_is_no_slider_is_named(words: dict[str, Any], name: str, value: object) -> None:
     with raises(RequestError, name=name, value=value) as refused:
-        Sliders.read(words)
+        Sliders.read(words, modes=5)
     assert refused.value.status == 400
     assert len(str(refused.value)) < 300
 
