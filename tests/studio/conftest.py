@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from avmsf.studio.opening import Opened
-from plate_page import Open, lay_out, plate_object, plate_strikes, plate_table, visiting
+from plate_page import Open, lay_out, plate_object, plate_strikes, plate_table
 from served import Served, served
 
 if TYPE_CHECKING:
@@ -81,18 +81,37 @@ def site(serve: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory)
     return address
 
 
+@contextlib.contextmanager
+def opening(browser: "Browser") -> Iterator[Open]:
+    """Yield a function that opens an address, after `before(page)`, in a browser of its own."""
+    with contextlib.ExitStack() as opened:
+
+        def open_page(address: str, before: Callable[["Page"], Any] = lambda page: None) -> "Page":
+            # The driver waits by evaluating words in the page, which a studio's policy forbids; another test has that.
+            context = browser.new_context(viewport={"width": 900, "height": 600}, bypass_csp=True)
+            opened.callback(context.close)
+            page = context.new_page()
+            page.set_default_timeout(15_000)
+            before(page)
+            page.goto(address)
+            page.evaluate("window.avmsf.ready.then(() => null)")
+            return page
+
+        yield open_page
+
+
 @pytest.fixture
 def visit(browser: "Browser", site: Callable[..., str]) -> Iterator[Open]:
-    """Return a function that opens the plate's page in a browser of its own."""
-    with visiting(browser, site) as open_page:
-        yield open_page
+    """Return a function that opens the plate's page, after `before(page)`."""
+    with opening(browser) as open_page:
+        yield lambda before=lambda page: None, **wishes: open_page(site(**wishes), before)
 
 
 @pytest.fixture(scope="module")
 def plain(browser: "Browser", site: Callable[..., str]) -> Iterator["Page"]:
     """Return one page of the plate's contacts without a server, for tests that leave no more behind than a blow."""
-    with visiting(browser, site) as open_page:
-        yield open_page()
+    with opening(browser) as open_page:
+        yield open_page(site())
 
 
 @pytest.fixture
@@ -103,19 +122,7 @@ def serving(tmp_path: Path) -> Iterator[Callable[[Opened], Served]]:
 
 
 @pytest.fixture
-def visit_studio(browser: "Browser") -> Iterator[Callable[..., "Page"]]:
-    """Return a function that opens a studio's page, after `before(page)`, in a browser of its own."""
-    with contextlib.ExitStack() as opened:
-
-        def visit(server: Served, before: Callable[["Page"], Any] = lambda page: None) -> "Page":
-            # The driver waits by evaluating words in the page, which its policy forbids; another test has that.
-            context = browser.new_context(viewport={"width": 900, "height": 600}, bypass_csp=True)
-            opened.callback(context.close)
-            page = context.new_page()
-            page.set_default_timeout(15_000)
-            before(page)
-            page.goto(f"http://127.0.0.1:{server.port}/{server.token}/")
-            page.evaluate("window.avmsf.ready.then(() => null)")
-            return page
-
-        yield visit
+def visit_studio(browser: "Browser") -> Iterator[Open]:
+    """Return a function that opens a studio's page, after `before(page)`."""
+    with opening(browser) as open_page:
+        yield lambda server, *before: open_page(f"http://127.0.0.1:{server.port}/{server.token}/", *before)

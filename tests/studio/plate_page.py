@@ -1,10 +1,9 @@
 """A plate in closed form and its page: a folder to be served, a browser of its own, and answers for the server."""
 
-import contextlib
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ from avmsf.studio.routes import PAGE
 from opened_plate import blow
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page, Route
+    from playwright.sync_api import Page, Route
 
 SIDES = (0.24, 0.16, 0.02)
 LARGER = 1.1
@@ -98,25 +97,6 @@ def lay_out(folder: Path, table: SampledField, *, live: bool, **bundle: Any) -> 
     shutil.copy(PAGE / "index.html", folder)
     shutil.copytree(PAGE, folder / "page")
     return folder
-
-
-@contextlib.contextmanager
-def visiting(browser: "Browser", site: Callable[..., str]) -> Iterator[Open]:
-    """Yield a function that opens the plate's page in a browser of its own, after `before(page)`."""
-    with contextlib.ExitStack() as opened:
-
-        def visit(*, before: Callable[["Page"], Any] | None = None, viewport: Any = None, **wishes: Any) -> "Page":
-            context = browser.new_context(viewport=viewport or {"width": 900, "height": 600})
-            opened.callback(context.close)
-            page = context.new_page()
-            page.set_default_timeout(10_000)
-            if before is not None:
-                before(page)
-            page.goto(site(**wishes))
-            page.evaluate("window.avmsf.ready.then(() => null)")
-            return page
-
-        yield visit
 
 
 def on_screen(page: "Page", place: Any) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +43,9 @@ async def same(result: Any) -> Any:
     return {"taken": result}
 
 
-def run(text: str, *, task: Any = TEST, finish: Callable[[Any], Awaitable[Any]] = same) -> list[Any]:
+def run(text: str, *, task: Any = TEST) -> list[Any]:
     async def all_events() -> list[Any]:
-        job = Job("test", task, finish, script(text))
+        job = Job("test", task, same, script(text))
         await job.run()
         return [event async for _, event in job.listen()]
 

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.page
 
 HERE, THERE = (0.04, 0.04, 0.01), (-0.04, 0.0, 0.01)
-FILE = "capture/strikes/001.wav"
 
 LOUD_MICROPHONE = """
     navigator.mediaDevices.getUserMedia = async () => {
@@ -72,18 +71,8 @@ def impacts(server: Served) -> list[Any]:
 def take(page: "Page", place: tuple[float, float, float], seed: int = 0) -> None:
     """Click a place and attach its recording."""
     page.mouse.click(*on_screen(page, place))
-    attach(page, seed)
-
-
-def attach(page: "Page", seed: int) -> None:
     page.set_input_files("#sheet-capture input[type=file]", upload(content=blow(seed)))
     page.wait_for_selector("#sheet-capture dl")
-
-
-def record_one(page: "Page") -> None:
-    take(page, HERE)
-    page.click("text=Save recording")
-    page.wait_for_selector("text=1 impact")
 
 
 def test_a_recording_outlives_a_broken_connection_and_a_reload(capturing: Any) -> None:
@@ -113,7 +102,9 @@ def test_a_capture_is_made_by_clicks_and_reconstructed(capturing: Any, tmp_path:
     server.studio.jobs.command = (sys.executable, "-c", f"import json; print(json.dumps({result!r}))")
     assert page.is_disabled("text=● Record")
     assert page.is_disabled("text=Reconstruct the field")
-    record_one(page)
+    take(page, HERE)
+    page.click("text=Save recording")
+    page.wait_for_selector("text=1 impact")
     take(page, THERE, 1)
     page.click("text=Save recording")
     page.wait_for_selector("text=2 impacts")
@@ -167,7 +158,7 @@ def test_a_recording_belongs_where_it_was_begun_and_ends_by_itself(capturing: An
     page.wait_for_selector("text=1 impact")
     [impact] = impacts(server)
     assert impact["contact"] == pytest.approx(HERE, abs=0.003)
-    samples, rate = soundfile.read(io.BytesIO(server.get(FILE).content))
+    samples, rate = soundfile.read(io.BytesIO(server.get("capture/strikes/001.wav").content))
     spectrum = np.abs(np.fft.rfft(samples[-round(0.2 * rate) :]))
     assert np.argmax(spectrum) / 0.2 == pytest.approx(500, abs=10), "it is the tone that the microphone hears"
 
@@ -180,21 +171,6 @@ def test_a_recording_belongs_where_it_was_begun_and_ends_by_itself(capturing: An
     with page.expect_response("**/capture/strikes/001.wav"):
         page.click("button:text-is('Replace')")
     assert impacts(server)[0]["digest"] != impact["digest"]
-
-
-def test_another_tabs_recording_is_not_overwritten(capturing: Any) -> None:
-    page, server = capturing()
-    record_one(page)
-    page.click("[aria-label='Record 001.wav again']")
-    attach(page, 1)
-    assert server.ask("PUT", FILE, blow(2)).status == 200
-    page.click("button:text-is('Replace')")
-    page.wait_for_selector("text=was rejected: 001.wav: expected the recording that the page shows")
-    assert server.get(FILE).content == blow(2)
-    with page.expect_response("**/capture"):
-        page.click("text=Replace it with mine")
-    page.wait_for_function("!document.body.textContent.includes('was rejected')")
-    assert server.get(FILE).content == blow(1)
 
 
 def test_the_outbox_promises_only_what_is_written(visit: Open) -> None:

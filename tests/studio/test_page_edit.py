@@ -1,18 +1,15 @@
 """The page and its studio change a field: nothing that a slider says is lost, no other tab's change is overwritten."""
 
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
 
-from avmsf.editing.modal_edit import adjust_modes
-from avmsf.field.store import load, save
+from avmsf.field.store import load
 from factories.made_fields import BANK
-from opened_plate import blow, open_plate, plate_field
-from plate_page import answer, upload, words_on
+from opened_plate import open_plate
+from plate_page import answer, words_on
 from served import Served
 
 if TYPE_CHECKING:
@@ -138,34 +135,6 @@ def test_undo_waits_for_the_edit_that_it_undoes(edits: Edits) -> None:
     assert [(what, words["base"]) for what, words in asked] == [("edit", 1), ("edit", 2), ("undo", 3)]
     assert shown(page, "Size", "Pitch") == ["× 1.01", "× 1.00"]
     assert words_on(page) == ""
-
-
-def guide(server: Served, folder: Path) -> Callable[[], None]:
-    """Let guided edits come to a field that is a fourth higher, once the returned function is called."""
-    save(adjust_modes(plate_field(), pitch=1.25), folder / "led")
-    script = (
-        "import json, os, shutil, sys, time; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
-        "while not os.path.exists(sys.argv[2]): time.sleep(0.01)\nprint(json.dumps({'result': task}))"
-    )
-    server.studio.jobs.command = (sys.executable, "-c", script, str(folder / "led"), str(folder / "go"))
-    return (folder / "go").touch
-
-
-def test_a_guided_edit_takes_the_sliders_along_and_holds_them_meanwhile(edits: Edits, tmp_path: Path) -> None:
-    page, server = edits
-    finish, asked = guide(server, tmp_path), requests_of(page)
-    move(page, "Pitch")
-    page.set_input_files("#sheet-edit input[type=file]", upload(content=blow()))
-    page.wait_for_selector("#sheet-edit button:visible:has-text('Stop')")
-    assert [what for what, _ in asked] == ["edit", "lead"], "the slider first, then the recording"
-    assert slider(page, "Pitch").locator("input").is_disabled()
-    assert page.is_disabled("#sheet-edit >> text=Undo")
-    finish()
-    until_revision(page, 3)
-    assert pitch_of_page(page) == pytest.approx(1.25)
-    assert shown(page, "Pitch") == ["× 1.00"]
-    move(page, "Size")
-    until_revision(page, 4)
 
 
 def test_an_edit_that_is_refused_is_neither_saved_nor_kept(edits: Edits, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.page
 
 MIDDLE = (0.0, 0.0, SIDES[2] / 2)
-CORNER = (0.1, 0.06, SIDES[2] / 2)
 
 
 def page_module(page: "Page", module: str, does: str, given: Any = None) -> Any:

@@ -120,9 +120,6 @@ def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
     saved = plate.ask("POST", "save", {"base": 2, "name": "wooden"})
     assert saved.status == 201
     assert torch.equal(load(saved.words["file"]).bank.frequency, expected.bank.frequency)
-    again = plate.ask("POST", "save", {"base": 3, "name": "wooden"})
-    assert again.status == 409
-    assert again.words["error"].startswith("wooden.safetensors: ")
     undone = plate.ask("POST", "undo", {"base": 3}).words
     assert undone["revision"] == 4
     assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("elastic").bank.frequency)
@@ -186,9 +183,7 @@ def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:
     top = (points[:, 2] > 0.0019) & (np.abs(points[:, 0]) < 0.1) & (np.abs(points[:, 1]) < 0.07)
     assert np.median(normals[top] @ [0, 0, 1.0]) > 0.9
     assert capture.get("capture").words["strikes"] == []
-    judged = capture.ask("POST", "capture/check", blow())
-    assert judged.status == 200
-    assert judged.words["onset_seconds"] == pytest.approx(0.1, abs=1e-3)
+    assert capture.ask("POST", "capture/check", blow()).words["onset_seconds"] == pytest.approx(0.1, abs=1e-3)
     for number, place in enumerate(points[np.flatnonzero(top)[:3]].tolist()):
         query = "x={}&y={}&z={}&nx=0&ny=0&nz=-1".format(*place)
         for _ in range(2):
