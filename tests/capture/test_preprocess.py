@@ -19,7 +19,6 @@ from factories.plate_capture import fill_plate
 from oracles.plate import Plate, sample_contacts, strike
 
 HAMMER = CaptureSettings(force_channel=1, response_channel=2, seconds=0.4)
-CAPTURES = Path(__file__).resolve().parents[2] / "benchmarks/captures"
 HEARD = CaptureSettings(seconds=0.3)
 MARGIN = 160
 """20 ms at 8 kHz."""

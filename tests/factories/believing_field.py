@@ -69,21 +69,21 @@ def impacts(contacts: Tensor) -> Sites:
     return Sites(contacts, DOWN.expand_as(contacts))
 
 
-def rows_of(perturbation: float = PERTURBATION, remainder: float = REMAINDER) -> Tensor:
+def rows_of() -> Tensor:
     """Return the rows of the elastic kernels in which each mode is the elastic one of the same row, perturbed."""
     profiles, shapes, remainders = len(PERTURBATIONS) + len(WIDTHS), len(ELASTIC), len(RESIDUALS)
     rows = torch.arange(profiles * shapes * remainders).reshape(profiles, shapes, remainders)
-    return rows[PERTURBATIONS.index(perturbation), : len(BANK), RESIDUALS.index(remainder)]
+    return rows[PERTURBATIONS.index(PERTURBATION), : len(BANK), RESIDUALS.index(REMAINDER)]
 
 
-def drawn_gains(contacts: Tensor, *, seed: int, noise: float = NOISE) -> Tensor:
+def drawn_gains(contacts: Tensor, *, seed: int) -> Tensor:
     """Return gains of contacts that are drawn from one hypothesis of the elastic family, [contacts, modes, 2]."""
     sites = impacts(contacts)
     covariance = Elastic(sites, SIZE, bar()).take(rows_of()).kernels()
     factor = torch.linalg.cholesky(covariance + 1e-9 * torch.eye(len(contacts), dtype=torch.float64))
     generator = torch.Generator().manual_seed(seed)
     smooth = factor @ torch.randn(4, len(contacts), 2, generator=generator, dtype=torch.float64)
-    own = noise**0.5 * torch.randn(4, len(contacts), 2, generator=generator, dtype=torch.float64)
+    own = NOISE**0.5 * torch.randn(4, len(contacts), 2, generator=generator, dtype=torch.float64)
     return (smooth + own).transpose(0, 1)
 
 
@@ -106,20 +106,13 @@ def positional_field(contacts: Tensor, values: Tensor) -> MixtureGains:
     return _fitted([each(sites, SIZE) for each in (Unstructured, Smooth, ThinPlate)], values, directional=False)
 
 
-def one_hypothesis(
-    contacts: Tensor,
-    values: Tensor,
-    *,
-    perturbation: float = PERTURBATION,
-    remainder: float = REMAINDER,
-    noise: float = NOISE,
-) -> MixtureGains:
-    """Return the model of a single hypothesis for each mode: that of `drawn_gains`, unless another is named."""
-    sites, rows = impacts(contacts), rows_of(perturbation, remainder)
+def one_hypothesis(contacts: Tensor, values: Tensor) -> MixtureGains:
+    """Return the model of a single hypothesis for each mode: that of `drawn_gains`."""
+    sites, rows = impacts(contacts), rows_of()
     family = Elastic(sites, SIZE, bar()).take(rows)
     weights = torch.zeros(len(rows), len(NOISE_SHARES), 2 * len(rows), dtype=torch.float64)
     for row in range(len(rows)):
-        weights[row, NOISE_SHARES.index(noise), [row, row + len(rows)]] = 1.0
+        weights[row, NOISE_SHARES.index(NOISE), [row, row + len(rows)]] = 1.0
     series = values.transpose(1, 2).flatten(1)
     mixture = KernelMixture(family.kernels(), series, torch.zeros(series.shape[1]).double(), weights)
     return MixtureGains(bar_points(), sites, (family,), mixture, True)

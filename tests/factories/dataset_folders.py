@@ -1,7 +1,6 @@
 """Folders in the layouts of published datasets, with their names, types, shapes and quirks, as the tests need them."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -97,21 +96,10 @@ def write_mesh(path: Path, *, radius: float = 0.1, middle: tuple[float, float, f
 
 def microphones() -> np.ndarray:
     """Return where 600 microphones stand: angle > distance > microphone, a vertical row of 15 on an arm that turns."""
-    places = []
-    for angle in range(0, 181, 20):
-        for distance in (0, 333, 667, 1000):
-            for microphone in range(15):
-                radius, height = (230 + distance) / 1000, -0.91 + 1.82 * microphone / 14
-                turn = math.radians(angle)
-                across, along = -0.04345, radius
-                places.append(
-                    (
-                        along * math.cos(turn) - across * math.sin(turn),
-                        along * math.sin(turn) + across * math.cos(turn),
-                        height,
-                    )
-                )
-    return np.array(places)
+    turns, reaches = np.deg2rad(np.arange(0, 181, 20)), np.array([0.23, 0.563, 0.897, 1.23])
+    turn, reach, height = np.meshgrid(turns, reaches, np.linspace(-0.91, 0.91, 15), indexing="ij")
+    spot = (reach - 0.04345j) * np.exp(1j * turn)
+    return np.stack([spot.real, spot.imag, height], axis=-1).reshape(-1, 3)
 
 
 def write_realimpact(folder: Path, name: str, *, samples: int = 2400) -> Path:

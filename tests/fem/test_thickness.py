@@ -17,7 +17,7 @@ GRID = (0.001, 0.0016, 0.0025, 0.004, 0.0063)
 
 
 def searched(
-    of: Callable[[float], float], *, filled: float = -1000.0, walls: Sequence[float | None] = GRID, made: bool = True
+    of: Callable[[float], float], *, filled: float = -1000.0, walls: Sequence[float | None] = GRID
 ) -> tuple[Sequence[CandidateBody], ThicknessPosterior | None, list[float]]:
     """Search by the evidence of a log thickness and of the filled body; return the walls that were asked for, too."""
     asked: list[float] = []
@@ -28,9 +28,9 @@ def searched(
     def evidence(known: Sequence[CandidateBody]) -> list[float]:
         return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
 
-    def make(like: CandidateBody, wall: float) -> CandidateBody | None:
+    def make(like: CandidateBody, wall: float) -> CandidateBody:
         asked.append(wall)
-        return walled(wall) if made else None
+        return walled(wall)
 
     return *search_thickness([walled(each) for each in walls], evidence, make), asked
 

@@ -32,10 +32,6 @@ def field(damping: str = "shared") -> SoundField:
     return plate_fit(config, train=plate_impacts(forces=True), capture="a plate", settings=SETTINGS)
 
 
-def other_field() -> SoundField:
-    return replace(field(), bank=replace(field().bank, damping=field().bank.damping * 2))
-
-
 def test_a_field_comes_back_to_the_last_bit(tmp_path):
     saved, path, chance = field("validated"), tmp_path / "plate.safetensors", torch.get_rng_state()
     save(saved, path)

@@ -53,7 +53,7 @@ def seen(row: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def photographs(
-    wall: tuple[float, float, float], paint: tuple[float, float, float], *, falloff: float = 0.0, noise: float = 1.5
+    wall: tuple[float, float, float], paint: tuple[float, float, float], *, falloff: float = 0.0
 ) -> list[View]:
     """The ring in a color before a wall whose corners are darker by a share `falloff`."""
     generator = np.random.default_rng(0)
@@ -64,7 +64,7 @@ def photographs(
         there, light = seen(row)
         ring = np.array(paint) * (0.35 + 0.65 * light[..., None])
         image = np.where(there[..., None], ring, np.array(wall) * lit[..., None])
-        image += noise * generator.standard_normal(image.shape)
+        image += 1.5 * generator.standard_normal(image.shape)
         views.append(View(f"{row:02}.png", torch.from_numpy(image.round().clip(0, 255).astype(np.uint8)), camera))
     return views
 

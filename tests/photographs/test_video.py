@@ -15,10 +15,10 @@ SHARP = (2, 11, 13, 21, 28, 30)
 """Of 36 frames, one in each sixth that is not blurred."""
 
 
-def picture(number: int, *, blurred: bool, width: int = 96, height: int = 64) -> np.ndarray:
+def picture(number: int, *, blurred: bool) -> np.ndarray:
     """Fine noise whose brightness in the corner tells the frame's number."""
-    frame = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    frame = cv2.resize(frame[::2, ::2], (width, height), interpolation=cv2.INTER_NEAREST)
+    frame = np.random.default_rng(number).integers(0, 256, (64, 96, 3), dtype=np.uint8)
+    frame = cv2.resize(frame[::2, ::2], (96, 64), interpolation=cv2.INTER_NEAREST)
     if blurred:
         frame = cv2.GaussianBlur(frame, (0, 0), 2.0)
     frame[:16, :16] = 7 * number
