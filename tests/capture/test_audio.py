@@ -9,7 +9,7 @@ import soundfile
 import torch
 
 from avmsf.capture import CaptureSettings, check, read_capture, read_recording
-from avmsf.capture.audio import clipped_samples, constant_offset
+from avmsf.capture.audio import clipped_samples
 from avmsf.capture.issues import shared_problems
 from avmsf.errors import CaptureWarning
 from factories.capture_folder import RATE, fill, ring
@@ -48,16 +48,6 @@ def test_loss_by_compression_or_8_bits_is_reported(tmp_path: Path, container: st
     soundfile.write(tmp_path / "b.wav", ring(), RATE, format=container, subtype=subtype)
     report = check(tmp_path).recordings[1]
     assert (report.coding, report.clipped, len(report.problems)) == (subtype, 0, problems)
-
-
-@pytest.mark.parametrize("frequency", [20.0, 25.0, 33.0, 33.3, 50.0, 66.6])
-def test_a_slow_vibration_is_no_offset_and_hides_none(frequency: float) -> None:
-    time = np.arange(48_000) / 48_000
-    noise = 1e-4 * np.random.default_rng(0).standard_normal(48_000)
-    sound = np.exp(-time) * np.sin(2 * np.pi * frequency * time) + noise
-    assert constant_offset(sound, sample_rate=48_000) == 0.0
-    quiet = np.concatenate([noise, sound]) + 0.01
-    assert constant_offset(quiet, sample_rate=48_000) == pytest.approx(0.01, abs=1e-4)
 
 
 def test_flat_tops_count_and_smooth_ones_do_not() -> None:

@@ -47,13 +47,6 @@ def test_contacts_on_the_surface_pass_and_coarse_measurements_are_no_mistake_of_
         assert float(placement.distances.max()) < 0.01
 
 
-def test_distances_are_meters_to_the_nearest_point() -> None:
-    cloud = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2]])
-    placement = check_placement(torch.tensor([[1.0, 0.3, 0.4], [0, 2, 0.25]]), cloud)
-    assert placement.distances.tolist() == pytest.approx([0.5, 0.25])
-    assert placement.diagonal == pytest.approx(3)
-
-
 # Contacts on a surface three times too large look like contacts on a part of it.
 @pytest.mark.parametrize("factor", [factor for factor in FACTORS if factor < 1 or factor > 9])
 def test_every_ratio_of_units_is_found_whichever_of_the_two_it_befell(factor: float) -> None:

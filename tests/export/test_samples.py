@@ -97,27 +97,6 @@ def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("layers", "order"),
-    [
-        ((Layer(2.0), Layer(1.0), Layer(0.5)), [2, 1, 0]),
-        ((Layer(1.0), Layer(1.0, 0.002), Layer(1.0, 0.0005)), [1, 2, 0]),
-        (LAYERS, [0, 1, 2]),
-    ],
-)
-def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path, layers, order):
-    written = write_grid(table(), tmp_path / "grid", contacts=2, layers=layers)
-    found = rows(tmp_path / "grid")
-    assert [(float(row["force"]), float(row["contact_time"])) for row in found[:3]] == [
-        (layers[number].force, layers[number].contact_time) for number in order
-    ]
-    levels_db = [float(row["peak_db"]) for row in found]
-    assert levels_db[:3] == sorted(levels_db[:3])
-    for region in played(tmp_path / "grid"):
-        assert float(region[f"amp_velcurve_{region['hivel']}"]) == pytest.approx(1.0, rel=1e-5)
-    assert len(written.remarks) == 1 + (order != [0, 1, 2])
-
-
-@pytest.mark.parametrize(
     ("settings", "name", "value"),
     [
         ({"contacts": 0}, "contacts", 0),

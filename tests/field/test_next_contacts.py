@@ -13,7 +13,6 @@ from avmsf.errors import ArrayError, FitError
 from avmsf.field.gains.elastic import REACH
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.next_contacts import suggest
-from avmsf.field.posterior import relative_gain_std
 from avmsf.field.sound_field import SoundField
 from factories.believing_field import (
     BANK,
@@ -148,11 +147,3 @@ def test_one_place_says_nothing_of_how_gains_vary() -> None:
     values = drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2)
     with raises(FitError, name="field", value=1):
         suggest(sound_field(positional_field(contacts, values)))
-
-
-def test_errors_are_those_of_the_map_of_uncertainty() -> None:
-    field = of_one_hypothesis()
-    found = suggest(field, 1)
-    # The map is relative to the energy of the mean gains, to which errors add what is not known.
-    doubt = float(relative_gain_std(field, found.points.float()).square().mean())
-    assert found.before**2 == pytest.approx(doubt / (1 + doubt), rel=1e-3)

@@ -9,7 +9,6 @@ import torch
 import trimesh
 
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, SurfaceBodies
@@ -17,7 +16,6 @@ from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import GainData, gain_data, gain_variance
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for
-from avmsf.field.probable_body import ProbableBody
 from avmsf.mesh.level_set import difference
 from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction
@@ -109,19 +107,6 @@ def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
     assert first["weight"] > 10 * max(each["weight"] for each in others)
 
 
-def test_a_mesh_in_centimeters_is_said_to_be() -> None:
-    """Read in meters, it has frequencies a hundredth of the object's."""
-    slow = [replace(each, elastic=replace(each.elastic, frequency=each.elastic.frequency / 100)) for each in bodies()]
-    candidates = CandidateBodies(slow)
-    candidates.unit_ratios = CaptureSettings().unit_ratios(8.0)
-    report = MixtureEstimator(bodies=candidates).solve(case())[0].report
-    assert (report["bodies"][0]["body"], report["bodies"][0]["unit"]) == (bodies()[1].name, "cm")
-    assert report["bodies"][0]["frequency_factor"] == pytest.approx(STIFFER, rel=0.06)
-    found = ProbableBody.of(report)
-    assert found is not None
-    assert 'unit = "cm"' in found.warning
-
-
 def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> None:
     # Both are walls of 4 mm by name; the wrong one comes first.
     bad, good = (
@@ -133,13 +118,6 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert candidates.asked == [good]
     assert (first["wall_thickness"], first["refined"]) == (0.00396, True)
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
-
-
-@pytest.mark.parametrize("directions", [None, torch.zeros(12, 3)], ids=["no directions", "directions of length zero"])
-def test_impacts_of_unknown_direction_go_straight_into_the_body(directions: torch.Tensor | None) -> None:
-    found = estimator().solve(case(directions=directions))[0].training.directions
-    straight = -truth(WALLS[1]).normals(recorded(12)[0].contacts)
-    assert float((found * straight).sum(1).min()) > 0.99
 
 
 def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
