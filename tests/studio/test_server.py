@@ -220,23 +220,6 @@ def test_a_reconstruction_needs_two_strikes(capture: Served) -> None:
     assert capture.ask("DELETE", "jobs/unknown").status == 404
 
 
-@pytest.mark.slow
-def test_a_reconstruction_that_fails_says_why_and_one_can_be_stopped(tmp_path: Path) -> None:
-    folder = fill_plate(tmp_path / "plate")
-    rows = (folder / "impacts.csv").read_text().splitlines()
-    (folder / "impacts.csv").write_text("\n".join([*rows, rows[-1].replace("008.wav", "missing.wav")]) + "\n")
-    with served(open_target(folder), tmp_path / "files") as running:
-        job = running.ask("POST", "reconstruct", {}).words["job"]
-        assert running.manifest()["live"]["job"] == job
-        assert running.ask("POST", "reconstruct", {}).status == 409
-        last = running.events(job)[-1]
-        assert "missing.wav" in last["error"]
-        assert running.events(job, after="0") == running.events(job)[1:]
-        again = running.ask("POST", "reconstruct", {}).words["job"]
-        assert running.ask("DELETE", f"jobs/{again}").words == {"cancelled": again}
-        assert running.events(again)[-1]["stage"] == "cancelled"
-
-
 def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(tmp_path: Path) -> None:
     made = adjust_modes(plate_field(), pitch=1.25)
     save(made, tmp_path / "made")
