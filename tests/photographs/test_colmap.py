@@ -1,7 +1,5 @@
 """COLMAP's models: text, binary and what COLMAP itself writes say the same as transforms.json."""
 
-import subprocess
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,7 +14,6 @@ from avmsf.photographs.colmap import MODELS, read_colmap, read_lenses
 from factories.raising import raises
 from factories.views_folder import (
     HEIGHT,
-    PINHOLE,
     WIDTH,
     frames,
     quaternion,
@@ -68,51 +65,6 @@ def test_points_and_colors(tmp_path: Path, write: Callable[..., None]) -> None:
     for name in ("points3D.txt", "points3D.bin"):
         (tmp_path / "sparse/0" / name).unlink(missing_ok=True)
     assert read_sparse_points(tmp_path) is None
-
-
-PYCOLMAP = """
-import sys
-import numpy as np
-import pycolmap
-model, name, width, height = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
-parameters = [float(each) for each in sys.argv[5].split(",")]
-reconstruction = pycolmap.Reconstruction()
-camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters, camera_id=7)
-reconstruction.add_camera_with_trivial_rig(camera)
-for row, line in enumerate(sys.stdin.read().splitlines(), start=1):
-    w, x, y, z, *translation = (float(each) for each in line.split())
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(translation))
-    image = pycolmap.Image(name=f"{chr(96 + row)}.png", camera_id=7, image_id=row)
-    reconstruction.add_image_with_trivial_frame(image, pose)
-reconstruction.add_point3D(np.array([0.5, -0.25, 2.0]), pycolmap.Track(), np.array([255, 128, 0], dtype=np.uint8))
-reconstruction.write_text(model) if sys.argv[6] == "text" else reconstruction.write_binary(model)
-"""
-
-
-@pytest.mark.parametrize("form", ["text", "binary"])
-def test_what_colmap_writes_says_the_same(tmp_path: Path, form: str) -> None:
-    model = tmp_path / "one" / "sparse" / "0"
-    model.mkdir(parents=True)
-    cameras = ring(4)
-    poses = [(*quaternion(camera), *camera.world_to_camera[:3, 3].tolist()) for camera in cameras]
-    command = [sys.executable, "-c", PYCOLMAP, str(model)]
-    done = subprocess.run(
-        [*command, "PINHOLE", str(WIDTH), str(HEIGHT), ",".join(map(str, PINHOLE[1])), form],
-        input="\n".join(" ".join(map(repr, pose)) for pose in poses),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    if "No module named 'pycolmap'" in done.stderr:
-        pytest.skip("pycolmap is not installed")
-    assert done.returncode == 0, done.stderr
-    write_images(tmp_path / "one")
-    write_transforms(tmp_path / "other", frames(cameras))
-    assert_same(read_views(tmp_path / "one"), read_views(tmp_path / "other"))
-    found = read_sparse_points(tmp_path / "one")
-    assert found[0].tolist() == [[0.5, -0.25, 2.0]]
-    assert found[1].tolist() == [[255, 128, 0]]
 
 
 # By COLMAP's documentation: focal lengths, principal point, then coefficients in the order k1 k2 p1 p2.
