@@ -17,11 +17,9 @@ from avmsf.fem.meshing import (
     TOLERANCES,
     CheckedSurface,
     checked,
-    count_crowded_edges,
     denoised,
     roughness,
     simplified,
-    thinned,
     weld,
 )
 from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed
@@ -169,19 +167,6 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
     # Without thinning, elements that differ change frequencies by 1.5 % at this size.
     assert found.frequency.numpy() == pytest.approx(known.frequency.numpy(), rel=0.03)
     assert found.mass == pytest.approx(known.mass, rel=0.01)
-
-
-def test_a_noisy_mesh_is_thinned_without_its_noise_and_stays_a_skin(monkeypatch: pytest.MonkeyPatch) -> None:
-    clean = ellipsoid(5)
-    noise = 0.01 * clean.scale * np.random.default_rng(0).standard_normal(clean.vertices.shape) / 3**0.5
-    limit(monkeypatch, 4000)
-    found = thinned(mesh_of(clean.vertices + noise, clean.faces), log=lambda words: None)
-    assert len(found.faces) == 4000
-    assert (len(boundary_edges(found)), count_crowded_edges(found)) == (0, 0)
-    surface = ClosestPoints(clean.triangles)
-    before = np.sqrt((surface(clean.vertices + noise).distances ** 2).mean())
-    assert np.sqrt((surface(found.vertices).distances ** 2).mean()) < 0.35 * before
-    assert found.volume == pytest.approx(clean.volume, rel=0.01)
 
 
 def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is_filled() -> None:

@@ -165,19 +165,6 @@ def mixed(surface: Surface) -> Surface:
 
 
 @pytest.mark.slow
-def test_two_balls_that_cross_with_a_hole_are_one_body():
-    one = ball()
-    pierced = Surface(one.vertices, one.faces[8:])
-    other = Surface(one.vertices + torch.tensor([0.06, 0.0, 0.0]), one.faces + len(one.vertices))
-    scan = Surface(torch.cat([one.vertices, other.vertices]), torch.cat([pierced.faces, other.faces]))
-    solid = fill(scan, detail=0.1)
-    # Two balls less the lens in which both lie, pi (4 r + d) (2 r - d)^2 / 12.
-    lens = math.pi * (4 * 0.05 + 0.06) * (2 * 0.05 - 0.06) ** 2 / 12
-    assert solid.volume == pytest.approx(2 * 4 / 3 * math.pi * 0.05**3 - lens, rel=0.06)
-    assert int(solid.parts.max()) == 0
-
-
-@pytest.mark.slow
 def test_a_skin_that_runs_through_itself_is_filled_once():
     # A tube wider than the ring that it is bent to: the part around the axis lies inside of it twice.
     ring, tube = 0.03, 0.04

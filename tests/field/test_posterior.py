@@ -21,7 +21,6 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.believing_field import (
     BANK,
-    DOWN,
     LENGTH,
     bar_contacts,
     bar_points,
@@ -66,17 +65,6 @@ def test_what_is_drawn_from_the_model_is_covered() -> None:
     # Gains of one mode hang together: six fields of four modes scatter by about .02.
     assert plain == pytest.approx(0.9, abs=0.05)
     assert by_energy == pytest.approx(0.9, abs=0.05)
-
-
-def test_an_impact_from_below_has_the_opposite_gain_where_directions_are_known() -> None:
-    everywhere = bar_contacts(60, seed=13)
-    values = drawn_gains(everywhere, seed=0)
-    side = torch.where(torch.arange(40) % 2 == 0, -1.0, 1.0).double()[:, None]
-    turned = side * torch.view_as_complex(values[20:])
-    field = sound_field(elastic_field(everywhere[:20], values[:20]))
-    straight = coverage(field, everywhere[20:], torch.view_as_complex(values[20:])).plain
-    assert coverage(field, everywhere[20:], turned, directions=side * DOWN).plain == straight
-    assert coverage(field, everywhere[20:], turned).plain < straight - 0.1
 
 
 @both_models

@@ -1,20 +1,16 @@
 """Presets: what `paper` selects, that it is complete, and that the options of the commands start from it."""
 
 import re
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-
-import pytest
 
 import avmsf
 from avmsf.capture import Capture, CaptureSettings
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.modes import Options as ModesOptions
 from avmsf.errors import AvmsfError, FitError, SceneError
-from avmsf.field.config import FitConfig
 from avmsf.field.store import load
-from avmsf.gaussians.config import SplatConfig
-from avmsf.pipeline.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, SceneConfig, ViewsConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig, PipelineConfig, ViewsConfig
 from avmsf.pipeline.record import recorded, with_record
 from factories.plate_field import plate_impacts
 from factories.raising import raises
@@ -33,16 +29,6 @@ def test_commands_start_from_the_preset_and_change_what_is_said() -> None:
 def test_a_seed_is_that_of_all_stages() -> None:
     made = FitOptions.parse(["mug", "--seed", "4"]).all_settings
     assert {made.fit.seed, made.scene.views.seed, made.scene.splat.seed, made.scene.lift.seed} == {4}
-
-
-def test_no_setting_of_a_preset_is_left_out_by_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = SceneConfig(ViewsConfig(count=9), SplatConfig(steps=8), LiftConfig(angles=7))
-    other = PipelineConfig(
-        "smooth", BodyConfig(wall=0.5), scene, FitConfig(steps=6), "short-time", 5, "peak", "cpu", False
-    )
-    assert all(getattr(other, each.name) != getattr(PipelineConfig(), each.name) for each in fields(other))
-    monkeypatch.setitem(PRESETS, "paper", other)
-    assert FitOptions.parse(["mug", "--preset", "paper"]).all_settings == other
 
 
 def test_the_start_of_sounds_is_the_presets_before_the_captures_own() -> None:

@@ -7,45 +7,14 @@ from pathlib import Path
 import pytest
 
 from avmsf.cli import main
-from avmsf.field.gains.elastic import Elastic
 from avmsf.field.store import load
 from avmsf.mesh import read_surface
 from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.photographs.folder import write_frames
 from avmsf.pipeline.config import CACHE, SURFACE
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
-from factories.plate_capture import TINY, fill_plate
 from factories.settings import sets
-from factories.small_scene import SMALL_SPLAT, slab_views
 
 Streams = pytest.CaptureFixture[str]
-SMALL = (
-    *SMALL_SPLAT,
-    *sets("lift.encoder=descriptors lift.points=600 lift.symmetry=false modes=12"),
-    *TINY[:-2],
-)
-
-
-@pytest.fixture(scope="module")
-def slab(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a capture folder with photographs of the slab and impacts on it."""
-    folder = fill_plate(tmp_path_factory.mktemp("photographs") / "slab", surface=False)
-    write_frames(slab_views(), folder)
-    return folder
-
-
-@pytest.mark.slow
-def test_photographs_alone_give_elastic_mode_shapes(slab: Path, capsys: Streams) -> None:
-    bodies = (*sets("body.wall=0 body.shapes=6 body.dofs=1500 body.supports=free"),)
-    assert main(["fit", str(slab), *SMALL, *bodies, "--json"]) == 0
-    made = json.loads(capsys.readouterr().out)
-    report = made["report"]
-    assert Elastic.kind not in report["unavailable"]
-    assert report["bodies"][0]["body"].startswith("solid body")
-    assert main(["fit", str(slab), *SMALL, *bodies, "--json"]) == 0
-    again = json.loads(capsys.readouterr().out)
-    assert [each["stage"] for each in again["stages"]] == ["views", "cloud", "features", "surface", "modes", "fit"]
-    assert not any(each["fresh"] for each in again["stages"])
 
 
 @pytest.mark.slow

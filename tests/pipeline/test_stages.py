@@ -8,18 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import trimesh
 
 import avmsf.pipeline.fit as module
 from avmsf._utils.progress import ProgressListener
 from avmsf.capture import read_capture
-from avmsf.cli import main
 from avmsf.errors import CaptureError, FolderInUseError, SimulationError
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.pipeline.bodies import candidate_bodies
-from avmsf.pipeline.config import CACHE, BodyConfig, PipelineConfig
+from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from avmsf.pipeline.fit import fit_in_stages
 from avmsf.pipeline.stages import Pipeline, Stage, StageFolder
 from factories.plate_capture import fill_plate
@@ -225,14 +223,6 @@ def held(folder: Path) -> Iterator[None]:
     finally:
         done.set()
         thread.join()
-
-
-@pytest.mark.parametrize("stage", ["gaussians", "features"])
-def test_a_command_is_refused_while_another_one_makes_stages(stage: str, tmp_path: Path) -> None:
-    trimesh.creation.icosphere(subdivisions=1, radius=0.05).export(tmp_path / "surface.ply")
-    with held(tmp_path / CACHE):
-        assert main(["fit", str(tmp_path), "--until", stage]) == 2
-    assert not (tmp_path / CACHE / "views").exists()
 
 
 def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path) -> None:

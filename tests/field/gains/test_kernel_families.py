@@ -14,7 +14,7 @@ from scipy.interpolate import RBFInterpolator
 from avmsf.field.gains import kernels
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured, Visual
+from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.symmetry import Symmetric
@@ -228,15 +228,3 @@ def test_visual_kernels_are_the_written_ones():
     for unit in (1.0, 100.0):
         found = Visual(known, 1.0, points, unit * features).kernels()
         torch.testing.assert_close(found, expected, atol=1e-6, rtol=0.0)
-
-
-def test_places_of_similar_features_share_gains():
-    points, features = object_points()
-    known = alike(points[:20:2].double())
-    values = features[:20:2, :1].to(torch.complex128) * torch.tensor([1.0, 2.0j], dtype=torch.complex128)
-    ones = torch.ones(2, dtype=torch.float64)
-    gains = MeasuredGains(values, 0 * ones, 100.0 * ones.cumsum(0), ones)
-    families = [Unstructured(known, 1.0), Visual(known, 1.0, points, features)]
-    found = fit_mixture(families, gains, points, directional=False).predict(points[20::2].double()).mean
-    torch.testing.assert_close(found[:, 0].real, values[:, 0].real.float(), atol=0.1, rtol=0.0)
-    torch.testing.assert_close(found[:, 1].imag, values[:, 1].imag.float(), atol=0.2, rtol=0.0)
