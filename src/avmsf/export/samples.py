@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int
+from jaxtyping import Float32, Float64, Int, Int64
 from torch import Tensor
 
 from avmsf._utils.text import counted
@@ -72,19 +72,15 @@ def write_grid(
 ) -> Written:
     """Write a float32 wav for every contact and layer, the table and the instrument.
 
-    More than `contacts`, of which each has a MIDI note, are reduced by farthest point sampling; those whose modes have
-    `range_db` or more less energy than the loudest's are left out. Each has one impact of each of the `layers`, which
-    are sorted by their level. Sounds last `seconds`, by default as long as the training
-    sounds, and have the residual noise unless `noise` is False. All are scaled by one factor, which the manifest names
-    as `scale`, so that the loudest peaks at `level_db` relative to full scale. Raises `ExportError` for no layers,
-    more contacts than MIDI has notes, and settings that are not positive.
+    More than `contacts`, of which each has a MIDI note, are reduced by farthest point sampling; those with `range_db`
+    less energy than the loudest are left out. Each has one impact of each of the `layers`, sorted by their level.
+    Sounds last `seconds`, by default as long as the training sounds, and have the residual noise unless `noise` is
+    False. All are scaled by one factor, the manifest's `scale`, so that the loudest peaks at `level_db` relative to
+    full scale. Raises `ExportError` for no layers, more contacts than MIDI has notes, and settings not positive.
     """
     _check(contacts, layers, seconds, level_db, range_db, field.sample_rate)
     rate = round(field.sample_rate)
-    rows = torch.arange(len(field)) if len(field) <= contacts else field.spread(contacts)
-    energy_db = 10 * field.energy[rows].clamp_min(1e-300).log10()
-    quiet = energy_db < energy_db.max() - range_db
-    rows = rows[~quiet]
+    rows, remarks = _chosen(field, contacts, range_db)
     samples = field.samples if seconds is None else max(1, round(seconds * rate))
     rendered = []
     for layer in layers:
@@ -118,9 +114,7 @@ def write_grid(
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in ordered]
     sizes = write_folder(Path(folder), files, manifest, overwrite=overwrite)
-    remarks = [f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB"]
-    if quiet.any():
-        remarks.append(f"{counted(int(quiet.sum()), 'contact')} left out, {range_db:g} dB or more below the loudest")
+    remarks.append(f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB")
     if ordered != list(layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)
         remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
@@ -144,6 +138,15 @@ def _check(
     for name, value, valid, wanted in checks:
         if not valid:
             raise ExportError.expected(wanted, value, name=name)
+
+
+def _chosen(field: SampledField, contacts: int, range_db: float) -> tuple[Int64[Tensor, " chosen"], list[str]]:
+    """Return the rows of at most `contacts` points that are audible, and a note on those left out."""
+    rows = torch.arange(len(field)) if len(field) <= contacts else field.spread(contacts)
+    energy_db = 10 * field.energy[rows].clamp_min(1e-300).log10()
+    audible = energy_db >= energy_db.max() - range_db
+    left = f"{counted(int((~audible).sum()), 'contact')} left out, {range_db:g} dB or more below the loudest"
+    return rows[audible], [] if audible.all() else [left]
 
 
 def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
