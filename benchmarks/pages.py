@@ -34,6 +34,7 @@ RESULTS = (
 METHODS = {
     "nearest recording": ("{group}.mean of 1{end}",),
     "mean waveform of 3 nearest": ("{group}.mean of 3{end}", "{group}.averaging{end}"),
+    "best of eight simple methods, in hindsight": ("{group}.best simple{end}",),
     "attention network, quick, positions only": ("align.errors.{count}.network.after{end}",),
     "**avmsf's default**": ("{group}.mixture{end}", "{group}.error{end}"),
     "held-out gains in intervals of 90 %": ("{group}.coverage{end}",),
