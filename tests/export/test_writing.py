@@ -58,3 +58,11 @@ def test_a_file_that_exists_is_replaced_only_if_asked(tmp_path):
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.ply", b"ours")]
     write_files({tmp_path / "a.ply": b"other"}, overwrite=True)
     assert (tmp_path / "a.ply").read_bytes() == b"other"
+
+
+def test_files_and_folders_are_told_apart(tmp_path):
+    (tmp_path / "file").write_text("avmsf")
+    with raises(ExportError, file=tmp_path / "file", value="file"):
+        write_folder(tmp_path / "file", named("a.txt"), {}, overwrite=True)
+    with raises(ExportError, file=tmp_path, value="folder"):
+        write_files({tmp_path: b"avmsf"}, overwrite=True)

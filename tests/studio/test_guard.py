@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, new_token
+from avmsf.studio.guard import LOOPBACK, NOTHING_HERE, Guard, new_token
 from opened_plate import open_plate
-from served import Served, served
+from served import Served, run_async, served
 
 LARGEST = 200_000
 
@@ -124,3 +124,20 @@ def test_the_token_does_not_leak_to_other_sites(server: Served) -> None:
         assert answer.headers["x-content-type-options"] == "nosniff"
         assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
         assert "access-control-allow-origin" not in answer.headers
+
+
+def test_sockets_of_another_protocol_are_closed() -> None:
+    sent: list[dict[str, object]] = []
+
+    async def application(*arguments: object) -> None:
+        raise AssertionError("let in")
+
+    async def receive() -> dict[str, object]:
+        return {"type": "websocket.connect"}
+
+    async def send(message: dict[str, object]) -> None:
+        sent.append(message)
+
+    guard = Guard(application, token="token", port=80)
+    run_async(guard({"type": "websocket", "path": "/token/", "headers": []}, receive, send))
+    assert sent == [{"type": "websocket.close", "code": 1008}]
