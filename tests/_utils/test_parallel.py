@@ -42,7 +42,7 @@ def stays(file: Path) -> None:
 def run(act: object, arguments: dict, count: int = 2, address: str | None = None) -> dict:
     found: dict[str, object] = {}
     with workers_at(count, address, raising=FitError) as workers:
-        run_tasks(act, arguments, workers, found.__setitem__)
+        run_tasks(act, arguments, workers, found.__setitem__, lambda text: None)
     return found
 
 
@@ -110,7 +110,7 @@ def test_who_stops_waiting_ends_all(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with workers_at(2, raising=FitError) as workers, pytest.raises(KeyboardInterrupt):
-        run_tasks(_either, {"long": tmp_path / "numbers", "short": tmp_path / "short"}, workers, stop)
+        run_tasks(_either, {"long": tmp_path / "numbers", "short": tmp_path / "short"}, workers, stop, print)
     await_end(tmp_path / "numbers")
 
 

@@ -8,12 +8,14 @@ import os
 import pickle
 import signal
 import threading
+import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import connection, get_context
 from multiprocessing.context import SpawnProcess
 from types import ModuleType
@@ -31,6 +33,8 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 """What libraries read when they are loaded: sums in one order, and workers that do not stall each other."""
 _WAIT = 1.0
 """Seconds after which waiting is interrupted, so that Ctrl-C gets through."""
+_NAMED = 8
+"""Tasks that a line names, those that have run longest."""
 _GRACE = 3.0
 """Seconds that a process has to end before it is killed."""
 
@@ -88,19 +92,25 @@ def run_tasks(
     arguments: Mapping[str, Argument],
     workers: Workers,
     done: Callable[[str, Result | Exception], object],
+    doing: Callable[[str], object],
 ) -> None:
     """Call a function with each argument in a worker; `done` gets the argument's name and what came of it.
 
+    `doing` gets, about every second, which tasks run and for how long.
+
     A task whose process ended early `MAX_STARTS` times comes to a WorkerError. What `done` raises, and Ctrl-C, end all.
     """
-    waiting, ended, running = deque(arguments), Counter[str](), dict[Any, str]()
+    waiting, ended, running = deque(arguments), Counter[str](), dict[Any, tuple[str, float]]()
     try:
         while waiting or running:
             while waiting and len(running) < workers.count:
                 name = waiting.popleft()
-                running[workers.start(act, arguments[name])] = name
+                running[workers.start(act, arguments[name])] = name, time.monotonic()
+            longest = islice(running.values(), _NAMED)
+            names = ", ".join(f"{name} for {time.monotonic() - begun:.0f} s" for name, begun in longest)
+            doing(f"running {names}{' and others' * (len(running) > _NAMED)}")
             for task in workers.wait(running):
-                name = running.pop(task)
+                name, _ = running.pop(task)
                 try:
                     outcome = workers.outcome(task)
                 except WorkerError as error:

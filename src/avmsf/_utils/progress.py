@@ -11,6 +11,9 @@ from avmsf._utils.text import printable
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+LINE_SECONDS = 60.0
+"""After so long without a line of several objects one says what is being done."""
+
 
 def _ignore(*values: object) -> None:
     pass
@@ -80,15 +83,19 @@ class ProgressDisplay:
     def objects(self, after_each: Callable[[], object] = _ignore) -> Callable[[str, int, int], None]:
         """Return what receives which of several objects begins or ends, how many are done, and how many there are.
 
-        When one is done it calls `after_each` and prints a line.
+        When one is done it calls `after_each` and prints a line, and another after a minute without one.
         """
         finished, begun = 0, time.monotonic()
+        printed = begun
 
         def show(message: str, done: int, total: int) -> None:
-            nonlocal finished
+            nonlocal finished, printed
+            now = time.monotonic()
             if done > finished:
                 after_each()
-                self.say(f"{message} ({done} of {total}, {time.monotonic() - begun:.0f} s)")
+            if done > finished or now - printed >= LINE_SECONDS:
+                self.say(f"{message} ({done} of {total}, {now - begun:.0f} s)")
+                printed = now
             finished = done
             self._show("objects", message, done, total)
 

@@ -14,7 +14,6 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib import import_module
-from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
@@ -112,21 +111,24 @@ def run_many(verb: str, options: Many, *, raising: type[AvmsfError]) -> int:
 
     folder, tasks = options.written, options.tasks()
     assert folder is not None
-    done, shown = count(1), display.objects()
+    shown = display.objects()
     found: dict[str, dict[str, Any]] = {}
 
     def take(name: str, outcome: Values | Exception) -> None:
         found[name] = _failed(outcome) if isinstance(outcome, Exception) else dict(outcome)
         for each in found[name]["notes"]:
             note(f"{name}: {each}")
-        shown(f"{name}: {found[name]['state']}", next(done), len(tasks))
+        shown(f"{name}: {found[name]['state']}", len(found), len(tasks))
+
+    def doing(text: str) -> None:
+        shown(text, len(found), len(tasks))
 
     with (
         StageFolder(folder, "--output").lock(f"avmsf {verb}"),
         workers_at(options.workers, options.ray, raising=raising) as workers,
     ):
         try:
-            run_tasks(partial(_make, verb), tasks, workers, take)
+            run_tasks(partial(_make, verb), tasks, workers, take, doing)
         finally:
             rows = [_row(options, name, found[name]) for name in tasks if name in found]
             write_whole(folder / RESULTS, _csv(rows), raising=OutputError)

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 
 import torch
@@ -328,7 +327,7 @@ def run_objects(
     process. Each object is computed on one thread, so that values do not depend on the number of workers. An object
     whose processes end early is a failure. Raises as `Evaluation.begin`, `run_object` and `workers_at`.
     """
-    total, whole = len(identifiers), count(1)
+    total, whole = len(identifiers), list[str]()
 
     def done(identifier: str, outcome: Exception | None) -> None:
         if isinstance(outcome, WorkerError):
@@ -336,20 +335,19 @@ def run_objects(
             results.write(replace(record, failure=failure_of(outcome)))
         elif outcome is not None:
             raise outcome
-        progress(f"{identifier}: done", next(whole), total)
+        whole.append(identifier)
+        progress(f"{identifier}: done", len(whole), total)
+
+    def log(message: str) -> None:
+        progress(message, len(whole), total)
 
     with workers_at(workers, address, raising=EvaluationError) as parallel:
         evaluation.begin(results)
         if workers > 1 or address is not None:
-            progress(f"{total} objects in parallel", 0, total)
             act = partial(_run_elsewhere, (evaluation, results, METRICS))
-            run_tasks(act, {each: each for each in identifiers}, parallel, done)
+            run_tasks(act, {each: each for each in identifiers}, parallel, done, log)
             return
-        for number, identifier in enumerate(identifiers):
-
-            def log(message: str, number: int = number) -> None:
-                progress(message, number, total)
-
+        for identifier in identifiers:
             run_object(evaluation, identifier, results, log)
             done(identifier, None)
 
