@@ -1,6 +1,7 @@
 """Many inputs of one verb: the same as one by one, kept when repeated, whatever happens to the processes."""
 
 import csv
+import math
 import os
 import shutil
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from avmsf._utils import progress
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.cli.paths import InputError, OutputError
@@ -90,22 +92,25 @@ def test_all_are_made_but_what_fails_for_a_reason_and_kept_while_nothing_changes
     assert states(capsys, *again, "--overwrite") == {"a": "done", "b": "done"}
 
 
+@pytest.mark.parametrize("done", [["a"], []])
 def test_ctrl_c_keeps_what_is_done(
-    fields: list[str], tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+    done: list[str], fields: list[str], tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["export", *fields[:2], "--to", "gltf", "-o", str(tmp_path / "pages")]
+    pages, last = tmp_path / "pages", "a: done" if done else "running a for 0 s (0 of 2, "
+    words = ["export", *fields[:2], "--to", "gltf", "-o", str(pages)]
     say = ProgressDisplay.say
 
     def stop(self: ProgressDisplay, text: str, *, always: bool = False) -> None:
-        if text.startswith("a: done"):
+        if text.startswith(last):
             raise KeyboardInterrupt
         say(self, text, always=always)
 
     with monkeypatch.context() as patched:
         patched.setattr(ProgressDisplay, "say", stop)
+        patched.setattr(progress, "LINE_SECONDS", math.inf if done else 0.0)
         assert main(words) == 130
-    assert list(table_of(tmp_path / "pages")) == ["a"]
-    assert states(capsys, *words) == {"a": "as before", "b": "done"}
+    assert (list(table_of(pages)) if done else sorted(pages.glob("*.csv"))) == done
+    assert states(capsys, *words) == {"a": "as before" if done else "done", "b": "done"}
 
 
 def test_what_cannot_be_of_many_is_refused(captures: tuple[Path, ...], tmp_path: Path) -> None:

@@ -131,7 +131,8 @@ def run_many(verb: str, options: Many, *, raising: type[AvmsfError]) -> int:
             run_tasks(partial(_make, verb), tasks, workers, take, doing)
         finally:
             rows = [_row(options, name, found[name]) for name in tasks if name in found]
-            write_whole(folder / RESULTS, _csv(rows), raising=OutputError)
+            if rows:
+                write_whole(folder / RESULTS, _csv(rows), raising=OutputError)
     failures = [row for row in rows if row["failure"]]
     heads = [each for each in rows[0] if each != "failure"]
     title = f"{counted(len(rows), 'input')}, {len(failures)} failed"
@@ -194,7 +195,7 @@ def _row(options: Many, name: str, values: Values) -> dict[str, str]:
 def _csv(rows: Sequence[Mapping[str, str]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([list(row) for row in rows[:1]] + [list(row.values()) for row in rows])
+    writer.writerows([list(rows[0]), *(list(row.values()) for row in rows)])
     return text.getvalue()
 
 
