@@ -65,6 +65,7 @@ WRONG = {
     "farthest plates --workers 0": ("workers", 0),
     "farthest plates --cdpam-contacts -1": ("cdpam_contacts", -1),
     "non-symmetric plates": ("subset", "non-symmetric"),
+    "edit plates --objects a,b --methods unedited --output results": ("edit", (0, 0)),
     "farthest plates --device nothing": ("device", "nothing"),
     "farthest plates --device meta": ("device", "meta"),
 }

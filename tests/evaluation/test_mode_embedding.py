@@ -92,7 +92,7 @@ BANKS, MATERIALS = labelled()
         (lambda: pitches_and_dampings(bank([100.0, 0.0])), {"row": 1, "name": "frequency", "value": 0.0}),
         (lambda: pitches_and_dampings(bank([100.0], math.nan)), {"row": 0, "name": "damping"}),
         (lambda: space_of(BANKS, MATERIALS[1:]), {"name": "materials", "value": 15}),
-        (lambda: space_of(BANKS[:4], MATERIALS[:4]), {"name": "mode_sets", "value": (4, 1)}),
+        (lambda: space_of(BANKS[:4], MATERIALS[:4]), {"name": "materials", "value": (4, 1)}),
         (lambda: space_of(BANKS, MATERIALS).center("steel"), {"name": "material", "value": "steel"}),
         (lambda: space_of(BANKS, MATERIALS).embedding, {"name": "umap-learn"}),
     ],

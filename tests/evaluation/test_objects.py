@@ -13,9 +13,10 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.datasets import CaptureCollection
-from avmsf.datasets.dataset import Dataset, VisualSource
+from avmsf.datasets.dataset import Dataset, ObjectFacts, VisualSource
 from avmsf.errors import CaptureError, EvaluationError, SceneError
-from avmsf.evaluation.objects import ObjectInputs, draw_other_recording
+from avmsf.evaluation.objects import ObjectInputs, choose_objects, draw_other_recording
+from avmsf.evaluation.registry import PROTOCOLS
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
@@ -163,3 +164,13 @@ def test_another_recording_is_of_another_object_at_this_ones_rate_and_length(tmp
     assert float(drawn[1001:].abs().max()) == 0.0 < float(drawn[:1000].abs().max())
     with raises(EvaluationError, name="a"):
         draw_other_recording(CaptureCollection(tmp_path / "a"), "a", train, seed=0)
+
+
+def test_edits_are_of_objects_whose_materials_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [f"{material}-{number}" for material in ("iron", "ceramic") for number in range(3)]
+    monkeypatch.setattr(OneObject, "objects", lambda self: tuple(names))
+    monkeypatch.setattr(OneObject, "facts", lambda self, name: ObjectFacts(name, name))
+    with raises(EvaluationError, name="edit", value="ceramic, iron"):
+        choose_objects(OneObject(None), PROTOCOLS["edit"])
+    names.append("plastic-0")
+    assert choose_objects(OneObject(None), PROTOCOLS["edit"]) == ("plastic-0",)

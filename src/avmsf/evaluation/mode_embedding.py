@@ -8,7 +8,7 @@ compared. UMAP places a new point near known points, however far away it is.
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -75,6 +75,13 @@ def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64
     return bank.frequency.log2().numpy(), bank.damping.log2().numpy()
 
 
+def expect_materials(known: Collection[str], *, name: str = "materials") -> None:
+    """Raise EvaluationError, about `name`, for fewer objects or materials than an embedding takes."""
+    if len(known) < _MIN_OBJECTS or len(set(known)) < 2:
+        found, wanted = (len(known), len(set(known))), f"{_MIN_OBJECTS} objects or more, of two known materials or more"
+        raise EvaluationError.expected(wanted, found, got="{} of {}".format(*found), name=name)
+
+
 @dataclass(frozen=True, eq=False)
 class MaterialSpace:
     """Labelled objects by their modes; `MaterialSpace.of` makes one."""
@@ -107,9 +114,7 @@ class MaterialSpace:
         for name, labels in (("materials", materials), ("names", names)):
             if len(labels) != len(mode_sets):
                 raise EvaluationError.expected(f"one for each of {len(mode_sets)} sets", len(labels), name=name)
-        if len(mode_sets) < _MIN_OBJECTS or len(set(materials)) < 2:
-            found, wanted = (len(mode_sets), len(set(materials))), f"{_MIN_OBJECTS} objects of two materials or more"
-            raise EvaluationError.expected(wanted, found, got="{} of {}".format(*found), name="mode_sets")
+        expect_materials(materials)
         vectors = []
         for name, bank in zip(names, mode_sets, strict=True):
             try:

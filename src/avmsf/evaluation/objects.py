@@ -21,6 +21,7 @@ from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.editing import TRANSITIONS, materials_of
 from avmsf.evaluation.modal_metrics import simulated
+from avmsf.evaluation.mode_embedding import expect_materials
 from avmsf.evaluation.registry import Protocol
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
@@ -202,14 +203,21 @@ def choose_objects(dataset: Dataset, protocol: Protocol, asked: Sequence[str] = 
     materials that others of the dataset contrast with.
 
     Raises DatasetError for unknown ones, and EvaluationError where the protocol is about a group that the dataset does
-    not have.
+    not have, and where edits have too few objects to be measured by, or none to change.
     """
+    materials = materials_of(dataset) if protocol.scoring == "edits" else {}
+    if protocol.scoring == "edits":
+        expect_materials(materials.values(), name=protocol.name)
     if asked:
         return tuple(dict.fromkeys(dataset.facts(identifier).identifier for identifier in asked))
     if protocol.scoring == "edits":
-        materials = materials_of(dataset)
         reached = [first for first, second in TRANSITIONS if second in materials.values()]
-        return tuple(name for name, material in materials.items() if material in reached)
+        found = tuple(name for name, material in materials.items() if material in reached)
+        if not found:
+            pairs = ", ".join(map(" to ".join, TRANSITIONS))
+            wanted, known = f"objects of a pair of materials of {pairs}", ", ".join(sorted({*materials.values()}))
+            raise EvaluationError.expected(wanted, known, name=protocol.name)
+        return found
     if protocol.subset is not None:
         group = members(dataset).get(protocol.subset, frozenset())
         if group:
