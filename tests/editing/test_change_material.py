@@ -14,6 +14,7 @@ from avmsf.editing.material import (
     RATIO_ONLY,
     VELOCITY,
     change_material,
+    edit,
     guess_materials,
     infer_material,
 )
@@ -139,7 +140,7 @@ def test_a_material_given_to_itself_and_one_by_way_of_another(law):
     )
     expect_same(change_material(field, STEEL, STEEL, law=law), field, CONTACTS)
     twice = change_material(change_material(field, STEEL, OTHER, size=0.5, law=law), OTHER, THIRD, size=3.0, law=law)
-    expect_same(twice, change_material(field, STEEL, THIRD, size=1.5, law=law), 1.5 * CONTACTS)
+    expect_same(twice, change_material(field, STEEL, THIRD, size=1.5, law=law.name), 1.5 * CONTACTS)
     expect_same(change_material(twice, THIRD, STEEL, size=1 / 1.5, law=law), field, CONTACTS)
     assert len(twice.origin.report["edits"]) == 2
 
@@ -181,6 +182,8 @@ BARE = replace(OTHER, name="aether", alpha=0.0, beta=0.0)
 def test_materials_and_sizes_that_cannot_be_are_refused(old, new, size, attributes):
     with raises(EditError, **attributes):
         change_material(plate_field(STEEL), old, new, size=size)
+    with raises(EditError, name="law", value="accelerations"):
+        edit(plate_field(STEEL), size=2.0, old_material=STEEL, law="accelerations")
     with raises(SimulationError, name="young", value=-1.0):
         Material("lead", 1e4, -1.0, 0.4, 1.0, 0.0)
     # Where neither material damps, dampings stay.

@@ -170,7 +170,7 @@ def run(options: Options) -> int:
 
 def _edited(options: Options, field: "SoundField") -> "SoundField":
     """Return the edited field: material, size and modes by `edit`, then the guided edit."""
-    from avmsf.editing.material import LAWS, edit, infer_material
+    from avmsf.editing.material import edit, infer_material
 
     settings = options.all_settings
     new = None if options.to is None else material_named(options.to)
@@ -187,7 +187,7 @@ def _edited(options: Options, field: "SoundField") -> "SoundField":
             target = replace(target, name=f"{target.name} with {', '.join(constants)} changed", **constants)
     if options.changes_material or options.changes_modes:
         adjusted = _adjustments(options, field) if options.changes_modes else dict[str, Any]()
-        law = LAWS[settings.material.law]
+        law = settings.material.law
         field = edit(field, material=target, old_material=old, size=options.scale, law=law, **adjusted)
     return _guided(options, field, target or old) if options.guides else field
 

@@ -49,11 +49,16 @@ LAWS = {law.name: law for law in (DISPLACEMENT, VELOCITY, ACCELERATION, RATIO_ON
 
 
 def change_material(
-    field: SoundField, old: Material | str, new: Material | str, *, size: float = 1.0, law: GainLaw = DISPLACEMENT
+    field: SoundField,
+    old: Material | str,
+    new: Material | str,
+    *,
+    size: float = 1.0,
+    law: GainLaw | str = DISPLACEMENT,
 ) -> SoundField:
     """Return the field of an object of the same shape, `size` times as large, in a new material.
 
-    Materials are given as such, or by their name in `avmsf.fem.material.MATERIALS`.
+    Materials and the law are given as such, or by their names in `avmsf.fem.material.MATERIALS` and `LAWS`.
     The dampings of the field are multiplied by the ratio of what the two materials' Rayleigh laws say, so that
     each mode's deviation from the law (by supports and radiation) stays in proportion; the same material changes
     nothing, and a third material in between gives the same result, unless it overdamps a mode.
@@ -66,11 +71,15 @@ def change_material(
     damps beyond the critical damping, which have no tone: they are mute from then on, and keep the frequency and the
     damping that they had; and another Poisson's ratio, which changes shapes and takes a new solve.
 
-    Raises `EditError` for a size that is not positive, and where one of the materials has no damping and the other has,
-    and `SimulationError` for a name of no material.
+    Raises `EditError` for a size that is not positive, a name of no law, and where one of the materials has no damping
+    and the other has, and `SimulationError` for a name of no material.
     """
     old, new = (material_named(each) if isinstance(each, str) else each for each in (old, new))
     _check(old, new, size)
+    if isinstance(law, str):
+        if law not in LAWS:
+            raise EditError.unknown(law, LAWS, name="law")
+        law = LAWS[law]
     before, mute = field.bank, muted(field)
     omega = torch.hypot(2.0 * math.pi * before.frequency, before.damping)
     moved = omega * (math.sqrt(new.young / old.young) * math.sqrt(old.density / new.density) / size)
@@ -239,7 +248,7 @@ def edit(
     material: Material | str | None = None,
     old_material: Material | str | None = None,
     size: float = 1.0,
-    law: GainLaw = DISPLACEMENT,
+    law: GainLaw | str = DISPLACEMENT,
     pitch: Slider = 1.0,
     decay: Slider = 1.0,
     brightness_db: float = 0.0,
@@ -255,7 +264,8 @@ def edit(
         material: The new material, by name or with constants of its own.
         old_material: The material before; by default the one nearest to the modes' dampings.
         size: New lengths over old ones.
-        law: What the recordings are in proportion to.
+        law: What the recordings are in proportion to: a `GainLaw`, or the name of one, which is displacement,
+            velocity, acceleration or ratio-only.
         pitch: Factor on frequencies, one or one for each mode.
         decay: Factor on decay times, likewise.
         brightness_db: Change of level per octave, dB.
