@@ -62,9 +62,9 @@ class Options(Configured):
     visual_source: Annotated[Literal["best", "mesh"], arg("best|mesh")] = "best"
     """Features of photographs, if any, or of the mesh."""
     workers: int = 1
-    """Objects at a time; several need `scale`."""
+    """Objects at a time, on one thread each."""
     ray: Annotated[str | None, arg("ADDRESS")] = None
-    """Address of a ray cluster with the same paths, or auto."""
+    """A ray cluster with the same paths; needs `scale`."""
     seed: int = 0
     """Seed of all methods."""
     device: Device = None
