@@ -13,6 +13,7 @@ from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.options import Configured
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
+from avmsf.evaluation.registry import METHODS, PROTOCOLS
 from avmsf.simulate.recipe import named_recipe
 from factories.raising import raises
 
@@ -42,7 +43,18 @@ def test_a_help_fits_on_one_screen(verb: str, capsys: Streams, monkeypatch: pyte
     # An argument before it takes nothing out of it.
     with pytest.raises(SystemExit, match="0"):
         main([verb, "edit", "--help"])
-    assert capsys.readouterr().out == out
+    assert capsys.readouterr().out.endswith(out)
+
+
+def test_the_help_of_a_protocol_begins_with_what_it_does_and_its_methods(capsys: Streams) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["evaluate", "edit", "data", "--help"])
+    title, methods = capsys.readouterr().out.split("\n\n")[:2]
+    assert " ".join(title.split()) == f"edit: {PROTOCOLS['edit'].title}"
+    named = {*re.findall(r"[-\w]+", methods)}
+    assert {name for name in METHODS if name in named} == {"unedited", "generation"} | {
+        f"edit-{each}" for each in ("independent", "published", "hierarchical", "searched", "physics")
+    }
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
 import shlex
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -16,7 +17,7 @@ from avmsf.cli.paths import CacheFolder, ContactData, Existing, OutputFolder, ar
 from avmsf.cli.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.registry import PROTOCOLS, EvaluationSettings, expect_suited, method_entry, protocol_named
+from avmsf.evaluation.registry import PROTOCOLS, EvaluationSettings, expect_suited, protocol_named, suited_methods
 from avmsf.pipeline.config import TimeZero, ViewsConfig
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class Options(Configured):
     """
 
     protocol: tyro.conf.Positional[
-        Annotated[str, tyro.conf.arg(metavar="PROTOCOL", help=f"The experiment: {', '.join(PROTOCOLS)}.")]
+        Annotated[str, tyro.conf.arg(metavar="PROTOCOL", help=f"{', '.join(PROTOCOLS)}; `NAME --help` explains it.")]
     ]
     data: tyro.conf.Positional[
         Annotated[
@@ -87,12 +88,20 @@ class Options(Configured):
         """What methods share."""
         return with_settings(self.usual, self.set, self.config)
 
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> "Options":
+        """Return the options as `Configured`; a help that names a protocol begins with what it does."""
+        for name in {*words} & {*PROTOCOLS} if {"-h", "--help"} & {*words} else ():
+            known, usual = (", ".join(names) for names in (suited_methods(name), PROTOCOLS[name].methods))
+            for text in (f"{name}: {PROTOCOLS[name].title}", f"Methods: {known}; by default {usual}."):
+                print(textwrap.fill(text, 80, break_on_hyphens=False), end="\n\n")
+        return super().parse(words)
+
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         protocol_named(self.protocol)
         for name in words_of(self.methods):
-            method_entry(name)
             expect_suited(name, self.protocol)
         if self.protocol == "predefined" and not self.test:
             wanted, advice = "names of the recordings to test on", "such as --test 009.wav,010.wav"

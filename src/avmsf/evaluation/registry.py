@@ -267,7 +267,8 @@ PROTOCOLS: dict[str, Protocol] = {
         ),
         Protocol(
             "edit",
-            "Change the material of objects, towards prompts or recordings; distance from objects of the new material.",
+            "Change the material of objects, towards prompts or recordings; distance of edited modes and sounds from "
+            "objects of the new material. Takes six objects or more, of two known materials or more.",
             "splits:Edited",
             ("unedited", "edit-independent", "edit-hierarchical"),
             scoring="edits",
@@ -297,6 +298,12 @@ def method_entry(name: str) -> MethodEntry:
         known = [f"{each}:PATH" if row.path else each for each, row in METHODS.items()]
         raise EvaluationError.unknown(name, known, name="method")
     return METHODS[kind]
+
+
+def suited_methods(protocol: str) -> list[str]:
+    """Return the names of the methods that edit sounds, or of those that predict them, as the protocol asks."""
+    edits = PROTOCOLS[protocol].scoring == "edits"
+    return [name for name, row in METHODS.items() if (row.make == _EDIT) == edits]
 
 
 def expect_suited(method: str, protocol: str) -> None:
