@@ -9,17 +9,22 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from avmsf.fem.material import MATERIALS
 from avmsf.field.gains import elastic as module
 from avmsf.field.gains.elastic import (
+    EQUAL_PRIOR,
     FACTORS,
     FREQUENCY_ERRORS,
     PERTURBATIONS,
+    PROFILE_PRIOR,
     REACH,
+    RESIDUAL_PRIOR,
     RESIDUALS,
     WIDTHS,
     Elastic,
+    frequency_log_prior,
 )
-from avmsf.field.gains.fitting import WeighedFamily, fit_mixture, weigh_factors
+from avmsf.field.gains.fitting import WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import log_evidence
 from avmsf.field.gains.model import series_of
@@ -96,6 +101,17 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     assert abs(math.log(found / factor)) <= 0.01
 
 
+@pytest.mark.parametrize("factor", [0.067, 1.8])
+def test_no_factor_is_considered_that_no_material_has(factor):
+    """Of the table, with 5 % for frequencies of real bodies and 20 % for the thickness: plastic to ceramic."""
+    sites = impacts(12, seed=1)
+    given, gains = families(sites), measured(sites, factor=factor)
+    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
+    (body,) = (each for each in given if isinstance(each, Elastic))
+    slowest, *_, fastest = sorted(math.sqrt(each.young / each.density / (7e10 / 2700)) for each in MATERIALS.values())
+    assert slowest / 1.05 / 1.2 <= body.factor <= fastest * 1.05 * 1.2
+
+
 @pytest.mark.parametrize(("ratio", "unit"), [(1.0, 0), (0.3048, 1), (0.0254, 2), (0.01, 3)])
 @pytest.mark.parametrize("factor", [0.75, 1.0])
 def test_the_unit_is_inferred_where_none_is_stated(ratio, unit, factor):
@@ -152,6 +168,36 @@ def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
     # It is that of each kernel around a shape.
     prior = given.log_prior(measured_modes).reshape(PROFILES, SHAPES, len(RESIDUALS), SHAPES)
     assert torch.equal(prior, found[None, :, None].expand_as(prior))
+
+
+def test_the_factors_prior_is_a_probability_of_units_and_materials():
+    probability = frequency_log_prior(3).exp().reshape(3, len(FACTORS), -1).sum(2)
+    assert float(probability.sum()) == pytest.approx(1.0)
+    assert float(FACTORS[probability[0].argmax()]) == pytest.approx(1.0)
+    # Materials are as probable in all units, and each other unit is as probable as the next.
+    assert probability.sum(1).tolist() == pytest.approx([1 / 1.002, 0.001 / 1.002, 0.001 / 1.002])
+    assert torch.allclose(probability[0] / probability[2], torch.tensor(1000.0, dtype=torch.float64))
+
+
+def test_categories_are_profiles_and_remainders_of_their_probability():
+    """With a probability that no typical one is, and all are equal."""
+    given, rows = family(), product(range(PROFILES), range(SHAPES), range(len(RESIDUALS)))
+    assert given.categories().tolist() == [profile * len(RESIDUALS) + remainder for profile, _, remainder in rows]
+    typical = np.outer(PROFILE_PRIOR, RESIDUAL_PRIOR).flatten()
+    expected = (1.0 - EQUAL_PRIOR) * typical / typical.sum() + EQUAL_PRIOR / len(typical)
+    assert given.category_prior().tolist() == pytest.approx(expected.tolist(), rel=1e-6)
+    gains = measured(impacts(10, seed=1), noise=0.01)
+    found = hypotheses_of([WeighedFamily.of(given, gains, (0.01,))], gains)
+    assert torch.allclose(found.category_prior, given.prior * given.category_prior(), rtol=1e-12)
+
+
+def test_the_evidence_of_a_shape_is_that_of_its_kernels_by_their_probability():
+    given = family()
+    evidence = 10.0 * draw(len(given.shares), 3, 2, seed=5)
+    prior = given.category_prior().log()[given.categories()][:, None]
+    # Over noise shares, which are equally probable.
+    joint = (evidence.logsumexp(1) - math.log(3) + prior).reshape(PROFILES, SHAPES, len(RESIDUALS), 2)
+    assert torch.allclose(given.shape_evidence(evidence), joint.logsumexp((0, 2)), rtol=1e-12)
 
 
 def test_a_shape_without_motion_at_the_impacts_is_not_visible():

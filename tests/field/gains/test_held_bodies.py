@@ -68,3 +68,14 @@ def test_a_free_plate_that_is_said_to_be_held_fits_better_free():
     report = MixtureEstimator(bodies=Plate(((0.12, 0.08, 0.0),))).solve(known_gains(free)[0])[0].report
     assert report["bodies"][0]["support"] == "held at (120, 80, 0) mm"
     assert report["support_evidence"]["held"] < report["support_evidence"]["free"]
+
+
+def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(Plate, "held", lambda plate, body: asked.append(body))
+    monkeypatch.setattr(Plate, "supports", "auto")
+    case = known_gains(elastic_modes(block(SIDES, (9, 6, 1)), NOMINAL, count=12))[0]
+    model, _ = MixtureEstimator(bodies=Plate()).solve(case)
+    assert model.report["credibility"]["credible"]
+    assert not model.report["supports_tried"]
+    assert asked == []

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from jaxtyping import Int
+from jaxtyping import Float64, Int
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
@@ -16,6 +16,7 @@ from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import (
     WIDE_NOISE_SHARES,
+    Credibility,
     Fit,
     Outlier,
     PredictiveRatios,
@@ -238,3 +239,37 @@ def test_leaving_wrong_labels_out_predicts_the_others_better_and_right_ones_not(
         fewer, whole = fit(rows, NOISE_SHARES), fit(torch.arange(CONTACTS), NOISE_SHARES)
         kept = replace(measured, values=measured.values[rows])
         assert predicts_better(fewer.leave_one_out(), whole.leave_one_out()[rows], kept) == better
+
+
+@pytest.mark.parametrize(("with_body", "without", "credible"), [(0.8, 0.4, True), (0.6, 0.1, False), (2.0, 1.9, False)])
+def test_body_has_to_predict_and_to_add(with_body: float, without: float, credible: bool) -> None:
+    assert Credibility(with_body, without).credible == credible
+
+
+def test_a_contact_near_a_support_does_not_outweigh_the_others():
+    gains = draw(12, 5, seed=0).to(torch.complex128)
+    # A body that moves there is as wrong as can be, and no more.
+    gains[-1] *= 1e-6
+    measured = MeasuredGains(
+        gains, torch.full((5,), 1e-5).double(), torch.arange(1.0, 6.0).double() * 100, torch.full((5,), 10.0).double()
+    )
+    held = gains + 0.2 * draw(12, 5, seed=1)
+    free = gains + 0.8 * draw(12, 5, seed=2)
+    assert predicts_better(held, free, measured)
+    assert not predicts_better(free, held, measured)
+    assert not predicts_better(gains + 0.8 * draw(12, 5, seed=3), free, measured)
+
+
+def test_errors_that_fall_at_most_contacts_are_no_chance():
+    # Of one mode at 12 contacts the errors fall at 9, and rise by as much at 3: by chance with a probability of .017.
+    falls = torch.tensor([-0.035, -0.055, -0.075, *(0.02 * step for step in range(1, 10))], dtype=torch.float64)
+    ones = torch.ones(12, 1, dtype=torch.complex128)
+
+    def predicted(error: Float64[Tensor, " contacts"]) -> Tensor:
+        """Gains p with |p - 1| / sqrt(1 + |p|^2) = error."""
+        return ones + 1j * (error * (2 / (1 - error.square())).sqrt())[:, None]
+
+    one = torch.ones(1, dtype=torch.float64)
+    new, old, measured = predicted(0.3 + 0 * falls), predicted(0.3 + falls), MeasuredGains(ones, one, one, one)
+    assert predicts_better(new, old, measured)
+    assert not predicts_better(old, new, measured)
