@@ -106,6 +106,29 @@ def test_an_interruption_in_the_middle_of_a_step_loses_no_more_than_it(tmp_path,
     expect_same(fitted(checkpoint), uninterrupted())
 
 
+PATIENT = replace(CONFIG, damping="shared", patience=10, learning_rate=0.3, steps=90)
+
+
+def test_patience_survives_an_interruption(tmp_path):
+    stopped = uninterrupted(PATIENT).origin.report["steps"]
+    # Or nothing would have stopped it, and the interruption would never come.
+    assert stopped + 10 < 90
+    keys = Interruption((STAGES[0], 3 + stopped + 10))
+    with pytest.raises(KeyboardInterrupt):
+        fitted(tmp_path / "state", keys, config=PATIENT)
+    expect_same(fitted(tmp_path / "state", keys, config=PATIENT), uninterrupted(PATIENT))
+
+
+def test_a_look_that_was_cut_off_is_taken_again(tmp_path, monkeypatch):
+    stopped = uninterrupted(PATIENT).origin.report["steps"]
+    # Sounds are made once a step after the warm-up and once a look, of which the first comes before those steps.
+    with monkeypatch.context() as patch:
+        interrupt(patch, TrainingRun, "sounds", call=stopped + stopped // 10 + 1)
+        with pytest.raises(KeyboardInterrupt):
+            fitted(tmp_path / "state", config=PATIENT)
+    expect_same(fitted(tmp_path / "state", config=PATIENT), uninterrupted(PATIENT))
+
+
 def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):
     """A fit that is killed leaves a checkpoint behind as well, from the last time that one was due."""
     monkeypatch.setattr("avmsf._utils.checkpoint.SAVE_SECONDS", 0.0)

@@ -92,6 +92,17 @@ def test_the_same_seed_gives_the_same_field_to_the_last_bit_and_another_another(
     assert not torch.equal(plate_fit(replace(VALIDATED, seed=1)).bank.frequency, first.bank.frequency)
 
 
+def test_recordings_in_float64_give_the_same_field():
+    impacts = plate_impacts()
+    wide = replace(impacts, sounds=impacts.sounds.double())
+    modes = plate_extraction(impacts)
+    wide_modes = replace(modes, residual=replace(modes.residual, magnitude=modes.residual.magnitude.double()))
+    field = plate_fit(SHORT, train=wide, modes=wide_modes)
+    assert same(field, short_fit())
+    assert {each.dtype for each in field.gain_field.state_dict().values()} == {torch.float32}
+    assert field.residual.magnitude.dtype == torch.float32
+
+
 def flipped(modes: Extraction) -> Extraction:
     order = torch.arange(len(modes.bank)).flip(0)
     return Extraction(
@@ -173,6 +184,15 @@ def test_a_trial_does_not_learn_from_the_recordings_held_out():
     assert reports[0]["validation_spectral"] != reports[1]["validation_spectral"]
 
 
+def test_looking_more_often_changes_no_step(monkeypatch):
+    """The looks draw noise too, which must not be missing in the training's stream."""
+    losses: dict[int, list[float]] = {1: [], 100: []}
+    for every, seen in losses.items():
+        monkeypatch.setattr("avmsf.field.estimators.VALIDATION_STEPS", every)
+        plate_fit(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
+    assert losses[1] == losses[100]
+
+
 def test_patience_ends_a_trial_early_and_shortens_the_fit():
     told: list[Progress] = []
     # Steps far too long for the network to go on improving.
@@ -211,6 +231,19 @@ def test_background_has_one_level_in_recordings_that_are_not_divided_by_their_fo
     # 12 recordings tell each of 33 bands to .4 dB. The plate's own noise, which here grows with the force, adds .05 dB.
     assert abs(float(decibels.mean())) < 0.3
     assert float(decibels.std()) < 1.0
+
+
+def test_without_a_warm_up_modes_are_as_strong_as_they_were_found_whatever_their_phase():
+    modes = plate_extraction(plate_impacts())
+    late = replace(modes, gains=1j * modes.gains)
+    sines, cosines = (plate_fit(replace(SHORT, warmup_steps=0), modes=each).gain_field for each in (modes, late))
+    assert float(sines.gain_scale.min()) > 0
+    assert torch.allclose(cosines.gain_scale, sines.gain_scale)
+
+
+def test_forces_make_a_field_per_newton():
+    assert plate_fit(SHORT, train=plate_impacts(forces=True)).origin.per_newton is True
+    assert short_fit().origin.per_newton is False
 
 
 def test_a_silent_recording_and_a_mode_that_is_never_excited_do_no_harm():
@@ -258,6 +291,13 @@ def test_too_many_clusters_are_refused():
     assert plate_fit(replace(SHORT, clusters=12), features=few).gain_field.shape.clusters == 12
 
 
+def test_a_fit_that_diverges_says_so():
+    config = replace(QUICK, learning_rate=1e30, warmup_steps=0)
+    with raises(FitError, name="fit") as caught:
+        plate_fit(config)
+    assert not math.isfinite(caught.value.value)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -289,3 +329,10 @@ def test_resolutions_follow_the_sample_rate():
     assert PAPER.resolutions(48000.0)[1] == (64, 64, 64, 64)
     assert PAPER.interleave == 1, "the paper compares all frames at every step"
     assert FitConfig(fft_sizes=(24,)).resolutions(400.0)[0] == (6,)
+
+
+def test_the_network_has_the_configs_sizes():
+    shape = FitConfig(clusters=3, bands=2, width=5, hidden=6, layers=1, feature_scale=0.5).shape
+    assert (shape.clusters, shape.bands, shape.width, shape.hidden, shape.layers) == (3, 2, 5, 6, 1)
+    assert shape.feature_scale == 0.5
+    assert shape.spatial_damping is False

@@ -94,6 +94,12 @@ def test_silence_gives_finite_losses_and_gradients(dtype, silent_target, silent_
         assert float(loss.detach()) == pytest.approx(0, abs=1e-6)
 
 
+def test_a_sound_that_is_no_number_has_a_loss_that_is_none():
+    made = sounds()
+    made[1, 500] = math.nan
+    assert math.isnan(float(spectral_loss(made, spectral_target(sounds(seed=1), fft_sizes=SIZES, hops=HOPS))))
+
+
 def test_only_the_beginning_counts_where_only_that_is_asked_for():
     recorded, made = sounds(seed=1), sounds().requires_grad_()
     loss = spectral_loss(made, spectral_target(recorded, fft_sizes=SIZES, hops=HOPS, samples=300))

@@ -12,7 +12,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.next_contacts import suggest
-from avmsf.field.quality import FieldQuality
+from avmsf.field.quality import FieldQuality, smallest_within_error
 from avmsf.field.store import load, save
 from avmsf.modal.extraction.extract import extract_modes
 from factories.delayed_plate import SAMPLES, strikes
@@ -82,6 +82,14 @@ def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     torch.testing.assert_close(field.render(test.contacts, forces=4.0), 4.0 * plain)
     # Longer than the recordings there is silence, as beyond their end nothing is known.
     assert torch.equal(known.render(test.contacts, samples=SAMPLES + 50)[:, :100], known.render(test.contacts)[:, :100])
+
+
+def test_the_smallest_share_is_taken_that_is_not_surely_worse_than_the_best():
+    sign = torch.tensor([1.0, -1.0, 1.0, -1.0])
+    best = 0.7 + 0.1 * sign
+    # Standard errors of the differences are .058 and .115.
+    assert smallest_within_error(torch.stack([best + 0.3 - 0.1 * sign, best + 0.1 + 0.2 * sign, best])) == 1
+    assert smallest_within_error(torch.stack([best + 0.3 - 0.1 * sign, best + 0.2 + 0.2 * sign, best])) == 2
 
 
 def test_where_places_say_nothing_the_spread_counts_and_new_sounds_are_nearer():

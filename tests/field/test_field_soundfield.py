@@ -72,3 +72,8 @@ def test_force_scales_the_modes_and_leaves_the_background():
     assert torch.equal(field().render(CONTACTS, forces=0.0), (2.0 * noise).expand(40, -1))
     forces = torch.linspace(0.1, 4.0, 40)
     assert torch.equal(field().render(CONTACTS, forces=forces), forces[:, None] * modes + 2.0 * noise)
+
+
+def test_force_scales_noise_that_is_no_background():
+    trained = replace(field(), residual=replace(field().residual, force=None))
+    assert torch.equal(trained.render(CONTACTS, forces=4.0), 4.0 * trained.render(CONTACTS))

@@ -233,6 +233,23 @@ def test_a_record_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
 
 
 @every_kind
+def test_sizes_that_are_not_the_tensors_are_refused(name, tmp_path):
+    field = ALL[name]()
+    whole = {"kind": field.kind, **field.record()}
+    wrong = [{key: whole[key] + 1} for key in ("points", "contacts", "dim", "nodes", "triangles") if key in whole]
+    if "kernels" in whole:
+        wrong.append({"kernels": [1 + each for each in whole["kernels"]]})
+    for body in whole.get("bodies", []):
+        wrong += [{"bodies": [body | {key: size + 1}]} for key, size in body.items()]
+    for each in wrong:
+        with raises(FieldFileError, file="plate.safetensors") as caught:
+            load(changed(name, tmp_path, {}, {"gains": whole | each}))
+        assert caught.value.name.startswith("gains.")
+    with raises(FieldFileError, name="gains.modes", value=MODES + 1):
+        load(changed(name, tmp_path, {}, {"gains": whole | {"modes": MODES + 1}}))
+
+
+@every_kind
 def test_damaged_tensors_are_refused_by_name(name, tmp_path):
     for key, tensor in ALL[name]().tensors().items():
         with raises(FieldFileError, name=f"gains.{key}", value=[[f"gains.{key}"], []]):

@@ -88,6 +88,17 @@ def test_the_axis_of_a_hammer_lies_clear_and_is_the_nearest_to_the_normal() -> N
     assert (axes[1:, 2] > 0).all()
 
 
+def test_suggestions_are_struck_along_the_axis_that_lies_clear(monkeypatch: pytest.MonkeyPatch) -> None:
+    contacts, leaning = bar_contacts(6), np.array([0.6, 0.0, 0.8])
+
+    def judge(access: MeshAccess, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return np.ones(len(places), dtype=bool), places, np.broadcast_to(leaning, places.shape)
+
+    monkeypatch.setattr(MeshAccess, "__call__", judge)
+    found = suggest(sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1))), 2).directions
+    assert torch.allclose(found, -torch.from_numpy(leaning).expand(2, 3))
+
+
 def test_a_place_within_a_wall_is_moved_onto_its_surface_and_one_far_off_is_none() -> None:
     judge = by_mesh(trimesh.creation.box((0.3, 0.2, 0.1)))
     struck, feet, _ = judge(np.array([[0.01, 0.02, 0.048], [0.0, 0.0, 0.0], [0.0, 0.0, 0.07]]))

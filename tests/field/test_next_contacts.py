@@ -142,6 +142,27 @@ def test_where_fewer_places_are_left_than_asked_for_all_are_suggested() -> None:
     assert len(found.after) == 1
 
 
+def test_a_place_that_was_struck_is_not_suggested_again() -> None:
+    contacts = bar_contacts(6)
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=3))
+    with raises(FitError, name="candidates", value=0):
+        suggest(sound_field(gains), 1, candidates=contacts)
+    without = sound_field(gains.without(torch.arange(6) == 4))
+    assert suggest(without, 1, candidates=contacts).rows.tolist() == [4]
+
+
+def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(monkeypatch: pytest.MonkeyPatch) -> None:
+    contacts, candidates = bar_contacts(6), bar_contacts(120, seed=4)
+    field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=3)))
+    whole = suggest(field, 3, candidates=candidates)
+    monkeypatch.setattr("avmsf.field.next_contacts.MAX_CANDIDATES", 30)
+    fewer = suggest(field, 3, candidates=candidates)
+    assert torch.equal(fewer.contacts, candidates[fewer.rows])
+    # A quarter of them loses next to nothing.
+    assert fewer.after[-1] < whole.after[-1] + 0.1 * (whole.before - whole.after[-1])
+    assert len(suggest(field, 40, candidates=candidates).rows) == 40
+
+
 def test_one_place_says_nothing_of_how_gains_vary() -> None:
     contacts = bar_contacts(1).expand(3, 3)
     values = drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2)

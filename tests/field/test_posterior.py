@@ -1,5 +1,6 @@
 """How sure a field is: against fits without a contact, draws whose truth is known, and the sounds themselves."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -145,6 +146,19 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     assert torch.equal(spectrum_band(same, others[0]).upper_db, spectrum_band(field, others[0]).upper_db)
     maps = [Locator.of(each, points=points).locate(field.render(others[:1])[0]) for each in (field, same)]
     assert torch.equal(maps[0].probability, maps[1].probability)
+
+
+def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
+    contacts = bar_contacts(12)
+    gains = elastic_field(contacts, drawn_gains(contacts, seed=17))
+    field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
+    above = adjust_modes(field, pitch=[1.0, 1.0, 4.0, 4.0])
+    mute = adjust_modes(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
+    points = bar_points()[::5]
+    assert torch.equal(relative_gain_std(above, points), relative_gain_std(mute, points))
+    torch.testing.assert_close(
+        spectrum_band(above, points[3]).upper_db, spectrum_band(mute, points[3]).upper_db, rtol=0, atol=1e-9
+    )
 
 
 def test_what_cannot_be_said_is_refused() -> None:

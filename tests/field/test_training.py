@@ -10,6 +10,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.training import AdamW, Targets, TrainingRun
+from avmsf.modal.residual_noise import noise_power
 from avmsf.modal.spectra import magnitude_stft
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 
@@ -108,3 +109,14 @@ def test_regressed_gains_are_the_warm_ups_aim_without_signs() -> None:
     strong = signed.gains.abs() > 0.3 * signed.gains.abs().amax(1, keepdim=True)
     ratio = (case.gains / signed.gains.abs())[strong & (case.gains > 0)]
     assert 0.2 < float(ratio.median()) < 0.75
+
+
+def test_the_residual_may_start_from_the_quietest_segments() -> None:
+    impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
+    bins = len(modes.residual.magnitude)
+    case = gain_data(impacts, plate_features(), modes, replace(SHORT, residual_start="quietest"))
+    expected = noise_power(impacts.sounds.float(), bins=bins).mean(0).sqrt()
+    assert torch.equal(case.modes.residual.magnitude, expected)
+    assert torch.equal(
+        gain_data(impacts, plate_features(), modes, SHORT).modes.residual.magnitude, modes.residual.magnitude
+    )
