@@ -9,7 +9,7 @@ import soundfile
 import torch
 
 from avmsf.capture import CaptureSettings, check, read_capture, read_recording
-from avmsf.capture.audio import clipped_samples
+from avmsf.capture.audio import clipped_samples, constant_offset
 from avmsf.capture.issues import shared_problems
 from avmsf.errors import CaptureWarning
 from factories.capture_folder import RATE, fill, ring
@@ -48,6 +48,16 @@ def test_loss_by_compression_or_8_bits_is_reported(tmp_path: Path, container: st
     soundfile.write(tmp_path / "b.wav", ring(), RATE, format=container, subtype=subtype)
     report = check(tmp_path).recordings[1]
     assert (report.coding, report.clipped, len(report.problems)) == (subtype, 0, problems)
+
+
+@pytest.mark.parametrize("frequency", [20.0, 25.0, 33.0, 33.3, 50.0, 66.6])
+def test_a_slow_vibration_is_no_offset_and_hides_none(frequency: float) -> None:
+    time = np.arange(48_000) / 48_000
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(48_000)
+    sound = np.exp(-time) * np.sin(2 * np.pi * frequency * time) + noise
+    assert constant_offset(sound, sample_rate=48_000) == 0.0
+    quiet = np.concatenate([noise, sound]) + 0.01
+    assert constant_offset(quiet, sample_rate=48_000) == pytest.approx(0.01, abs=1e-4)
 
 
 def test_flat_tops_count_and_smooth_ones_do_not() -> None:
@@ -98,3 +108,13 @@ def test_channels_of_one_sound_are_read_and_named_once(tmp_path: Path, kind: str
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.array_equal(read_capture(folder, chosen).impacts.sounds.numpy(), sounds)
+
+
+def test_a_soft_recording_s_channels_differ_by_their_rounding_alone(tmp_path: Path) -> None:
+    # Its peak is 40 steps of 16 bits, so that rounding is more than a hundredth of it.
+    files = {}
+    for seed, name in enumerate(NAMES):
+        sound = ring(noise=0.0, seed=seed) * 80 / 32768
+        files[name] = np.stack([sound, second_channel(sound, "dither")], axis=1)
+    folder = fill(tmp_path, replace=files, subtype="PCM_16")
+    assert all(row.readable for row in check(folder).recordings)

@@ -342,6 +342,16 @@ def test_a_plate_s_responses_start_with_the_impact_at_any_rate(rate: float, cont
     assert start_with_impact(prepared) == (lead == 0)
 
 
+def test_a_force_channel_says_where_an_impulse_response_starts(tmp_path: Path) -> None:
+    force = np.zeros(4000)
+    force[1:6] = [1, 3, 4, 3, 1]
+    files = {name: np.stack([force, ring(0.5, seed=seed)], axis=1) for seed, name in enumerate(NAMES)}
+    settings = CaptureSettings(force_channel=1)
+    report = check(fill(tmp_path, replace=files), settings)
+    assert report.remarks == ()
+    assert {row.onset_seconds for row in report.recordings} == {1 / RATE}
+
+
 def test_a_dataset_s_gain_is_divided_out_of_the_margins_too() -> None:
     files = pre_triggered(40, 300, 1000)
     plain, divided = (
