@@ -12,6 +12,7 @@ from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import HeldModes, elastic_modes
 from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import NOMINAL
+from avmsf.fem.solid import Solid
 from avmsf.fem.supports import EndPatch, Support, patches_of
 from factories.raising import raises
 from oracles.block import block
@@ -101,6 +102,15 @@ def test_a_lying_plate_may_be_held_along_each_of_its_sides():
     # Not at its face, which is half of it.
     assert sorted(round(float(np.ptp(side[:, :2], axis=0).max()), 6) for side in sides) == [0.16, 0.16, 0.24, 0.24]
     assert all(np.ptp(side[:, :2], axis=0).min() < 0.01 for side in sides)
+
+
+def test_a_cone_on_its_tip_may_be_held_at_its_tip():
+    flat = block((1.0, 1.0, 1.0), (4, 4, 4))
+    points = flat.points.clone()
+    points[:, :2] = (points[:, :2] - 0.5) * (0.05 + points[:, 2:])
+    mesh = SecondOrder.of(Solid.build(points, flat.cells))
+    tip = next(patch for patch in patches_of(mesh) if patch.name == "its lowest part")
+    assert float(np.ptp(mesh.nodes[tip.nodes(mesh)], axis=0).max()) < 0.1
 
 
 @pytest.mark.parametrize("held", ["point", "line"])

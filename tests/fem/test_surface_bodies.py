@@ -10,7 +10,7 @@ import trimesh
 
 from avmsf.errors import SimulationError
 from avmsf.fem import body_meshes, candidate_bodies
-from avmsf.fem.candidate_bodies import SurfaceBodies
+from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import NOMINAL
 from avmsf.mesh.surface import Surface, read_surface
@@ -160,3 +160,26 @@ def test_settings_that_make_no_sense_are_named(settings: dict, row: int | None, 
     [name] = settings
     with raises(SimulationError, name=name, row=row, value=pytest.approx(value, nan_ok=True)):
         computed(sheet(), **settings)
+
+
+@pytest.fixture(scope="module")
+def coarse() -> CandidateBody:
+    elastic = computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies[0].elastic
+    return CandidateBody(0.004, elastic, fine=False)
+
+
+@pytest.mark.parametrize("error", [None, MemoryError(), SimulationError("badly shaped")])
+def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory_or_fails(
+    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody, error: Exception | None
+):
+    def fail(*solid: object, **settings: object) -> None:
+        assert error is not None
+        raise error
+
+    monkeypatch.setattr(candidate_bodies, "elastic_modes", fail)
+    if error is None:
+        monkeypatch.setattr(body_meshes, "free_memory", lambda: 1e9)
+    messages: list[str] = []
+    bodies = SurfaceBodies(sheet(), count=4, dofs=3000 if error else 400_000, log=messages.append)
+    assert bodies.refined(coarse) is coarse
+    assert messages[-1].startswith("wall of 4 mm: ")

@@ -120,6 +120,14 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
 
 
+def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
+    assert estimator().digest() == estimator().digest()
+    finer = [CandidateBodies(bodies()) for _ in range(2)]
+    finer[0].dofs, finer[1].dofs = 20_000, 40_000
+    made = (estimator(), estimator(*bodies()[:2]), *(MixtureEstimator(bodies=each) for each in finer))
+    assert len({each.digest() for each in made}) == len(made)
+
+
 def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
     """Over 3000 draws of white noise, each mode alone: a variance of so many is good to 3 %."""
     still, draws = torch.zeros(1, dtype=torch.float64), 3000
@@ -186,6 +194,21 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
         with raises(SimulationError, name=name, value=value):
             estimator_for(model, make)
     estimator_for("smooth", make)
+
+
+def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avmsf.fem.body_meshes.free_memory", lambda: 1000.0)
+    with raises(SimulationError, name="memory"):
+        candidate_bodies(dome(), BodyConfig(wall=0.004))
+
+
+def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
+    told: list[str] = []
+    surface = Surface(1000.0 * dome().vertices, dome().faces)
+    with raises(FitError, name="contacts") as caught:
+        candidate_bodies(surface, impacts=recorded(12)[0], log=told.append)
+    assert 'unit "mm"' in str(caught.value)
+    assert told == []
 
 
 SIDES = (0.08, 0.06, 0.05)
