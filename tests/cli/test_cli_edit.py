@@ -10,6 +10,7 @@ import torch
 
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
+from avmsf.cli.edit_report import contact_of_sounds
 from avmsf.cli.paths import OutputError
 from avmsf.editing.material import RATIO_ONLY, change_material, rayleigh_damping
 from avmsf.editing.modal_edit import EDITS, adjust_modes
@@ -17,11 +18,12 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError
 from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from factories.made_fields import FIELDS, places
+from factories.made_fields import FIELDS, mixture, places
 from factories.raising import raises
 from factories.settings import sets
 from factories.verbs import results_of, run_verb
@@ -170,6 +172,16 @@ def test_towards_a_materials_sound(field: Path) -> None:
     both = edited(field, *words, *quick, name="both")
     assert [each["edit"] for each in both.origin.report[EDITS]] == ["change_material", "guided"]
     assert {name: both.origin.report[EDITS][1][name] for name in expected} == expected
+
+
+def test_the_loudest_place_is_that_of_both_parts_of_the_gains() -> None:
+    values = torch.zeros(3, 5, dtype=torch.complex128)
+    values[0], values[1] = 1.0, 3.0j
+    corners = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
+    alike = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(3, 3)
+    gains = replace(mixture(Sites(corners, alike), values, directional=False), points=corners.float())
+    loud = replace(ceramic(), gain_field=gains)
+    assert contact_of_sounds(loud, None).tolist() == pytest.approx([0.1, 0.0, 0.0])
 
 
 class Echo:

@@ -12,6 +12,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.paths import OutputError
 from avmsf.errors import AvmsfError, CaptureError
 from avmsf.field.sound_field import Origin, SoundField
@@ -199,6 +200,24 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_
     (tmp_path / "capture.toml").write_text('name = "other plate"')
     results, _ = located(place, capsys, paths[3], "--true-contact", *map(str, fitted.tolist()))
     assert results["impacts"][0]["training"] is False
+
+
+@pytest.mark.parametrize(
+    ("names", "recording", "rows"),
+    [
+        (("hit.wav",), "a/hit.wav", [0]),
+        (("b/hit.wav",), "a/hit.wav", [0]),
+        (("hit.wav", "a/hit.wav"), "a/hit.wav", [1]),
+        (("hit.wav", "a/hit.wav"), "b/hit.wav", [0]),
+        (("a/hit.wav", "x/a/hit.wav", "y/a/hit.wav"), "/x/a/hit.wav", [1]),
+        (("/x/hit.wav", "/y/hit.wav"), "/y/hit.wav", [1]),
+        (("a/hit.wav", "b/hit.wav"), "c/hit.wav", [0, 1]),
+        (("other.wav", "a/hit.flac"), "a/hit.wav", []),
+    ],
+)
+def test_a_recording_has_the_row_with_most_of_its_path(names: tuple[str, ...], recording: str, rows: list[int]) -> None:
+    contacts = Contacts(torch.zeros(len(names), 3, dtype=torch.float64), names)
+    assert rows_of(contacts, Path(recording)) == rows
 
 
 TABLES: dict[str, dict[str, Any]] = {
