@@ -18,6 +18,7 @@ from avmsf.editing.material import (
     guess_materials,
     infer_material,
 )
+from avmsf.editing.modal_edit import adjust_modes, silenced
 from avmsf.errors import EditError, SimulationError
 from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import elastic_modes
@@ -165,6 +166,24 @@ def test_modes_without_a_tone_are_mute_and_named_and_stay_where_they_are():
     before, after = gains_of(field, CONTACTS), gains_of(back, CONTACTS)
     torch.testing.assert_close(after, torch.where(dead, 0.0, before), rtol=1e-6, atol=0)
     assert back.origin.report["edits"][-1]["remarks"] == []
+
+
+def test_a_mute_mode_is_none_that_a_lower_pitch_brings_back():
+    found = change_material(plate_field(GLASS), GLASS, replace(GLASS, alpha=4e5))
+    high = adjust_modes(found, pitch=1e3)
+    assert not bool(high.audible.any())
+    assert high.origin.report["edits"][-1]["silent_hertz"] == []
+    assert not bool(silenced(high).any())
+    assert change_material(high, GLASS, replace(GLASS, alpha=4e9)).origin.report["edits"][-1]["overdamped_hertz"] == []
+
+
+def test_another_poissons_ratio_is_said_with_what_it_would_do_to_a_plate():
+    stiff = replace(STEEL, poisson=0.45)
+    (words,) = change_material(plate_field(STEEL), STEEL, stiff).origin.report["edits"][-1]["remarks"]
+    lowest = [float(plate_modes(plate_of(each), CONTACTS).frequency[0]) for each in (STEEL, stiff)]
+    assert f"about {100 * (lowest[1] / lowest[0] - 1):+.1f} %" in words
+    same = change_material(plate_field(STEEL), STEEL, replace(STEEL, young=1e11))
+    assert same.origin.report["edits"][-1]["remarks"] == []
 
 
 BARE = replace(OTHER, name="aether", alpha=0.0, beta=0.0)

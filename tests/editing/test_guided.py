@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avmsf.editing.config import GuidedEditConfig
-from avmsf.editing.guided import HIERARCHICAL, INDEPENDENT, PUBLISHED, edit_towards
+from avmsf.editing.guided import HIERARCHICAL, INDEPENDENT, PUBLISHED, SEARCHED, edit_towards
 from avmsf.editing.modal_edit import ModalEdit
 from avmsf.editing.reference import Reference
 from avmsf.errors import EditError
@@ -111,6 +111,21 @@ def test_the_published_form_has_one_factor_on_frequencies_and_gains_that_follow_
     # The level of the whole is none of the edit's.
     ratio = follow.gain_field.scale / stay.gain_field.scale * (follow.bank.frequency / field.bank.frequency)
     torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(("parameters", "pitch"), [(INDEPENDENT, 1.0), (SEARCHED, 0.5)])
+def test_what_does_not_move_stays_where_it_begins(parameters, pitch):
+    class Proposing(Towards):
+        def start(self, struck):
+            return ModalEdit.none(struck.field.bank, pitch=math.log(0.5), damping=math.log(2.0))
+
+    guide = Proposing(sound_of(ringing_field(pitch=0.5)))
+    made, seen = trace(ringing_field(), guide, config=replace(QUICK, steps=2, preview_every=0), parameters=parameters)
+    assert (seen[-1].pitch, seen[-1].decay) == (pytest.approx(pitch), pytest.approx(pitch))
+    # Two steps of single modes are a 25th at most.
+    ratio = made.bank.frequency / ringing_field().bank.frequency
+    torch.testing.assert_close(ratio, torch.full_like(ratio, pitch), rtol=0.05, atol=0)
+    assert not torch.allclose(ratio, torch.full_like(ratio, pitch), rtol=1e-3)
 
 
 def test_stiffness_keeps_modes_together():
