@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from avmsf.modal.clips import resampled
 from corpus import make as corpus
 
 from avmsf.errors import EvaluationError
@@ -168,6 +169,18 @@ def test_what_cannot_be_compared_is_refused(metric):
     with raises(EvaluationError, name="predicted", row=2, value=math.inf) as caught:
         validate(broken, good, names=("a", "b", "taps/c.wav"))
     assert "taps/c.wav" in str(caught.value)
+
+
+def test_resampling_keeps_a_tone_and_its_length():
+    def tone(rate: float) -> torch.Tensor:
+        times = torch.arange(round(0.5 * rate), dtype=torch.float64) / rate
+        return (torch.sin(math.pi * times / 0.5) ** 2 * torch.sin(2 * math.pi * 1000 * times))[None]
+
+    # 44100 / 0.9999: the rate of a capture that was played a little slower.
+    for rate in (8000.0, 44100.0 / 0.9999, 48000.0, 192000.0):
+        heard = resampled(tone(rate), sample_rate=rate, wanted=22050.0)
+        assert abs(heard.shape[1] - 11025) <= 1
+        assert torch.allclose(heard[0, :11024], tone(22050.0)[0, :11024], atol=3e-3)
 
 
 def test_every_metric_of_the_corpus_says_what_it_said():

@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.fit import fit as field_fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.sound_field import SoundField
-from avmsf.simulate.ground_truth import read_truth
+from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_field import QUICK
 from factories.plate_set import PlateInputs, fill_plates
@@ -141,6 +142,18 @@ def test_an_object_that_cannot_be_read_or_shows_nothing_is_a_failure(tmp_path: P
     failures = summed(tmp_path / "results")["failures"]
     assert [(each["object"], each["method"]) for each in failures] == [("a", "field"), ("b", None)]
     assert "03.wav" in failures[1]["failure"]
+
+
+def test_a_truth_of_other_recordings_costs_its_object_alone_until_it_is_mended(tmp_path: Path) -> None:
+    folder = fill_plates(tmp_path / "plates", ("a", "b"), count=6, truth=True)
+    truth = read_truth(folder / "a")
+    write_truth(replace(truth, names=tuple(f"x{name}" for name in truth.names)), folder / "a" / TRUTH)
+    results = ResultsFolder(tmp_path / "results")
+    run_objects(planned(folder, "nearest"), ("a", "b"), results)
+    assert [len(each.outcomes) for each in results.records()] == [0, 1]
+    (folder / "a" / TRUTH).unlink()
+    run_objects(planned(folder, "nearest"), ("a", "b"), results)
+    assert [(len(each.outcomes), each.failure) for each in results.records()] == [(1, None), (1, None)]
 
 
 def test_methods_share_modes_that_are_found_once_and_kept(plates: Path, tmp_path: Path) -> None:
@@ -334,6 +347,37 @@ def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_ow
     assert fitted == ["paper"]
     before, paper, after = (each.fit_seconds for each in outcomes)
     assert paper > max(before, after)
+
+
+def evaluate_plates(data: Path, results: Path) -> None:
+    evaluation = planned(data, protocol="leave-one-out")
+    run_objects(evaluation, evaluation.dataset.objects(), ResultsFolder(results))
+    summed(results)
+
+
+@pytest.mark.slow
+def test_killed_twice_it_comes_to_the_same_summary(tmp_path: Path) -> None:
+    plates, place, counts = fill_plates(tmp_path / "plates", count=6), tmp_path / "killed", [0]
+
+    def kept() -> int:
+        return sum(path.read_text().count('"method"') for path in place.glob("objects/[!.]*.json"))
+
+    evaluate_plates(plates, tmp_path / "whole")
+    for _ in range(2):
+        child = get_context("spawn").Process(target=evaluate_plates, args=(plates, place))
+        child.start()
+        while child.is_alive() and kept() == counts[-1]:
+            time.sleep(0.001)
+        child.kill()
+        child.join()
+        assert child.exitcode == -signal.SIGKILL, "it came midway"
+        counts.append(kept())
+    # Nothing that was there was lost.
+    assert counts == sorted(counts)
+    evaluate_plates(plates, place)
+    whole, resumed = (json.loads((folder / "summary.json").read_text()) for folder in (tmp_path / "whole", place))
+    assert resumed == whole
+    assert set(whole["methods"]) == set(CHEAP)
 
 
 @pytest.mark.slow
