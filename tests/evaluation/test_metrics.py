@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from avmsf.modal.clips import resampled
 from corpus import make as corpus
 
 from avmsf.errors import EvaluationError
@@ -21,6 +20,7 @@ from avmsf.evaluation.metrics import (
     spectrogram_distance,
     validate,
 )
+from avmsf.modal.clips import resampled
 from avmsf.modal.spectra import magnitude_stft
 from factories.raising import raises
 
