@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,13 @@ import torch
 import trimesh
 from torch import Tensor
 
+from avmsf.cli import main
 from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.paths import OutputError
 from avmsf.errors import AvmsfError, CaptureError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -171,14 +174,14 @@ def test_the_error_is_the_distance_from_the_true_contact(place: Place, hit: str,
 
 
 def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_not_trained_on(
-    place: Place, hit: str, tmp_path: Path, capsys: Streams
+    place: Place, hit: str, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    points, names = place.points.double(), ("a/hit.wav", "b/hit.wav", "other.flac", "fitted.wav")
+    points, names = place.points.double(), ("fitted.wav", "a/hit.wav", "b/hit.wav", "other.flac")
     sound = soundfile.read(hit)[0]
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         soundfile.write(tmp_path / name, sound, RATE)
-    # The fourth is a recording of the field's capture; a row may have an absolute path, and the third none.
+    # The first is a recording of the field's capture, and comes last; a row may have an absolute path, one has none.
     (tmp_path / "capture.toml").write_text('name = "plate"')
     fitted = positional().contacts[0].double()
     rows = ("b/hit.wav", points[SECOND_PLACE]), (tmp_path / "a" / "hit.wav", points[STRUCK]), ("fitted.wav", fitted)
@@ -196,9 +199,23 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_
     wanted = {"impacts": 2, "training": 1, "median_error": 0.5 * distance, "in_region": 0.5}
     wanted |= {"rmed": relative, "rmed_posterior": relative}
     assert results["summary"] == pytest.approx(wanted, abs=1e-6)
+    # The package's attribute of this name is the function.
+    locate = import_module("avmsf.localization.locate")
+    find, calls = locate.locate, list[Any]()
+
+    def interrupted(*given: Any, **named: Any) -> ContactPosterior:
+        calls.append(given)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return find(*given, **named)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(locate, "locate", interrupted)
+        assert main(["locate", place.field, *paths, "--true-contact-table", str(table), "--unit", "mm"]) == 130
+    assert "2 located impacts of known contacts: median distance" in capsys.readouterr().out
     # A recording of the same name, at the same contact, is another one where it is of another capture.
     (tmp_path / "capture.toml").write_text('name = "other plate"')
-    results, _ = located(place, capsys, paths[3], "--true-contact", *map(str, fitted.tolist()))
+    results, _ = located(place, capsys, paths[0], "--true-contact", *map(str, fitted.tolist()))
     assert results["impacts"][0]["training"] is False
 
 

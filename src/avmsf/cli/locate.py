@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from statistics import mean, median
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,7 +58,7 @@ class Options(Common):
     unit: Unit = "m"
     """Unit of the true contacts; the field is in meters."""
     output: PictureFolder = None
-    """Folder for a heat map and a colored point cloud of every impact, NAME.png and NAME.ply."""
+    """Folder for a heat map and a point cloud of every impact, NAME.png and NAME.ply: most of many recordings' time."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
@@ -88,30 +88,36 @@ def run(options: Options) -> int:
         show(verdict)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     locate = _locator(options, field)
-    for path in options.recordings:
-        doing(f"locating the impact of {path}")
-        try:
-            RECORDING.check(path)
-            answers = locate(path)
-        except AvmsfError as error:
-            # One that cannot be read does not keep the others from being located.
-            if len(options.recordings) == 1:
-                raise
-            failures.append({"recording": str(path), "error": " ".join(str(error).split())})
-            say(f"avmsf locate: {failures[-1]['error']}", always=True)
-            continue
-        truth = None if truths is None else _true_contact(truths, path)
-        for values, contact in answers:
-            if truth is not None and contact is not None:
-                values |= _error(contact, truth, options.probability)
-                values["training"] = _is_training(field, path)
-            show(_words(values))
-            if contact is not None and options.output is not None:
-                values |= _draw(contact, options.output, _name(path, taken), values, truth)
-            found.append(values)
-    summary = _summary(found)
-    if summary is not None:
-        show(_summary_line(summary, options.probability))
+    recordings = list(options.recordings)
+    if options.true_contact_table is not None:
+        # What does not count comes last.
+        recordings.sort(key=partial(_is_training, field))
+    try:
+        for path in recordings:
+            doing(f"locating the impact of {path}")
+            try:
+                RECORDING.check(path)
+                answers = locate(path)
+            except AvmsfError as error:
+                # One that cannot be read does not keep the others from being located.
+                if len(options.recordings) == 1:
+                    raise
+                failures.append({"recording": str(path), "error": " ".join(str(error).split())})
+                say(f"avmsf locate: {failures[-1]['error']}", always=True)
+                continue
+            truth = None if truths is None else _true_contact(truths, path)
+            for values, contact in answers:
+                if truth is not None and contact is not None:
+                    values |= _error(contact, truth, options.probability)
+                    values["training"] = _is_training(field, path)
+                show(_words(values))
+                found.append(values)
+                if contact is not None and options.output is not None:
+                    values |= _draw(contact, options.output, _name(path, taken), values, truth)
+    finally:  # An interruption keeps the summary of what is located.
+        summary = _summary(found)
+        if summary is not None:
+            show(_summary_line(summary, options.probability))
     results = {"impacts": found, "summary": summary, "failures": failures}
     print_json({"field": str(options.field), "quality": verdict, **results})
     located = [each["position"] is not None for each in found]
