@@ -259,7 +259,7 @@ WRONG: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("words", WRONG)
 def test_what_cannot_be_done_is_refused(words: str, place: Place, hit: str, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("file,x,y,z\na.wav,0,0,0\n")
     with raises(AvmsfError, **WRONG[words]):
         run_verb("locate", place.field, *words.replace("HIT", hit).replace("FOLDER", str(tmp_path)).split())
 

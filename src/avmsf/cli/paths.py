@@ -12,6 +12,7 @@ import tyro
 from avmsf._utils.files import temporary_path, unwritable
 from avmsf._utils.headers import FEATURES_KEY, read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
+from avmsf.capture.table import REQUIRED, read_table
 from avmsf.errors import AvmsfError
 from avmsf.field.header import FIELD
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
@@ -69,6 +70,18 @@ class Existing:
 
 
 @dataclass(frozen=True)
+class ExistingTable(Existing):
+    """Marks a table of contacts with these columns."""
+
+    columns: tuple[str, ...] = REQUIRED[1:]
+
+    def check(self, path: Path) -> None:
+        """Raise as `Existing` and `read_table`."""
+        super().check(path)
+        read_table(path, self.columns, (), advice=f"write a row for each impact below {','.join(self.columns)}")
+
+
+@dataclass(frozen=True)
 class New:
     """Marks the path of a file or a folder to write."""
 
@@ -120,7 +133,7 @@ OutputFolder = Annotated[Path | None, arg("FOLDER", "-o"), New()]
 PictureFolder = Annotated[Path | None, arg("FOLDER", "-o", "--plots"), New()]
 PlotsFolder = Annotated[Path | None, arg("FOLDER"), New()]
 CacheFolder = Annotated[Path | None, arg("FOLDER"), New()]
-ContactTable = Annotated[Path | None, arg("TABLE.csv"), Existing("a table of contacts")]
+ContactTable = Annotated[Path | None, arg("TABLE.csv"), ExistingTable("a table of contacts")]
 PositionList = Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], arg("X Y Z")]
 """Vectors, one for each time that the option is given."""
 
