@@ -82,19 +82,6 @@ def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
     assert again.origin.report["gains"] == "made"
 
 
-def test_the_loudest_modes_by_energy():
-    field = made_field()
-    struck = FieldAtContacts.at(field, made_fields.places(9, seed=3), samples=40000)
-    energies = []
-    for mode in range(5):
-        alone = torch.full((5,), -40.0, dtype=torch.float64).index_fill(0, torch.tensor(mode), 0.0)
-        sounds = struck.sounds(replace(ModalEdit.none(field.bank), scale=alone))
-        energies.append(float(sounds.double().square().sum()))
-    order = sorted(range(5), key=lambda mode: -energies[mode])
-    for count in range(1, 6):
-        assert struck.loudest(count).tolist() == sorted(order[:count])
-
-
 def test_edits_that_cannot_be_are_refused():
     edit = ModalEdit(*(torch.zeros(size, dtype=torch.float64) for size in ((), (3,), (), (3,), (3,))))
     with raises(EditError, name="shift", value=3):

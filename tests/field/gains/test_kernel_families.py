@@ -108,16 +108,6 @@ def test_kernels_are_covariances_of_mean_one_at_the_contacts(kind, count):
 
 
 @every_kind
-def test_mean_is_the_kernels_times_their_coefficients(kind):
-    family, others = made(kind, impacts(12, seed=1)), impacts(9, seed=2)
-    kept = family.take(torch.arange(0, len(family), 2))
-    solved = draw(len(kept), 12, 3, seed=4)
-    expected = torch.einsum("hpc,hcs->ps", kept.between(others, family.reference), solved)
-    found = kept.mean(others, family.reference, kept.coefficients(solved))
-    assert torch.allclose(found, expected, rtol=1e-9, atol=1e-10)
-
-
-@every_kind
 def test_an_opposite_impact_changes_the_sign(kind):
     family, others = made(kind, impacts(12, seed=1)), impacts(9, seed=2)
     cross = family.between(others, family.reference)
