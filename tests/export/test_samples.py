@@ -96,6 +96,16 @@ def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path
         assert (20 * np.log10(level[42:] / level[41:-1]) < 0.5).all()
 
 
+def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path):
+    for name, layers, order in (
+        ("forces", (Layer(2.0), Layer(1.0), Layer(0.5)), [2, 1, 0]),
+        ("times", (Layer(1.0), Layer(1.0, 0.002), Layer(1.0, 0.0005)), [1, 2, 0]),
+    ):
+        write_grid(table(), tmp_path / name, contacts=2, layers=layers)
+        found = [(float(row["force"]), float(row["contact_time"])) for row in rows(tmp_path / name)[:3]]
+        assert found == [(layers[number].force, layers[number].contact_time) for number in order]
+
+
 @pytest.mark.parametrize(
     ("settings", "name", "value"),
     [

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import fast_simplification
 import numpy as np
 import pytest
 import torch
@@ -20,6 +21,7 @@ from avmsf.fem.meshing import (
     denoised,
     roughness,
     simplified,
+    thinned,
     weld,
 )
 from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed
@@ -167,6 +169,32 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
     # Without thinning, elements that differ change frequencies by 1.5 % at this size.
     assert found.frequency.numpy() == pytest.approx(known.frequency.numpy(), rel=0.03)
     assert found.mass == pytest.approx(known.mass, rel=0.01)
+
+
+def test_a_thinned_sheet_keeps_its_rim(monkeypatch: pytest.MonkeyPatch) -> None:
+    side = np.linspace(0.0, 1.0, 61)
+    sheet = weld(sheet_over(side, side))
+    limit(monkeypatch, 1000)
+    found = thinned(sheet, log=lambda words: None)
+    assert len(found.faces) <= 1000
+    # Each corner may lose a triangle, with sides of about .045 now.
+    assert found.area == pytest.approx(1.0, abs=4 * 0.045**2 / 2)
+    assert np.ptp(found.vertices, axis=0) == pytest.approx([1.0, 1.0, 0.0], abs=1e-6)
+    assert 0 < len(boundary_edges(found)) < len(boundary_edges(sheet))
+
+
+def test_more_triangles_are_left_where_fewer_would_tear_the_skin(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = ellipsoid(4)
+
+    def tearing(points: np.ndarray, faces: np.ndarray, *, target_count: int) -> tuple[np.ndarray, np.ndarray]:
+        return points, faces if target_count >= 4000 else faces[:target_count]
+
+    monkeypatch.setattr(fast_simplification, "simplify", tearing)
+    limit(monkeypatch, 1000)
+    found = thinned(ball, log=lambda words: None)
+    assert np.array_equal(found.faces, ball.faces)
+    limit(monkeypatch, 3000)
+    assert thinned(ball, log=lambda words: None) is ball
 
 
 def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is_filled() -> None:

@@ -10,7 +10,7 @@ import trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem.body_meshes import count_dofs, filled_solid
 from avmsf.fem.candidate_bodies import SurfaceBodies
-from avmsf.fem.elastic_modes import elastic_modes
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.meshing import checked, weld
 from avmsf.fem.walls import wall_of
@@ -88,6 +88,27 @@ def test_a_plate_of_twelve_triangles_has_leissas_frequencies():
     rigidity = NOMINAL.young * thickness**3 / (12 * (1 - NOMINAL.poisson**2))
     found = 2 * math.pi * body.elastic.frequency * side**2 * math.sqrt(NOMINAL.density * thickness / rigidity)
     assert found.tolist() == pytest.approx([13.489, 19.789, 24.432], rel=0.01)
+
+
+class Converging(SurfaceBodies):
+    """Bodies whose frequencies' error falls with the third power of the edges' length."""
+
+    def __init__(self, error: float) -> None:
+        self.error, self.asked, self.messages = error, list[int](), list[str]()
+        super().__init__(box(0.1, 0.1, 0.1), thicknesses=[None], count=8, dofs=40_000, log=self.messages.append)
+
+    def modes(self, thickness: float | None, *, dofs: int = 40_000, **others: object) -> ElasticModes:
+        self.asked.append(dofs)
+        frequency = 100.0 * (1.0 + self.error * (40_000 / dofs) ** 1.5) * torch.arange(1, 9, dtype=torch.float64)
+        nodes, none = torch.zeros(dofs, 3, dtype=torch.float64), torch.zeros(0, 6, dtype=torch.int64)
+        return ElasticModes(frequency, nodes, none, torch.zeros(dofs, 8, 3, dtype=torch.float64), NOMINAL, 1.0)
+
+
+@pytest.mark.parametrize(("error", "dofs", "told"), [(0.03, 40_000, 0), (0.08, 80_000, 0), (0.3, 80_000, 1)])
+def test_a_body_of_too_coarse_elements_is_made_finer_and_an_error_that_is_left_told(error: float, dofs: int, told: int):
+    made = Converging(error)
+    assert made.bodies
+    assert (max(made.asked), len(made.messages)) == (dofs, told)
 
 
 @pytest.mark.slow

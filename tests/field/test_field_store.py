@@ -152,6 +152,7 @@ def put(keys: str, *value: object) -> Change:
         (tensor("bank.damping", torch.neg), "bank.damping"),
         (tensor("bank.frequency", lambda each: each * 0), "bank.frequency"),
         (tensor("residual.magnitude", lambda each: each[None]), "residual.magnitude"),
+        (tensor("residual.magnitude", torch.neg), "residual.magnitude"),
         (tensor("residual.magnitude", lambda each: each + 1e38), "residual.magnitude"),
         *((put("background_force", force), "background_force") for force in (0.0, -1.0, "1", [])),
         (put("sizes.modes", 13), "gains.modes"),
