@@ -1,6 +1,5 @@
 """Contacts from the command line or from a table, each with the name of its sound."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -10,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from avmsf._utils.arrays import as_vectors
 from avmsf.capture.settings import METRES
 from avmsf.capture.table import DIRECTION, REQUIRED, Row, is_inside, read_table
 from avmsf.cli.options import Unit
@@ -48,20 +48,15 @@ class Contacts:
 def given_contacts(
     places: _Vectors, table: Path | None, *, unit: Unit, directions: _Vectors = (), option: str = "--position"
 ) -> Contacts:
-    """Return the contacts that an option gives, numbered, or those of a table. Raises `OutputError` for no numbers."""
+    """Return the contacts that an option gives, numbered, or those of a table. Raises `ArrayError` for no numbers."""
     if table is not None:
         return read_contacts(table, unit=unit)
-    contacts = Contacts(
-        torch.tensor(places, dtype=torch.float64).reshape(-1, 3) * METRES[unit],
+    return Contacts(
+        as_vectors(torch.tensor(places, dtype=torch.float64).reshape(-1, 3), option) * METRES[unit],
         tuple(f"{number:03d}.wav" for number in range(1, len(places) + 1)),
         torch.tensor(directions, dtype=torch.float64) if directions else None,
         option,
     )
-    for row, place in enumerate(places):
-        if not all(map(math.isfinite, place)):
-            message = f"{contacts.label(row)}: expected finite numbers, got {place}"
-            raise OutputError(message, name=option, row=row, value=list(place))
-    return contacts
 
 
 def read_contacts(path: Path, *, unit: Unit, recordings: bool = False) -> Contacts:

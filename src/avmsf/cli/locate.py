@@ -12,10 +12,9 @@ import tyro
 
 from avmsf._utils.text import counted, format_number
 from avmsf.capture.settings import CaptureSettings, settings_of
-from avmsf.capture.table import REQUIRED
 from avmsf.cli.options import Common, Flag, Number, Unit
 from avmsf.cli.output import doing, next_command, note, print_json, say, show
-from avmsf.cli.paths import Existing, ExistingTable, FieldFile, OutputError, PictureFolder, SettingsFile, arg
+from avmsf.cli.paths import Existing, FieldFile, OutputError, PictureFolder, SettingsFile, TruthTable, arg
 from avmsf.errors import AvmsfError, LocationError
 
 if TYPE_CHECKING:
@@ -54,9 +53,7 @@ class Options(Common):
     """Probability that the contact lies within the region that is reported."""
     true_contact: Annotated[tuple[float, float, float] | None, arg("X Y Z")] = None
     """True contact of every impact, to print and mark its distance."""
-    true_contact_table: Annotated[
-        Path | None, arg("TABLE.csv"), ExistingTable("a table of contacts", columns=REQUIRED)
-    ] = None
+    true_contact_table: TruthTable = None
     """True contacts of several recordings: columns file,x,y,z, such as impacts.csv."""
     unit: Unit = "m"
     """Unit of the true contacts; the field is in meters."""

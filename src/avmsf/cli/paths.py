@@ -50,9 +50,11 @@ class Existing:
     what: str
     kinds: tuple[FileKind, ...] = ()
     """What it may be; a file of no known kind is left to its reader."""
+    columns: tuple[str, ...] = ()
+    """What a table has to have."""
 
     def check(self, path: Path) -> None:
-        """Raise `InputError` for no file or one of another kind, `FieldFileError` for a field that cannot be read."""
+        """Raise `InputError` for no file or one of another kind, and as the readers of fields and of tables."""
         try:
             found = None if path.exists() else "no such file or folder"
         except OSError as error:
@@ -67,18 +69,8 @@ class Existing:
             raise InputError.expected(self.what, kind, got=kind, file=path, advice=f"name {other}")
         if "a sound field" in self.kinds and kind in (None, "a sound field"):
             FIELD.read_record(path)
-
-
-@dataclass(frozen=True)
-class ExistingTable(Existing):
-    """Marks a table of contacts with these columns."""
-
-    columns: tuple[str, ...] = REQUIRED[1:]
-
-    def check(self, path: Path) -> None:
-        """Raise as `Existing` and `read_table`."""
-        super().check(path)
-        read_table(path, self.columns, (), advice=f"write a row for each impact below {','.join(self.columns)}")
+        if self.columns:
+            read_table(path, self.columns, (), advice=f"write a row for each impact below {','.join(self.columns)}")
 
 
 @dataclass(frozen=True)
@@ -133,7 +125,8 @@ OutputFolder = Annotated[Path | None, arg("FOLDER", "-o"), New()]
 PictureFolder = Annotated[Path | None, arg("FOLDER", "-o", "--plots"), New()]
 PlotsFolder = Annotated[Path | None, arg("FOLDER"), New()]
 CacheFolder = Annotated[Path | None, arg("FOLDER"), New()]
-ContactTable = Annotated[Path | None, arg("TABLE.csv"), ExistingTable("a table of contacts")]
+ContactTable = Annotated[Path | None, arg("TABLE.csv"), Existing("a table of contacts", columns=REQUIRED[1:])]
+TruthTable = Annotated[Path | None, arg("TABLE.csv"), Existing("a table of contacts", columns=REQUIRED)]
 PositionList = Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float, float], ...]], arg("X Y Z")]
 """Vectors, one for each time that the option is given."""
 
