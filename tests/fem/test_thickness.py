@@ -17,7 +17,7 @@ GRID = (0.001, 0.0016, 0.0025, 0.004, 0.0063)
 
 
 def searched(
-    of: Callable[[float], float], *, filled: float = -1000.0, walls: Sequence[float | None] = GRID
+    of: Callable[[float], float], *, filled: float = -1000.0, walls: Sequence[float | None] = GRID, made: bool = True
 ) -> tuple[Sequence[CandidateBody], ThicknessPosterior | None, list[float]]:
     """Search by the evidence of a log thickness and of the filled body; return the walls that were asked for, too."""
     asked: list[float] = []
@@ -28,9 +28,9 @@ def searched(
     def evidence(known: Sequence[CandidateBody]) -> list[float]:
         return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
 
-    def make(like: CandidateBody, wall: float) -> CandidateBody:
+    def make(like: CandidateBody, wall: float) -> CandidateBody | None:
         asked.append(wall)
-        return walled(wall)
+        return walled(wall) if made else None
 
     return *search_thickness([walled(each) for each in walls], evidence, make), asked
 
@@ -102,3 +102,9 @@ def test_the_right_wall_of_every_material_is_within_the_range_of_factors() -> No
     # A bending wall that is taken to be thinner by a part needs frequencies higher by as much.
     assert max(speeds) * (1.0 + DISCREPANCY) < high < max(speeds) * 1.3
     assert min(speeds) / (1.0 + DISCREPANCY) > low > min(speeds) / 1.3
+
+
+def test_other_thicknesses_are_tried_where_a_body_cannot_be_had() -> None:
+    _, thickness, asked = searched(lambda log: -((log - math.log(0.0029)) ** 2), made=False)
+    assert len({round(each, 9) for each in asked}) == len(asked) > 1
+    assert thickness.low < 0.0029 < thickness.high

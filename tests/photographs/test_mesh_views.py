@@ -129,6 +129,14 @@ def test_faces_are_as_bright_as_the_part_of_the_sky_that_they_see() -> None:
             assert np.allclose(view.image[16, 16].numpy(), expected, atol=0.51)
 
 
+def test_both_sides_are_seen_in_the_light_of_their_front() -> None:
+    for flip in ([0, 1, 2], [0, 2, 1]):
+        mesh = TexturedMesh.build(torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), torch.tensor([flip]))
+        assert MeshTracer(mesh.surface).depth(facing(9))[4, 4].item() == pytest.approx(1.0, abs=1e-12)
+        (view,) = render_views(mesh, [facing(9)], ambient=0.0)
+        assert np.allclose(view.image[4, 4].numpy(), 255 * GRAY * (1 - SKY[2]) / 2, atol=0.51)
+
+
 def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
     near = sphere(3)
     away = torch.tensor([3000.0, -2000.0, 500.0], dtype=torch.float64)

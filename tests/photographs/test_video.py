@@ -2,14 +2,16 @@
 
 import struct
 from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs.video import pick_frames
-from factories.raising import raises
+from factories.raising import raises, warns
 
 SHARP = (2, 11, 13, 21, 28, 30)
 """Of 36 frames, one in each sixth that is not blurred."""
@@ -71,6 +73,29 @@ def test_a_video_taken_upright_is_written_upright(tmp_path: Path) -> None:
     lying, upright = cv2.imread(str(plain)), cv2.imread(str(turned))
     assert lying.shape == (64, 96, 3)
     assert np.array_equal(upright, cv2.rotate(lying, cv2.ROTATE_90_CLOCKWISE))
+
+
+@pytest.mark.parametrize("claimed", [0, 35, 90])
+def test_spans_go_by_the_frames_that_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, claimed: int) -> None:
+    film(tmp_path / "a.avi")
+
+    opened = cv2.VideoCapture
+
+    class Claiming:
+        def __init__(self, path: str) -> None:
+            self.video = opened(path)
+
+        def get(self, what: int) -> float:
+            return claimed if what == cv2.CAP_PROP_FRAME_COUNT else self.video.get(what)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.video, name)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Claiming)
+    ended_early = warns(CaptureWarning, file="a.avi", name="frames", value=36) if claimed == 90 else nullcontext()
+    with ended_early:
+        picked = pick(tmp_path / "a.avi", tmp_path / "images", 6)
+    assert [path.name for path in picked] == names(SHARP)
 
 
 def test_what_cannot_be_picked_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
