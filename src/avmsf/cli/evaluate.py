@@ -91,7 +91,8 @@ class Options(Configured):
     @classmethod
     def parse(cls, words: Sequence[str]) -> "Options":
         """Return the options as `Configured`; a help that names a protocol begins with what it does."""
-        for name in {*words} & {*PROTOCOLS} if {"-h", "--help"} & {*words} else ():
+        named = [word for word in words if word in PROTOCOLS][:1]
+        for name in named if {"-h", "--help"} & {*words} else ():
             known, usual = (", ".join(names) for names in (suited_methods(name), PROTOCOLS[name].methods))
             for text in (f"{name}: {PROTOCOLS[name].title}", f"Methods: {known}; by default {usual}."):
                 print(textwrap.fill(text, 80, break_on_hyphens=False), end="\n\n")
