@@ -9,6 +9,7 @@ import torch
 import trimesh
 
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, SurfaceBodies
@@ -16,6 +17,7 @@ from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import GainData, gain_data, gain_variance
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for
+from avmsf.field.probable_body import ProbableBody
 from avmsf.mesh.level_set import difference
 from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction
@@ -107,6 +109,19 @@ def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
     assert first["weight"] > 10 * max(each["weight"] for each in others)
 
 
+def test_a_mesh_in_centimeters_is_said_to_be() -> None:
+    """Read in meters, it has frequencies a hundredth of the object's."""
+    slow = [replace(each, elastic=replace(each.elastic, frequency=each.elastic.frequency / 100)) for each in bodies()]
+    candidates = CandidateBodies(slow)
+    candidates.unit_ratios = CaptureSettings().unit_ratios(8.0)
+    report = MixtureEstimator(bodies=candidates).solve(case())[0].report
+    assert (report["bodies"][0]["body"], report["bodies"][0]["unit"]) == (bodies()[1].name, "cm")
+    assert report["bodies"][0]["frequency_factor"] == pytest.approx(STIFFER, rel=0.06)
+    found = ProbableBody.of(report)
+    assert found is not None
+    assert 'unit = "cm"' in found.warning
+
+
 def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> None:
     # Both are walls of 4 mm by name; the wrong one comes first.
     bad, good = (
@@ -118,6 +133,12 @@ def test_the_most_probable_body_alone_is_made_finer_and_not_its_namesake() -> No
     assert candidates.asked == [good]
     assert (first["wall_thickness"], first["refined"]) == (0.00396, True)
     assert (second["wall_thickness"], second["refined"]) == (0.00404, False)
+
+
+def test_a_fine_body_is_not_computed_again() -> None:
+    candidates = Asked()
+    MixtureEstimator(bodies=candidates).solve(case())
+    assert candidates.asked == []
 
 
 def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
