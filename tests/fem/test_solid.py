@@ -118,6 +118,27 @@ def test_a_coarser_sheet_keeps_its_hole():
     assert coarse.area == pytest.approx(sheet.area, rel=1e-6)
 
 
+class WithoutNormals(Trimesh):
+    """A mesh whose normals say nothing."""
+
+    @property
+    def vertex_normals(self) -> np.ndarray:
+        return np.zeros(self.vertices.shape)
+
+
+def test_a_coarser_ring_stays_a_ring():
+    ring = weld(surface_of(trimesh.creation.torus(0.05, 0.008, major_sections=24, minor_sections=8)))
+    # Edges longer than the tube is round, and no normals: nothing but its topology keeps it from being pinched.
+    faces = coarsened(WithoutNormals(ring.vertices, ring.faces, process=False), 0.06, turn=-1.0).faces
+    edges, count = np.unique(
+        np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True
+    )
+    assert len(faces) < 0.5 * len(ring.faces)
+    assert (count == 2).all()
+    # Euler's characteristic of a ring.
+    assert len(np.unique(faces)) - len(edges) + len(faces) == 0
+
+
 def test_an_open_bowl_gets_a_wall():
     sheet = half(ball())
     solid = shell(sheet, thickness=0.003, detail=0.06)
