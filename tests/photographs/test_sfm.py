@@ -1,7 +1,9 @@
 """Cameras found from pictures alone, against those that took them; and whatever can go wrong on the way."""
 
+import json
 import math
 import subprocess
+import sys
 import textwrap
 import time
 import warnings
@@ -19,7 +21,7 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs import read_views
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import render_views
-from avmsf.photographs.sfm import estimate_cameras
+from avmsf.photographs.sfm import WORKER, estimate_cameras
 from factories.raising import raises
 
 VIEWS, SIZE = 10, 256
@@ -221,6 +223,20 @@ def test_time_ends_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         estimate_cameras(folder / "images", folder, timeout=3.0)
     assert gone(int((tmp_path / "pid").read_text()))
     assert [path.name for path in folder.iterdir()] == ["images"]
+
+
+def test_the_worker_ends_when_its_parent_does(taken: tuple[View, ...], tmp_path: Path) -> None:
+    fill(tmp_path / "images", taken)
+    names = sorted(path.name for path in (tmp_path / "images").iterdir())
+    job = {"names": dict(zip(names, names, strict=True)), "seed": 0, "features": 8192, "threads": 1}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    command = [sys.executable, "-P", str(WORKER), str(tmp_path / "job.json")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as worker:
+        assert worker.stdout.readline() == b"stage features\n"
+        # What a dying parent leaves behind: its end of the pipe, closed.
+        worker.stdin.close()
+        assert worker.wait(10) == 1
+    assert not (tmp_path / "result.json").exists()
 
 
 def test_what_cannot_begin_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,6 +149,12 @@ def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
     assert len({each.digest() for each in made}) == len(made)
 
 
+def test_reasons_against_other_bodies_are_reported() -> None:
+    known = CandidateBodies(bodies()[1:2], {None: "the mesh is open"})
+    report = MixtureEstimator(bodies=known).solve(case())[0].report
+    assert report["unavailable"] == {"solid body": "the mesh is open"}
+
+
 def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
     """Over 3000 draws of white noise, each mode alone: a variance of so many is good to 3 %."""
     still, draws = torch.zeros(1, dtype=torch.float64), 3000
