@@ -15,6 +15,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.estimators import Progress
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.losses import spectral_loss
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
@@ -296,6 +297,20 @@ def test_a_fit_that_diverges_says_so():
     with raises(FitError, name="fit") as caught:
         plate_fit(config)
     assert not math.isfinite(caught.value.value)
+
+
+@pytest.mark.parametrize(("every", "turns"), [(1, [0, 0, 0, 0]), (2, [0, 1, 0, 1]), (3, [1, 2, 0, 1])])
+def test_steps_take_turns_at_the_frames(monkeypatch, every, turns):
+    """Whole sounds and beginnings alike; the warm-up's four steps compare none, but count."""
+    asked = []
+
+    def noted(sounds, target, *, first=0, every=1):
+        asked.append((first, every))
+        return spectral_loss(sounds, target, first=first, every=every)
+
+    monkeypatch.setattr("avmsf.field.training.spectral_loss", noted)
+    plate_fit(replace(SHORT, interleave=every))
+    assert asked == [(turn, every) for turn in turns for _ in ("whole", "early")]
 
 
 @pytest.mark.parametrize(
