@@ -15,6 +15,7 @@ from avmsf.evaluation.registry import METRICS
 from avmsf.evaluation.report import SUMMARY
 from avmsf.simulate.recipe import ABLATED, SIM20
 from avmsf.simulate.simulation_folder import simulate_set
+from benchmarks.objects import simulated_folder
 from benchmarks.records import Measurement, Record, Settings, code_commit
 
 SIMPLE = "nearest,knn3,knn-gains,spline-gains"
@@ -43,7 +44,10 @@ def _evaluate(
             wanted = {each: replace(SIM20[each], views=0, sample_rate=rate, seconds=seconds) for each in chosen}
             simulate_set(wanted, objects)
         else:
-            objects = settings.sim20
+            # The folder may hold objects of other sets, which would be embedded too.
+            objects = Path(stack.enter_context(TemporaryDirectory()))
+            for each in chosen:
+                (objects / each).symlink_to(simulated_folder(each, settings).resolve())
         output = folder / code_commit() / f"{'quick-' * settings.quick}{'paper-' * paper}{protocol}"
         words = ["evaluate", protocol, str(objects), "--methods", methods, "--objects", ",".join(chosen), *options]
         words += ["--output", str(output), "--workers", str(os.cpu_count())]
