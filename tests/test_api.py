@@ -330,3 +330,12 @@ def test_a_field_is_written_in_the_format_of_its_ending(tmp_path):
     assert (tmp_path / "plate.glb").read_bytes().startswith(b"glTF")
     avmsf.write(field(), tmp_path / "samples", to="wavs", contacts=3)
     assert len(list((tmp_path / "samples").rglob("*.wav"))) == 3
+
+
+def test_a_field_written_at_fewer_contacts_than_it_has_says_so_unless_they_are_asked_for(tmp_path):
+    held = len(field().gain_field.points)
+    said = [
+        avmsf.write(field(), tmp_path / str(contacts), to="wavs", contacts=contacts).remarks for contacts in (None, 3)
+    ]
+    said = [[each for each in remarks if "of the field's" in each] for remarks in said]
+    assert said == [[f"written: 16 of the field's {held} contacts; contacts= sets the number"], []]

@@ -114,8 +114,10 @@ def test_as_many_points_are_written_as_faust_compiles_unless_more_are_asked_for(
     path = tmp_path / "thing.dsp"
     with raises(ExportError, name="numbers", value=POINTS * MODES):
         write_faust(table(), path, contacts=POINTS)
-    assert "5 of 9 contacts" in " ".join(write_faust(table(), path).remarks)
+    assert "5 of 9 contacts are written, evenly spread: Faust" in " ".join(write_faust(table(), path).remarks)
     assert "points = 5;" in path.read_text()
+    remarks = write_faust(table(), path, contacts=3, overwrite=True).remarks
+    assert "3 of 9 contacts are written, evenly spread" in remarks
 
 
 def test_other_endings_are_refused(tmp_path):

@@ -1,9 +1,9 @@
 """Sound fields for other tools.
 
 In goes a `SoundField`, or its table at points of the surface; out come files that other programs read, and notes on
-what their format cannot represent (`Written`). All formats but the web page start from a `SampledField`: frequencies,
-dampings, and a sine and a cosine amplitude of each mode at each point, of which `SampledField.render` is the reference
-that every file is compared with.
+what their format cannot represent (`Written`). All formats start from a `SampledField`: frequencies, dampings, and a
+sine and a cosine amplitude of each mode at each point, of which `SampledField.render` is the reference that every file
+is compared with.
 
 - `web.write_webpage`, `bundle.make_bundle`: the studio's page with one field, as a folder or a single file.
 - `gltf.write_gltf`: the object (`geometry`) and its modes in the draft extension KHR_audio_rigid_bodies.

@@ -35,8 +35,9 @@ def write_faust(
     """
     path = Path(path)
     check_suffix(path, FORMATS["faust"].suffixes)
-    held, with_noise = len(field), noise and bool(field.noise.any())
+    held, with_noise, reason = len(field), noise and bool(field.noise.any()), ""
     if contacts is None:
+        reason = ": Faust compiles few in reasonable time"
         contacts, with_noise = _compiled(field, noise=with_noise)
     field = field if held <= contacts else field.take(field.spread(contacts))
     text = faust_library(field, noise=with_noise)
@@ -46,9 +47,7 @@ def write_faust(
     if not field.shared_damping:
         remarks.append("dampings are those of the last contact, for earlier impacts too")
     if len(field) < held:
-        remarks.append(
-            f"{len(field)} of {held} contacts are written, evenly spread: Faust compiles few in reasonable time"
-        )
+        remarks.append(f"{len(field)} of {held} contacts are written, evenly spread{reason}")
     if with_noise:
         remarks.append("the noise restarts with every impact")
     elif field.noise.any():

@@ -1,13 +1,16 @@
 """A field in any format of other tools, by the ending of a file's name or the format's."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from avmsf._utils.text import counted
 from avmsf.errors import ExportError
 from avmsf.export import write_demo, write_faust, write_gltf, write_grid, write_universal, write_webpage
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Format, Written
+from avmsf.field.positions import points_on_object
 from avmsf.field.sound_field import SoundField
 
 _OF_SUFFIX: dict[str, Format] = {suffix: name for name, each in FORMATS.items() for suffix in each.suffixes}
@@ -55,4 +58,9 @@ def write(
     sampled = SampledField.of(field, limit=FORMATS[kind].points if contacts is None else contacts)
     if kind == "wavs" or (kind == "faust" and contacts is not None):
         options = {"contacts": len(sampled), **options}
-    return WRITERS[kind](sampled, output, **options)
+    written = WRITERS[kind](sampled, output, **options)
+    held = len(points_on_object(field.gain_field))
+    if contacts is not None or len(sampled) == held:
+        return written
+    remark = f"written: {len(sampled)} of the field's {counted(held, 'contact')}; contacts= sets the number"
+    return replace(written, remarks=(remark, *written.remarks))
