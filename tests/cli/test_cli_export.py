@@ -99,6 +99,18 @@ def test_faust_gets_what_it_compiles_unless_asked_for_more(
     assert "noiseDraw" not in export(field_file, "faust", tmp_path / "b.dsp", "--contacts", 3, "--no-noise").read_text()
 
 
+def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    export(field_file, "faust", tmp_path / "a.dsp", "--contacts", 7, "--json")
+    contacts = Path(json.loads(capsys.readouterr().out)["contacts"])
+    folder = export(field_file, "wavs", tmp_path / "w", "--contacts", 7, "--seconds", 0.01)
+    one, other = (
+        {row["contact"]: [row[axis] for axis in "xyz"] for row in table_of(path)}
+        for path in (contacts, folder / "samples.csv")
+    )
+    assert len(one) == 7
+    assert one == other
+
+
 def test_the_demo_has_the_given_gaussians(field_file: Path, tmp_path: Path) -> None:
     cloud = gaussians(tmp_path / "plate.ply")
     demo = export(field_file, "avmsf-demo", tmp_path / "demo", "--object", tmp_path / "plate.ply")

@@ -2,10 +2,14 @@
 
 import csv
 import math
+import multiprocessing
 import os
+import random
 import shutil
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -21,6 +25,7 @@ from factories.raising import raises
 from factories.verbs import results_of, run_verb
 
 Streams = pytest.CaptureFixture[str]
+NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
 SMOOTH = ("--gain-model", "smooth", "--train-count", "5", *TINY)
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
@@ -152,3 +157,26 @@ def test_pages_of_many_have_the_captures_of_their_names(
     together = ["export", *fields[:2], *words, str(captures[0].parent), "-o", str(tmp_path / "pages")]
     assert states(capsys, *together) == {"a": "done", "b": "done"}
     assert (tmp_path / "pages" / "a.html").read_bytes() == (tmp_path / "alone.html").read_bytes()
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_change_nothing(captures: tuple[Path, ...], tmp_path: Path) -> None:
+    chance, killed = random.Random(0), list[int | None]()
+    alone = fields_one_by_one(captures, tmp_path / "alone", *NETWORK)
+
+    def kill() -> None:
+        while len(killed) < 3:
+            time.sleep(chance.uniform(0, 3))
+            running = multiprocessing.active_children()
+            if running:
+                victim = chance.choice(running)
+                victim.kill()
+                killed.append(victim.pid)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    assert main(fit(captures, tmp_path / "many", *NETWORK, "--workers", "2")) == 0
+    killer.join()
+    assert len(set(killed)) == 3
+    for name, content in alone.items():
+        assert (tmp_path / "many" / name).read_bytes() == content

@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from avmsf.fem.material import MATERIALS
 from avmsf.field.gains import elastic as module
 from avmsf.field.gains.elastic import (
     EQUAL_PRIOR,
@@ -98,6 +99,17 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     found = elastic.factor
     # The frequencies are exact, and the factors considered 1 % apart.
     assert abs(math.log(found / factor)) <= 0.01
+
+
+@pytest.mark.parametrize("factor", [0.067, 1.8])
+def test_no_factor_is_considered_that_no_material_has(factor):
+    """Of the table, with 5 % for frequencies of real bodies and 20 % for the thickness: plastic to ceramic."""
+    sites = impacts(12, seed=1)
+    given, gains = families(sites), measured(sites, factor=factor)
+    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
+    (body,) = (each for each in given if isinstance(each, Elastic))
+    slowest, *_, fastest = sorted(math.sqrt(each.young / each.density / (7e10 / 2700)) for each in MATERIALS.values())
+    assert slowest / 1.05 / 1.2 <= body.factor <= fastest * 1.05 * 1.2
 
 
 @pytest.mark.parametrize(("ratio", "unit"), [(1.0, 0), (0.3048, 1), (0.0254, 2), (0.01, 3)])
