@@ -75,7 +75,7 @@ def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64
     return bank.frequency.log2().numpy(), bank.damping.log2().numpy()
 
 
-def expect_materials(known: Collection[str], *, name: str = "materials") -> None:
+def check_materials(known: Collection[str], *, name: str = "materials") -> None:
     """Raise EvaluationError, about `name`, for fewer objects or materials than an embedding takes."""
     if len(known) < _MIN_OBJECTS or len(set(known)) < 2:
         found, wanted = (len(known), len(set(known))), f"{_MIN_OBJECTS} objects or more, of two known materials or more"
@@ -114,7 +114,7 @@ class MaterialSpace:
         for name, labels in (("materials", materials), ("names", names)):
             if len(labels) != len(mode_sets):
                 raise EvaluationError.expected(f"one for each of {len(mode_sets)} sets", len(labels), name=name)
-        expect_materials(materials)
+        check_materials(materials)
         vectors = []
         for name, bank in zip(names, mode_sets, strict=True):
             try:

@@ -21,7 +21,7 @@ from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.editing import TRANSITIONS, materials_of
 from avmsf.evaluation.modal_metrics import simulated
-from avmsf.evaluation.mode_embedding import expect_materials
+from avmsf.evaluation.mode_embedding import check_materials
 from avmsf.evaluation.registry import Protocol
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
@@ -207,7 +207,7 @@ def choose_objects(dataset: Dataset, protocol: Protocol, asked: Sequence[str] = 
     """
     materials = materials_of(dataset) if protocol.scoring == "edits" else {}
     if protocol.scoring == "edits":
-        expect_materials(materials.values(), name=protocol.name)
+        check_materials(materials.values(), name=protocol.name)
     if asked:
         return tuple(dict.fromkeys(dataset.facts(identifier).identifier for identifier in asked))
     if protocol.scoring == "edits":

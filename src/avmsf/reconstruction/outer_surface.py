@@ -157,9 +157,9 @@ def _seen_through(
     steps = np.arange(-sum(grid.shape), sum(grid.shape) + 1)[:, None]
     shape = np.array(grid.shape)
     for camera in cameras:
-        ways = rows - (camera.position.double().cpu().numpy() - grid.lowest) / grid.spacing
-        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-        cells = np.rint(rows[:, None] + steps * ways[:, None]).astype(int)
+        directions = rows - (camera.position.double().cpu().numpy() - grid.lowest) / grid.spacing
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        cells = np.rint(rows[:, None] + steps * directions[:, None]).astype(int)
         cells[~((cells >= 0) & (cells < shape)).all(2)] = 0
         within = inside[tuple(cells.T)].T
         numbers = openings[tuple(cells.T)].T
