@@ -202,8 +202,10 @@ def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) 
     slow = read_sound(tmp_path / "slow")
     assert (slow.sample_rate, slow.frames) == (8000.0, 20 * 4000)
     write_flac(tmp_path / "silent", torch.zeros(100), sample_rate=8000.0, gain=listening_gain(torch.zeros(100)))
-    with raises(EvaluationError, file=tmp_path / "gone"):
-        read_sound(tmp_path / "gone")
+    (tmp_path / "damaged").write_bytes(b"no sound")
+    for name in ("gone", "damaged"):
+        with raises(EvaluationError, file=tmp_path / name):
+            read_sound(tmp_path / name)
 
 
 def test_a_pictures_line_is_where_the_tone_is(tmp_path: Path) -> None:

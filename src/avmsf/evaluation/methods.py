@@ -24,11 +24,11 @@ from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
 from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published, folder_digest
 from avmsf.baselines.sonicgauss.small import SmallWeights, fit_small
 from avmsf.baselines.sonicgauss.training import TunedRenderer
+from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts, rows_by_place
-from avmsf.errors import EvaluationError, FitError
+from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.evaluation.metrics import envelope_distance
 from avmsf.evaluation.registry import kind_of, method_entry, resolve
-from avmsf.evaluation.results import read_sound
 from avmsf.evaluation.simple_methods import (
     MeanGains,
     MeanWaveform,
@@ -245,7 +245,10 @@ class Recorded:
         )
 
     def _read(self, path: Path) -> Float[Tensor, " samples"]:
-        recording = read_sound(path)
+        try:
+            recording = read_recording(path)
+        except CaptureError as error:
+            raise EvaluationError(str(error), **{**error.attributes, "file": path}) from error
         found = recording.frames, recording.sample_rate, len(np.unique(recording.channels, axis=0))
         if found != (self.task.train.sounds.shape[1], self.sample_rate, 1):
             shown = f"{found[0]} samples at {found[1]:g} Hz in {found[2]} different channels"

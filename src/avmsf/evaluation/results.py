@@ -202,11 +202,13 @@ def write_flac(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: flo
 
 
 def read_sound(path: Path) -> Recording:
-    """Read a sound file. Raises EvaluationError where it is gone or damaged."""
+    """Read a stored sound. Raises EvaluationError where it is gone or damaged."""
     try:
         return read_recording(path)
     except CaptureError as error:
-        raise EvaluationError(str(error), **{**error.attributes, "file": path}) from error
+        advice = "delete the object's file to compute it again"
+        got = "none" if not path.exists() else "a damaged one"
+        raise EvaluationError.expected("a stored sound", got=got, file=path, advice=advice) from error
 
 
 _AGAIN = "delete the file to compute them again, or choose another --output"
