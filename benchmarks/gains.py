@@ -95,11 +95,11 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
     """Errors on simulated objects, 8 training contacts; on exact meshes with fewer contacts too.
 
     Contacts are farthest-point samples of 40, from the first. tidy: recordings that need no alignment; noisy: meshes
-    whose vertices are off by .3 % of the size (standard deviation, each axis); photographs: shapes from 72 photographs;
-    with the errors from the exact mesh and what they are over; offset: these shapes, and contacts 2 mm off in random
-    directions. modal: error of the modes alone against the true ones, without noise; l1, l1_log, envelope: ratios to
-    the mean of the three nearest, of which means are geometric; located: median distance of held-out contacts from
-    where their recordings are located, over the diagonal, and in millimeters.
+    whose vertices are off by .3 % of the size (standard deviation, each axis); photographs: shapes from 72 photographs
+    (mesh: errors from the exact mesh; over_mesh: the error over that); offset: these shapes, and contacts 2 mm off in
+    random directions. modal: error of the modes alone against the true ones, without noise; l1, l1_log, envelope:
+    ratios to the mean of the three nearest, of which means are geometric; located: median distance of held-out contacts
+    from where their recordings are located, over the diagonal, and in millimeters.
     """
     rows, exact = [], []
     for name in settings.objects or settings.some(tuple(objects.SETS[of])):

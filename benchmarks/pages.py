@@ -85,27 +85,37 @@ def _parts(names: Sequence[str], options: Mapping[str, str], said: set[str]) -> 
 
 
 def _results() -> Iterator[str]:
-    """Yield the table of results, and what of it is missing."""
-    rows, used = [], list[Record]()
+    """Yield the table of results, without methods that have none, and what of it is missing."""
+    rows, used, asked = list[tuple[str, list[Record | None]]](), list[Record](), dict[str, None]()
     for title, group, thing, end in RESULTS:
         part, _, count = group.rpartition(".")
         known = {(each.name, each.object): each for own in (part, "align.errors") for each in _records(own)}
         names = [[name.format(group=group, count=count, end=end) for name in column] for column in METHODS.values()]
         cells = [next((known[name, thing] for name in column if (name, thing) in known), None) for column in names]
+        asked |= dict.fromkeys(_part_of(name) for column in names for name in column)
         if any(cells):
-            rows.append([title, *(DASH if each is None else in_digits(each.value) for each in cells)])
+            rows.append((title, cells))
             used += filter(None, cells)
-    yield "\n".join(f"| {' | '.join(line)} |" for line in ([" ", *METHODS], ["---"] * (1 + len(METHODS)), *rows))
-    sources = dict.fromkeys(".".join(each.name.split(".")[:2]) for each in used)
+    shown = [column for column in range(len(METHODS)) if any(cells[column] for _, cells in rows)]
+    lines = [[" ", *(list(METHODS)[column] for column in shown)], ["---"] * (1 + len(shown))]
+    for title, cells in rows:
+        found = [cells[column] for column in shown]
+        lines.append([title, *(DASH if each is None else in_digits(each.value) for each in found)])
+    yield "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    sources = dict.fromkeys(_part_of(each.name) for each in used)
     yield "; ".join(f"{_command([part])}, commit {_commits(_records(part))}" for part in sources)
-    yield from _missing(dict.fromkeys(group.rpartition(".")[0] for _, group, *_ in RESULTS))
+    yield from _missing(asked)
+
+
+def _part_of(name: str) -> str:
+    return ".".join(name.split(".")[:2])
 
 
 def _missing(names: Iterable[str]) -> Iterator[str]:
     """Yield the sentence on parts without records, if any."""
     missing = [each for each in names if not _records(each)]
     if missing:
-        yield f"Not measured at this commit: {_command(missing)}"
+        yield f"No records yet of: {_command(missing)}"
 
 
 def _overview() -> Iterator[str]:

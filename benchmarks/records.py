@@ -189,8 +189,8 @@ def _table(columns: Sequence[str], rows: Mapping[str, Mapping[str, Record]]) -> 
     known = {each: row[each] for row in rows.values() for each in columns if each in row}
     noted = any(record.note for row in rows.values() for record in row.values())
     arrows = {"lower": " ↓", "higher": " ↑", "": ""}
-    firsts = [(each, known[each]) for each in columns]
-    heads = [f"{each}{', ' * bool(first.unit)}{first.unit}{arrows[first.better]}" for each, first in firsts]
+    firsts = [(each, known.get(each)) for each in columns]
+    heads = [each if of is None else f"{each}{', ' * bool(of.unit)}{of.unit}{arrows[of.better]}" for each, of in firsts]
     yield "| " + " | ".join(["", *heads, *["note"] * noted]) + " |"
     yield "|---" * (1 + len(heads) + noted) + "|"
     for label, row in rows.items():
@@ -203,5 +203,6 @@ def in_digits(value: float) -> str:
     """Return a value in three digits, whole numbers and large ones in theirs, without a 0 before the point."""
     if not math.isfinite(value):
         return DASH
-    text = f"{value:.0f}" if abs(value) >= 1e3 or value == round(value) else f"{value:#.3g}"
+    # In three digits 999.5 is a thousand.
+    text = f"{value:.0f}" if abs(value) >= 999.5 or value == round(value) else f"{value:#.3g}"
     return re.sub(r"^(-?)0\.", r"\1.", text).removesuffix(".")
