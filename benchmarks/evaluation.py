@@ -44,8 +44,9 @@ def _evaluate(
             wanted = {each: replace(SIM20[each], views=0, sample_rate=rate, seconds=seconds) for each in chosen}
             simulate_set(wanted, objects)
         else:
-            # The folder may hold objects of other sets, which would be embedded too.
-            objects = Path(stack.enter_context(TemporaryDirectory()))
+            # The folder may hold objects of other sets, which would be embedded too. Results keep the folder's name.
+            objects = Path(stack.enter_context(TemporaryDirectory())) / "objects"
+            objects.mkdir()
             for each in chosen:
                 (objects / each).symlink_to(simulated_folder(each, settings).resolve())
         output = folder / code_commit() / f"{'quick-' * settings.quick}{'paper-' * paper}{protocol}"
