@@ -116,6 +116,14 @@ def test_covariances_are_those_of_the_most_probable_hypothesis(make):
         assert float(torch.linalg.eigvalsh(covariance).min()) > -1e-9 * noise
 
 
+def test_shares_are_of_the_families_that_modes_come_from():
+    shares = model().shares()
+    assert torch.allclose(shares.sum(0), torch.ones(MODES, dtype=torch.float64))
+    kinds = [family.kind for family in model().families]
+    assert [kinds[row] for row in shares.argmax(0).tolist()][:4] == ["elastic", "smooth", "elastic", "elastic"]
+    assert float(shares.amax(0)[:4].min()) > 0.9
+
+
 def test_one_contact_leaves_families_as_probable_as_they_were():
     """Its gain may be of any scale, so it says nothing of the kernels; families of one kind share its probability."""
     sites = impacts(1, seed=1)
