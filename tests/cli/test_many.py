@@ -167,7 +167,7 @@ def test_workers_that_are_killed_change_nothing(captures: tuple[Path, ...], tmp_
     def kill() -> None:
         while len(killed) < 3:
             time.sleep(chance.uniform(0, 3))
-            running = multiprocessing.active_children()
+            running = [each for each in multiprocessing.active_children() if each.pid not in killed]
             if running:
                 victim = chance.choice(running)
                 victim.kill()
@@ -177,6 +177,5 @@ def test_workers_that_are_killed_change_nothing(captures: tuple[Path, ...], tmp_
     killer.start()
     assert main(fit(captures, tmp_path / "many", *NETWORK, "--workers", "2")) == 0
     killer.join()
-    assert len(set(killed)) == 3
     for name, content in alone.items():
         assert (tmp_path / "many" / name).read_bytes() == content

@@ -25,7 +25,7 @@ note = display.note
 doing = display.doing
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, words: int = 1) -> str:
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], *, words: int = 1) -> str:
     """Return a table as text; its first `words` columns are words, set left, the others figures, set right."""
     cells = [list(map(str, row)) for row in (columns, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
