@@ -119,22 +119,13 @@ def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
     joint = torch.from_numpy(joint_kernels().copy())
     cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
     mean = torch.einsum("hpc,hcs->ps", cross, mixture().solve())
-    spread = (own.mT @ mixture().scale + mixture().explained(cross) - mean.square()).sqrt()
+    spread = (mixture().second_moment(cross, own) - mean.square()).sqrt()
     for series in range(SERIES):
         expected = textbook_prediction(
             list(range(CONTACTS)), list(range(CONTACTS, CONTACTS + PLACES)), series, noise=False
         )
         assert mean[:, series].numpy() == pytest.approx(expected.mean, rel=1e-8, abs=1e-10)
         assert spread[:, series].numpy() == pytest.approx(expected.deviation, rel=1e-6)
-
-
-def test_covariances_of_few_factors_explain_as_much_by_their_quadratic_forms():
-    generator = torch.Generator().manual_seed(4)
-    loadings = torch.randn(KERNELS - 1, CONTACTS, 3, generator=generator, dtype=torch.float64)
-    factors = torch.randn(PLACES, 3, generator=generator, dtype=torch.float64)
-    forms = mixture().explained_forms(range(1, KERNELS), lambda rows: loadings[rows])
-    found = torch.einsum("pf,sfg,pg->ps", factors, forms, factors)
-    assert torch.allclose(found, mixture().explained(factors @ loadings.mT, 1), rtol=1e-9)
 
 
 def test_the_prior_of_the_scale_is_integrated_over():

@@ -120,27 +120,9 @@ class Elastic(KernelFamily):
 
     def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
         """Return the kernels between two sets of impacts."""
-        one, other = self._along(sites), self._along(others)
-        found = self._residual_kernel(sites, others) * self.shares[:, -1, None, None]
-        # As one product where few impacts make it small, else kernel by kernel: the basis would be far larger.
-        if found[0].numel() * one.shape[1] <= _MEMORY:
-            pairs = (one.T[:, :, None] * other.T[:, None]).flatten(1)
-            return found + (self.shares[:, :-1] @ pairs).reshape(found.shape)
-        for row, share in enumerate(self.shares[:, :-1]):
-            found[row] += (one * share) @ other.T
-        return found
-
-    def factors(self, sites: Sites, known: Sites) -> Float64[Tensor, "sites factors"]:
-        """Return vectors z of impacts, for which each kernel's covariances with the known ones are `loadings` times z.
-
-        They are the components of each shape, and the remainder's kernel with each known impact.
-        """
-        return torch.cat([self._along(sites), self._residual_kernel(sites, known)], dim=1)
-
-    def loadings(self, known: Sites, rows: Int[Tensor, " rows"]) -> Float64[Tensor, "rows known factors"]:
-        """Return the matrix of each of some kernels that gives covariances with known impacts from `factors`."""
-        shares, one = self.shares[rows][:, None], torch.eye(len(known), dtype=torch.float64)
-        return torch.cat([shares[..., :-1] * self._along(known), shares[..., -1:] * one], dim=2)
+        one, other = self._along(sites), self.shares[:, :-1][:, None] * self._along(others)
+        mixed = (one @ other.flatten(0, 1).T).reshape(len(one), *other.shape[:2]).transpose(0, 1)
+        return mixed + self._residual_kernel(sites, others) * self.shares[:, -1, None, None]
 
     def mean(
         self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]

@@ -26,7 +26,7 @@ to series. So a series whose few values say little borrows from the others (MacK
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -139,13 +139,6 @@ class KernelMixture:
         """The values along the eigenvectors, z = U' y."""
         return self.eigen[1].mT @ self.values
 
-    @cached_property
-    def scale(self) -> Float64[Tensor, "kernels series"]:
-        """The sum over noise shares of weight times s^2, the variance of a kernel of one."""
-        found = torch.zeros(len(self.kernels), self.values.shape[1], dtype=torch.float64)
-        pairs = self._pairs
-        return found.index_put_((pairs.kernel, pairs.series), pairs.weight * pairs.scale, accumulate=True)
-
     def solve(self) -> Float64[Tensor, "kernels contacts series"]:
         """Return the sum over noise shares of weight times C^-1 y: a mean at a place is k' times it, over kernels."""
         pairs = self._pairs
@@ -213,40 +206,18 @@ class KernelMixture:
         variance = scale[:, None] * (own - pairs.variance[:, None]).clamp_min(0.0)
         return weights, error, variance, scale * pairs.variance
 
-    def explained(
-        self, cross: Float64[Tensor, "some places contacts"], first: int = 0
+    def second_moment(
+        self, cross: Float64[Tensor, "kernels places contacts"], own: Float64[Tensor, "kernels places"]
     ) -> Float64[Tensor, "places series"]:
-        """Return the sum over hypotheses of weight times (k' C^-1 y)^2 - s^2 k' C^-1 k, of kernels from `first` on.
+        """Return the mean square at places, without noise.
 
-        `cross` holds each of these kernels' covariances between places and contacts.
+        `cross` holds each kernel's covariances between places and contacts, `own` its variance at each place.
         """
-        total = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
-        for row, each in enumerate(cross, first):
-            pairs, along = self._by_kernel[row], each @ self.eigen[1][row]
-            found = (along @ pairs.solved.T).square_().sub_(along.square() @ (pairs.scale[:, None] * pairs.inverse).T)
-            total.index_add_(1, pairs.series, found.mul_(pairs.weight))
-        return total
-
-    def explained_forms(
-        self, kernels: range, loadings: Callable[[Int[Tensor, " some"]], Float64[Tensor, "some contacts factors"]]
-    ) -> Float64[Tensor, "series factors factors"]:
-        """Return for each series the symmetric matrix N by which `explained` of some kernels is z' N z.
-
-        A kernel's covariances between a place and the contacts are its loadings times the place's factors z. `loadings`
-        takes the numbers of kernels, counted from the first.
-        """
-        inside = (self._pairs.kernel >= kernels.start) & (self._pairs.kernel < kernels.stop)
-        forms = []
-        for series in range(self.values.shape[1]):
-            pairs = self._pairs.take(torch.nonzero(inside & (self._pairs.series == series)).flatten())
-            rows, place = torch.unique(pairs.kernel, return_inverse=True)
-            each = pairs.solved[:, :, None] * pairs.solved[:, None]
-            torch.diagonal(each, dim1=1, dim2=2).sub_(pairs.scale[:, None] * pairs.inverse)
-            middle = torch.zeros(len(rows), *each.shape[1:], dtype=torch.float64)
-            middle.index_add_(0, place, each.mul_(pairs.weight[:, None, None]))
-            along = self.eigen[1][rows].mT @ loadings(rows - kernels.start)
-            forms.append((middle @ along).flatten(0, 1).T @ along.flatten(0, 1))
-        return torch.stack(forms)
+        found = torch.zeros(self.values.shape[1], cross.shape[1], dtype=torch.float64)
+        for pairs, mean, within in self._predicted(cross, own):
+            square = pairs.weight[..., None] * mean.square_().add_(within)
+            found.index_add_(0, pairs.series.flatten(), square.flatten(0, 1))
+        return found.T
 
     def mean_magnitude(
         self,
@@ -256,20 +227,26 @@ class KernelMixture:
     ) -> Float64[Tensor, "places series"]:
         """Return the mean magnitude at places, of which `share` takes the deviation within hypotheses into account.
 
-        The rest is the mean over hypotheses of the magnitude of each one's mean. `cross` holds each kernel's
-        covariances between places and contacts, `own` its variance at each place.
+        The rest is the mean over hypotheses of the magnitude of each one's mean. `cross` and `own` as in
+        `second_moment`.
         """
-        found = torch.zeros(cross.shape[1], self.values.shape[1], dtype=torch.float64)
-        for rows, pairs in self._padded:
-            along = cross[rows] @ self.eigen[1][rows]
-            mean = along @ pairs.solved.mT
+        found = torch.zeros(self.values.shape[1], cross.shape[1], dtype=torch.float64)
+        for pairs, mean, within in self._predicted(cross, own):
             magnitude = mean.abs()
             if share:
-                within = (own[rows][..., None] - along.square() @ pairs.inverse.mT).clamp_min_(0.0)
-                magnitude = magnitude.lerp(_mean_magnitude(mean, pairs.scale[:, None] * within), share)
-            magnitude = magnitude.mul_(pairs.weight[:, None]).transpose(0, 1).flatten(1)
-            found.index_add_(1, pairs.series.flatten(), magnitude)
-        return found
+                magnitude = magnitude.lerp(_mean_magnitude(mean, within.clamp_min_(0.0)), share)
+            magnitude *= pairs.weight[..., None]
+            found.index_add_(0, pairs.series.flatten(), magnitude.flatten(0, 1))
+        return found.T
+
+    def _predicted(
+        self, cross: Float64[Tensor, "kernels places contacts"], own: Float64[Tensor, "kernels places"]
+    ) -> Iterator[tuple["_Pairs", Float64[Tensor, "some pairs places"], Float64[Tensor, "some pairs places"]]]:
+        """Yield the hypotheses of some kernels [kernels, pairs], with their means and variances at places."""
+        for rows, pairs in self._padded:
+            along = (cross[rows] @ self.eigen[1][rows]).mT
+            variance = pairs.scale[..., None] * (own[rows][:, None] - pairs.inverse @ along.square())
+            yield pairs, pairs.solved @ along, variance
 
     @cached_property
     def _pairs(self) -> "_Pairs":
@@ -282,11 +259,6 @@ class KernelMixture:
         weight, scale = self.weights[kernel, noise, series], quadratic / len(self.values)
         return _Pairs(kernel, series, weight, variance, inverse, projected * inverse, quadratic, scale)
 
-    @cached_property
-    def _by_kernel(self) -> list["_Pairs"]:
-        counts = torch.bincount(self._pairs.kernel, minlength=len(self.kernels)).tolist()
-        return [_Pairs(*each) for each in zip(*(torch.split(part, counts) for part in self._pairs), strict=True)]
-
     def _summed(self, values: Float64[Tensor, "pairs *rest"]) -> Float64[Tensor, "series *rest"]:
         """Return the sum over each series' `_pairs`."""
         total = torch.zeros(self.values.shape[1], *values.shape[1:], dtype=torch.float64)
@@ -295,10 +267,11 @@ class KernelMixture:
     @cached_property
     def _padded(self) -> list[tuple[Tensor, "_Pairs"]]:
         """Rows of kernels of about as many `_pairs`, and these, [kernels, pairs], filled with weights of zero."""
-        order = torch.argsort(torch.tensor([len(each.kernel) for each in self._by_kernel]), stable=True)
+        counts = torch.bincount(self._pairs.kernel, minlength=len(self.kernels))
+        by_kernel = list(zip(*(torch.split(part, counts.tolist()) for part in self._pairs), strict=True))
         found = []
-        for rows in torch.split(order, _TOGETHER):
-            parts = zip(*(self._by_kernel[row] for row in rows.tolist()), strict=True)
+        for rows in torch.split(torch.argsort(counts, stable=True), _TOGETHER):
+            parts = zip(*(by_kernel[row] for row in rows.tolist()), strict=True)
             found.append((rows, _Pairs(*(pad_sequence(list(part), batch_first=True) for part in parts))))
         return found
 

@@ -25,12 +25,8 @@ from avmsf.symmetry.characters import Group
 
 NEIGHBORS = 3
 """Nearest recordings that are averaged, as in the paper's baseline."""
-_MEMORY = 16_000_000
-"""Covariances between places and contacts that are held at once, over all kernels."""
-_FORM_ENTRIES = 16_000_000
-"""Largest number of entries of one family's matrices for the variance, which are kept: 128 MB."""
-_PRODUCTS = 64
-"""Sites whose products of factors are held at once."""
+_MEMORY = 2_000_000
+"""Covariances between places and contacts that are held at once, over all kernels: near a processor's cache."""
 _COVARIANCE_KERNELS = 8
 """Kernels whose covariances between places are held at once."""
 _OF_OBJECT = {Elastic.kind: "bodies", Symmetric.kind: "symmetries", Visual.kind: "features"}
@@ -347,48 +343,18 @@ class MixtureGains(GainModel):
         return torch.stack(means).sum(0)
 
     def _magnitude(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        cross = torch.cat([family.between(sites, self.training) for family in self.families])
-        own = torch.cat([family.own(sites) for family in self.families])
-        return self.mixture.mean_magnitude(cross, own, self.spread_share)
+        return self.mixture.mean_magnitude(*self._covariances(sites), self.spread_share)
 
     def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        mean, first = self._mean(sites), 0
-        second, scales = torch.zeros_like(mean), torch.split(self.mixture.scale, list(map(len, self.families)))
-        for family, form, scale in zip(self.families, self._forms, scales, strict=True):
-            second += family.own(sites).mT @ scale
-            if form is None:
-                second += self.mixture.explained(family.between(sites, self.training), first)
-            else:
-                elastic, forms = form
-                factors = elastic.factors(sites, self.training)
-                # Products of two factors, each pair once: half of what the matrices times the factors would take.
-                first_of, second_of = torch.triu_indices(factors.shape[1], factors.shape[1])
-                parts = torch.split(factors, _PRODUCTS)
-                second += torch.cat([(part[:, first_of] * part[:, second_of]) @ forms for part in parts])
-            first += len(family)
-        return (second - mean.square()).clamp_min(0.0).sqrt()
+        square = self.mixture.second_moment(*self._covariances(sites))
+        return (square - self._mean(sites).square()).clamp_min(0.0).sqrt()
 
-    @cached_property
-    def _forms(self) -> list[tuple[Elastic, Float64[Tensor, "_pairs series"]] | None]:
-        """`KernelMixture.explained_forms` by pairs of factors, those of two different ones twice, and their family.
-
-        None for other families, and for one that has fewer kernels than factors or whose matrices would exceed
-        `_FORM_ENTRIES`: its covariances with the training impacts, kernel by kernel, are cheaper.
-        """
-
-        def form(family: KernelFamily, first: int) -> tuple[Elastic, Tensor] | None:
-            if not isinstance(family, Elastic):
-                return None
-            count = family.shares.shape[1] - 1 + len(self.training)
-            if count >= len(family) or self.mixture.values.shape[1] * count**2 > _FORM_ENTRIES:
-                return None
-            kernels = range(first, first + len(family))
-            forms = self.mixture.explained_forms(kernels, lambda rows: family.loadings(self.training, rows))
-            row, column = torch.triu_indices(count, count)
-            return family, (forms[:, row, column] * torch.where(row == column, 1.0, 2.0)).T.contiguous()
-
-        firsts = accumulate(map(len, self.families), initial=0)
-        return [form(*each) for each in zip(self.families, firsts, strict=False)]
+    def _covariances(
+        self, sites: Sites
+    ) -> tuple[Float64[Tensor, "kernels sites contacts"], Float64[Tensor, "kernels sites"]]:
+        """Return each kernel's covariances between sites and the training impacts, and its variance at each site."""
+        cross = [family.between(sites, self.training) for family in self.families]
+        return torch.cat(cross), torch.cat([family.own(sites) for family in self.families])
 
     def _batched(self, compute: Callable[[Sites], Tensor], sites: Sites) -> Float64[Tensor, "sites series"]:
         """Return what is computed of sites, in batches whose covariances fit the memory."""
