@@ -23,7 +23,6 @@ from factories.raising import raises
 CONFIG = replace(
     QUICK, damping="validated", warmup_steps=3, steps=11, clusters=4, hidden=16, width=8, fft_sizes=(256,), early=256
 )
-"""Looks at the validation contacts are taken after the steps 3, 13 and 14."""
 STAGES = ("trial with shared damping", "trial with per-contact damping", "fit")
 
 
@@ -34,8 +33,8 @@ def fitted(
 
 
 @cache
-def uninterrupted(config: FitConfig = CONFIG) -> SoundField:
-    return fitted(None, config=config)
+def uninterrupted() -> SoundField:
+    return fitted(None)
 
 
 def expect_same(field: SoundField, other: SoundField) -> None:
@@ -61,7 +60,7 @@ class Interruption:
             raise KeyboardInterrupt
 
 
-# In warm-up, at the change of stages, between looks, before a look, at the last step.
+# In warm-up, at the change of stages, amid the steps end to end, at the last one.
 @pytest.mark.parametrize(
     ("stage", "step"), [(STAGES[0], 1), (STAGES[0], 3), (STAGES[1], 8), (STAGES[2], 13), (STAGES[2], 14)]
 )
@@ -104,29 +103,6 @@ def test_an_interruption_in_the_middle_of_a_step_loses_no_more_than_it(tmp_path,
     # Half-moved parameters are no state to go on from: such a fit starts from what was saved before, here nothing.
     assert checkpoint.exists() == (name != "step")
     expect_same(fitted(checkpoint), uninterrupted())
-
-
-PATIENT = replace(CONFIG, damping="shared", patience=10, learning_rate=0.3, steps=90)
-
-
-def test_patience_survives_an_interruption(tmp_path):
-    stopped = uninterrupted(PATIENT).origin.report["steps"]
-    # Or nothing would have stopped it, and the interruption would never come.
-    assert stopped + 10 < 90
-    keys = Interruption((STAGES[0], 3 + stopped + 10))
-    with pytest.raises(KeyboardInterrupt):
-        fitted(tmp_path / "state", keys, config=PATIENT)
-    expect_same(fitted(tmp_path / "state", keys, config=PATIENT), uninterrupted(PATIENT))
-
-
-def test_a_look_that_was_cut_off_is_taken_again(tmp_path, monkeypatch):
-    stopped = uninterrupted(PATIENT).origin.report["steps"]
-    # Sounds are made once a step after the warm-up and once a look, of which the first comes before those steps.
-    with monkeypatch.context() as patch:
-        interrupt(patch, TrainingRun, "sounds", call=stopped + stopped // 10 + 1)
-        with pytest.raises(KeyboardInterrupt):
-            fitted(tmp_path / "state", config=PATIENT)
-    expect_same(fitted(tmp_path / "state", config=PATIENT), uninterrupted(PATIENT))
 
 
 def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):

@@ -185,27 +185,6 @@ def test_a_trial_does_not_learn_from_the_recordings_held_out():
     assert reports[0]["validation_spectral"] != reports[1]["validation_spectral"]
 
 
-def test_looking_more_often_changes_no_step(monkeypatch):
-    """The looks draw noise too, which must not be missing in the training's stream."""
-    losses: dict[int, list[float]] = {1: [], 100: []}
-    for every, seen in losses.items():
-        monkeypatch.setattr("avmsf.field.estimators.VALIDATION_STEPS", every)
-        plate_fit(VALIDATED, progress=lambda told, seen=seen: seen.append(told.loss))
-    assert losses[1] == losses[100]
-
-
-def test_patience_ends_a_trial_early_and_shortens_the_fit():
-    told: list[Progress] = []
-    # Steps far too long for the network to go on improving.
-    config = replace(QUICK, warmup_steps=20, warmup_rate=3e-2, learning_rate=0.3, steps=200, patience=10)
-    report = plate_fit(config, progress=told.append).origin.report
-    trial = [each.step for each in told if each.stage == "trial with shared damping"]
-    final = [each.step for each in told if each.stage == "fit"]
-    assert max(trial) < 220
-    assert report["steps"] < 200
-    assert max(final) == 20 + report["steps"]
-
-
 def test_noise_is_measured_after_training_or_trained():
     impacts, measured = plate_impacts(), plate_extraction(plate_impacts()).residual.magnitude
     field = long_fit()[0]
@@ -317,7 +296,7 @@ def test_steps_take_turns_at_the_frames(monkeypatch, every, turns):
     ("name", "value"),
     [
         *product(["clusters", "width", "hidden", "early", "interleave"], [0, -1]),
-        *product(["bands", "layers", "steps", "warmup_steps", "patience", "hop", "seed"], [-1]),
+        *product(["bands", "layers", "steps", "warmup_steps", "hop", "seed"], [-1]),
         *product(["correction_rate", "weight_decay", "early_weight"], [-0.1, math.inf, math.nan]),
         *product(["feature_scale", "warmup_rate", "learning_rate"], [0.0, -1.0, math.inf, math.nan]),
         *product(["validation"], [-0.1, 0.6, math.nan]),

@@ -15,6 +15,8 @@ GainModelName = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "
 ADDED_SETTINGS = {"positive_gains": False, "positive": False}
 """Settings of a fit and of the network that the first field files lack, and what they stand for there: files hold them
 only where they differ, so that earlier versions read all others."""
+REMOVED_SETTINGS = {"patience": 0}
+"""Settings of a fit that this version lacks and earlier ones have: files hold these values, and any are read."""
 _COUNTS = ("clusters", "width", "hidden", "interleave", "early")
 _POSITIVE = ("feature_scale", "warmup_rate", "learning_rate")
 
@@ -84,9 +86,6 @@ class FitConfig:
     """Weights of the modes' squared errors: the energy of a unit gain over time, or all equal (paper)."""
     steps: int = 150
     """Steps end to end on spectra (paper, eq. 14)."""
-    patience: int = 0
-    """Stop when the validation contacts have not improved for this many steps; 0 runs all steps. For the network alone:
-    the mixture begins with solved gains, and takes all of its steps."""
     fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
     """Resolutions of the spectral loss, samples at 44.1 and 48 kHz; other rates scale them in octaves."""
     hop: int = 0

@@ -14,15 +14,11 @@ from torch import Tensor
 from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.device import steps_between_losses
 from avmsf.errors import FieldFileError, FitError
-from avmsf.field.config import FitConfig
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import GainModel
 from avmsf.field.losses import spectral_loss
 from avmsf.field.training import Targets, TrainableGains, TrainingRun
 from avmsf.modal.spectra import envelope
-
-VALIDATION_STEPS = 10
-"""Steps between validations."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +53,7 @@ class Trainer:
         identity = {**identity, "device": device.type}
         self.checkpoint = Checkpoint(checkpoint, identity, what="the fit", raising=FieldFileError)
         state = self.checkpoint.read() or {"trials": {}, "running": None}
-        self.trials: dict[str, dict[str, Any]] = state["trials"]
+        self.trials: dict[str, dict[str, float]] = state["trials"]
         self.running: dict[str, Any] | None = state["running"]
 
     def run(
@@ -71,39 +67,34 @@ class Trainer:
         steps: int,
         held: tuple[GainData, Int[Tensor, " held"]] | None = None,
     ) -> TrainingRun:
-        """Train gains on recordings, for which they read `rows`; with `held`, note in `trials` how well they do there.
+        """Train gains on recordings, for which they read `rows`; with `held`, note in `trials` their errors there.
 
         Raises FitError for a run that diverges.
         """
-        # The cosine runs out where the run ends, for one that is meant to end early as well.
+        # The cosine of the steps' lengths runs out where the run ends.
         config = replace(data.config, warmup_steps=warmup, steps=max(1, steps))
         run = TrainingRun(network, replace(data, config=config), self.device)
         targets = Targets.of(data, rows, self.device)
-        validation = None if held is None else _Validation(Targets.of(*held, self.device), held[0], config)
         if self.running is not None and self.running["name"] == name:
             run.resume(self.running["run"])
-            if validation is not None:
-                validation.best = self.running["validation"]
         end, every = warmup + steps, steps_between_losses(self.device)
         try:
-            # First in the loop, so that a run which goes on takes the validation that an interruption may have cut off;
-            # a second one at the same step changes nothing.
-            while not (validation is not None and validation.stops(run, end)) and run.step < end:
+            while run.step < end:
                 loss = run.advance(targets)
                 if run.step % every == 0 or run.step in (warmup, end):
                     self._note(Progress(name, run.step, end, float(loss), warmup))
                 if self.checkpoint.due:
-                    self._save(name, run, validation)
+                    self._save(name, run)
+            if held is not None:
+                self.trials[name] = _errors_at(held[0], run, Targets.of(*held, self.device))
         except KeyboardInterrupt:
             # Amid a step's changes there is nothing to keep but what was saved before.
             if run.whole and run.finite:
-                self._save(name, run, validation)
+                self._save(name, run)
             raise
-        if validation is not None:
-            self.trials[name] = validation.best
-        else:
+        if held is None:
             # The work is done but the field is not saved yet: should that fail, it need not be done again.
-            self._save(name, run, None)
+            self._save(name, run)
         return run.cpu()
 
     def _note(self, progress: Progress) -> None:
@@ -114,36 +105,20 @@ class Trainer:
         if self.progress is not None:
             self.progress(progress)
 
-    def _save(self, name: str, run: TrainingRun, validation: "_Validation | None") -> None:
+    def _save(self, name: str, run: TrainingRun) -> None:
         # On a GPU the loss is read every few steps only: a fit may have diverged since, and could not go on from that.
         if self.checkpoint.path is not None and not run.finite:
             self._note(Progress(name, run.step, run.step, math.nan, 0))
-        running = {"name": name, "run": run.state(), "validation": None if validation is None else validation.best}
-        self.checkpoint.save({"trials": self.trials, "running": running})
+        self.checkpoint.save({"trials": self.trials, "running": {"name": name, "run": run.state()}})
 
 
-class _Validation:
-    """Held-out contacts, and how well a run predicts them: at its best step with patience, or at its last."""
-
-    def __init__(self, targets: Targets, held: GainData, config: FitConfig) -> None:
-        self.targets, self.envelope, self.config = targets, envelope(held.train.sounds), config
-        self.best: dict[str, Any] = {"spectral": math.inf, "envelope": math.inf, "steps": 0}
-
-    def stops(self, run: TrainingRun, end: int) -> bool:
-        """Note the errors where it is time, relative and ENV (paper, 4.2); return whether patience is at its end."""
-        done = run.step - self.config.warmup_steps
-        if done < 0 or (done % VALIDATION_STEPS and run.step != end):
-            return False
-        # Validation must not disturb the run: its noise comes from the same place in the stream every time.
-        state = run.generator.get_state()
-        with torch.no_grad():
-            sounds = run.sounds(self.targets.rows)
-            spectral = float(spectral_loss(sounds, self.targets.whole)) / len(self.config.fft_sizes)
-            distance = float((envelope(sounds.cpu()) - self.envelope).square().mean(1).sqrt().mean())
-        run.generator.set_state(state)
-        if not self.config.patience or spectral < self.best["spectral"]:
-            self.best = {"spectral": spectral, "envelope": distance, "steps": done}
-        return self.config.patience > 0 and done - self.best["steps"] >= self.config.patience
+@torch.no_grad()
+def _errors_at(held: GainData, run: TrainingRun, targets: Targets) -> dict[str, float]:
+    """Return a run's errors at contacts that it was not trained on, relative spectral ones and ENV (paper, 4.2)."""
+    sounds = run.sounds(targets.rows)
+    spectral = float(spectral_loss(sounds, targets.whole)) / len(targets.whole.resolutions)
+    distance = (envelope(sounds.cpu()) - envelope(held.train.sounds)).square().mean(1).sqrt().mean()
+    return {"spectral": spectral, "envelope": float(distance)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,13 @@
-"""The posterior of a field's gains: over the object, in a sound's spectrum, and against measured gains.
+"""The posterior of a field's gains: over the object, and in a sound's spectrum.
 
 All functions take edited fields as well as fitted ones.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
-from statistics import NormalDist
 
 import torch
-from jaxtyping import Complex128, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
@@ -17,7 +16,6 @@ from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains
 from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.modes import turned_like
 from avmsf.modal.residual_noise import interpolated
 
 LEVEL = 0.9
@@ -44,16 +42,6 @@ class SpectrumBand:
     """Upper end of the interval."""
     level: float
     """Probability of the interval of each band."""
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """How many measured gains lie within their credible intervals."""
-
-    plain: float
-    """Part of the gains, each counted alike."""
-    by_energy: float
-    """The same, each counted by its mode's energy."""
 
 
 def has_posterior(field: SoundField) -> bool:
@@ -129,7 +117,8 @@ def spectrum_band(
     as in `SoundField.render`, `seed` for the draws, by default 0. Raises as `fitted_mixture`, and FitError for a level
     that is not between 0 and 1.
     """
-    _expect_level(level)
+    if not 0.0 < level < 1.0:
+        raise FitError.expected("a probability between 0 and 1, such as 0.9", level, name="level")
     mean, spread = (each[0] for each in posterior(field, contact[None], None if direction is None else direction[None]))
     generator = generator_of(seed)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
@@ -143,37 +132,3 @@ def spectrum_band(
     lower, middle, upper = 10.0 * torch.log10((ordered / ordered[1].max().clamp_min(tiny)).clamp_min(tiny))
     middles = (edges[:-1] + edges[1:] - 1).double() / 2.0 * field.sample_rate / field.samples
     return SpectrumBand(middles, lower, middle, upper, level)
-
-
-def coverage(
-    field: SoundField,
-    contacts: Float[Tensor, "contacts 3"],
-    gains: Complex128[Tensor, "contacts modes"],
-    *,
-    directions: Float[Tensor, "contacts 3"] | None = None,
-    level: float = LEVEL,
-) -> Coverage:
-    """Return which part of the gains measured at other contacts lies in the interval of this level.
-
-    `gains` are relative to the phases of the field's modes, of each mode up to a phase that all contacts share, of each
-    contact up to their common sign where the field knows no directions of impacts. The interval is normal, with the
-    posterior standard deviation of a measured gain, so it holds the scatter of an impact as well. Raises as
-    `fitted_mixture`, and FitError for gains of other modes.
-    """
-    _expect_level(level)
-    model, scale = fitted_mixture(field), scale_of(field).square()[:, None]
-    if gains.shape != (shape := (len(contacts), len(field.bank))):
-        advice = "give gains of the contacts and of the field's modes"
-        raise FitError.expected(f"the shape {list(shape)}", list(gains.shape), name="gains", advice=advice)
-    predicted, deviation = posterior(field, contacts, directions)
-    spread = (deviation.square() + scale * model.noise().square()).sqrt()
-    parts = torch.view_as_real(turned_like(gains, torch.view_as_complex(predicted.contiguous())))
-    within = (parts - predicted).abs() <= NormalDist().inv_cdf(0.5 + level / 2.0) * spread
-    power = scale * torch.view_as_real(model.values).square().mean(0)
-    energy = (power / (4.0 * field.bank.damping[:, None])).expand_as(parts)
-    return Coverage(float(within.double().mean()), float((within * energy).sum() / energy.sum()))
-
-
-def _expect_level(level: float) -> None:
-    if not 0.0 < level < 1.0:
-        raise FitError.expected("a probability between 0 and 1, such as 0.9", level, name="level")

@@ -27,7 +27,7 @@ from avmsf._utils.text import RecordError, count_of, like, record_of, without_de
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfError, FieldFileError
-from avmsf.field.config import ADDED_SETTINGS, FitConfig
+from avmsf.field.config import ADDED_SETTINGS, REMOVED_SETTINGS, FitConfig
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
 from avmsf.field.header import FIELD, checked_report
@@ -113,12 +113,13 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
     _ = _background_force(record)
     skeleton = _skeleton(record)
-    origin = dict(like(record["origin"], {}, "origin"))
+    origin, config = dict(like(record["origin"], {}, "origin")), like(record["config"], {}, "config")
+    config = {name: value for name, value in config.items() if name not in REMOVED_SETTINGS}
     read = Origin(
         capture=like(origin["capture"], "", "origin.capture"),
         trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
         per_newton=like(origin["per_newton"], True, "origin.per_newton"),
-        config=record_of(FitConfig(), record["config"], "config", added=ADDED_SETTINGS),
+        config=record_of(FitConfig(), config, "config", added=ADDED_SETTINGS),
         report=checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
         settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
     )
@@ -190,7 +191,7 @@ def _record(field: SoundField) -> dict[str, Any]:
         "alignment": None
         if alignment is None
         else {"modes": len(alignment.phases.bank), "names": alignment.names, "keys": alignment.keys},
-        "config": without_defaults(asdict(field.origin.config), ADDED_SETTINGS),
+        "config": without_defaults(asdict(field.origin.config), ADDED_SETTINGS) | REMOVED_SETTINGS,
         "origin": origin | {"settings": asdict(field.origin.settings)},
     }
 

@@ -190,12 +190,11 @@ class Attention(GainEstimator):
         """Choose what the config leaves open on held-out training contacts, then train with all."""
         report = self._validated(data, trainer)
         network, rows = self.start(data, report["damping"])
-        steps = report.get("steps", data.config.steps)
-        run = trainer.run("fit", network, data, rows, warmup=data.config.warmup_steps, steps=steps)
+        run = trainer.run("fit", network, data, rows, warmup=data.config.warmup_steps, steps=data.config.steps)
         return FittedGains(network.finished(run.order), run, range(len(data.train)), report)
 
     def _validated(self, data: GainData, trainer: Trainer) -> dict[str, Any]:
-        """Return the form of the dampings and the number of steps, and how they were decided."""
+        """Return the form of the dampings, and how it was decided."""
         config, train = data.config, data.train
         dampings = (SHARED, PER_CONTACT) if config.damping == "validated" else (config.damping,)
         held = held_out(train.contacts, config.validation)
@@ -206,7 +205,7 @@ class Attention(GainEstimator):
             reason = f"fewer than {_MIN_PLACES} positions leave none to validate on"
         else:
             reason = "chosen on validation contacts" if held else "no positions are held out to validate on"
-        if few or not held or (len(dampings) == 1 and not config.patience):
+        if few or not held or len(dampings) == 1:
             return {"damping": dampings[0], "validated": False, "damping_reason": reason}
         learned, unseen = data.take([row for row in range(len(train)) if row not in held]), data.take(held)
         outcomes = {}
@@ -227,7 +226,6 @@ class Attention(GainEstimator):
             "validation_contacts": [train.names[row] for row in held],
             "validation_envelope": {damping: each["envelope"] for damping, each in outcomes.items()},
             "validation_spectral": {damping: each["spectral"] for damping, each in outcomes.items()},
-            "steps": outcomes[best]["steps"] if config.patience else config.steps,
         }
 
     def _features(self, data: GainData) -> FeatureField:
