@@ -40,7 +40,7 @@ def exports(settings: Settings) -> Iterator[Record]:
     """
     points, seconds = (20, 0.2) if settings.quick else (1000, 3.0)
     field = _drawn_field(points, seconds=seconds)
-    plain = replace(field, gains=field.gains.real + 0j, noise=torch.zeros_like(field.noise))
+    plain = replace(field.without_noise(), gains=field.gains.real + 0j)
     few, rows = field.take(field.spread(64)), field.spread(4)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

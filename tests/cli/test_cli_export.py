@@ -97,6 +97,9 @@ def test_faust_gets_what_it_compiles_unless_asked_for_more(
     with raises(AvmsfError, value=1840):
         export(field_file, "faust", output, "--overwrite", "--contacts", 64)
     assert "noiseDraw" not in export(field_file, "faust", tmp_path / "b.dsp", "--contacts", 3, "--no-noise").read_text()
+    manifest = json.loads((export(field_file, "web", tmp_path / "c", "--no-noise") / "manifest.json").read_text())
+    where = manifest["tensors"]["noise"]
+    assert not np.fromfile(tmp_path / "c" / "field.bin", "<f4", where["shape"][0], offset=where["offset"]).any()
 
 
 def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:

@@ -46,13 +46,17 @@ def struck(field: SampledField, row: int, **settings: object) -> np.ndarray:
 
 @compiled
 @pytest.mark.parametrize(
-    ("phased", "spatial", "noisy"), [(False, False, False), (True, False, True), (True, True, True)]
+    ("phased", "spatial", "noisy", "background_force"),
+    [(False, False, False, None), (True, False, True, None), (True, True, True, 30.0)],
 )
-def test_every_kind_of_field_sounds_as_rendered(tmp_path, phased, spatial, noisy):
-    field = table(phased=phased, spatial=spatial, noisy=noisy)
+def test_every_kind_of_field_sounds_as_rendered(tmp_path, phased, spatial, noisy, background_force):
+    field = table(phased=phased, spatial=spatial, noisy=noisy, background_force=background_force)
     write_faust(field, tmp_path / "thing.dsp")
-    heard = sounded(tmp_path / "thing.dsp", (4, 0.5, 0.0, 0))
-    assert apart(heard, struck(field, 4, force=0.5)) < 2e-6
+    for force in (0.5, 1.0):
+        heard = sounded(tmp_path / "thing.dsp", (4, force, 0.0, 0))
+        assert apart(heard, struck(field, 4, force=force)) < 2e-6
+    if background_force is not None:
+        assert 'hslider("force", 30, 0, 3000, 0.03)' in (tmp_path / "thing.dsp").read_text()
 
 
 @compiled
@@ -104,7 +108,7 @@ def test_the_library_holds_the_same_sound_without_controls(tmp_path):
 
 def test_the_name_cannot_break_out_of_its_string():
     named = replace(table(), name='a"; process = _; // \n b\\')
-    lines = faust_library(named, noise=False).splitlines()
+    lines = faust_library(named).splitlines()
     assert lines[1] == 'declare name "a; process = _; //  b";'
     assert not any(re.match(r"\s*process", line) for line in lines)
 

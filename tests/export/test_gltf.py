@@ -86,7 +86,7 @@ def test_an_impulse_into_the_surface_sounds_as_the_blow(tmp_path, force):
 
 
 def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
-    field = table(phased=True, spatial=True, noisy=True)
+    field = table(phased=True, spatial=True, noisy=True, background_force=3.0)
     written = write_gltf(field, tmp_path / "thing.glb")
     words = " ".join(written.remarks)
     assert "starts as a sine" in words
@@ -98,6 +98,7 @@ def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
     rows = [arrays[extras[name]].reshape(MODES, POINTS)[:, 5] for name in ("sine", "cosine", "decayRates")]
     whole = summed(rows[0] + 1j * rows[1], model["frequencies"], rows[2]) + arrays[extras["noise"]]
     assert apart(whole, field.render(torch.tensor([5]))[0]) < 3e-4
+    assert extras["backgroundForce"] == 3.0
     plain = [struck(model, row, -field.normals[row].double().numpy()) for row in field.spread(8).tolist()]
     true = field.render(field.spread(8)).double().numpy()
     assert written.error == pytest.approx(apart(plain, true), rel=0.01)

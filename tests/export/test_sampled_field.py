@@ -21,29 +21,31 @@ from factories.raising import raises
 RATE, SAMPLES = 8000.0, 3000
 
 
-def sounding(name: str, *, phase: float = 0.0, scaled: bool = False) -> SoundField:
+def sounding(
+    name: str, *, phase: float = 0.0, scaled: bool = False, background_force: float | None = None
+) -> SoundField:
     gains = FIELDS[name]()
     if scaled:
         gains = ScaledGains(gains, torch.linspace(0.5, 2.0, len(BANK), dtype=torch.float64), length=1.25)
     magnitude = torch.linspace(0.02, 0.0, 33)
     origin = Origin("plate", ("a.wav",), per_newton=True, config=FitConfig(seed=7))
-    return SoundField(
-        BANK, gains, torch.full((len(BANK),), phase, dtype=torch.float64), Residual(magnitude), RATE, SAMPLES, origin
-    )
+    phases, residual = torch.full((len(BANK),), phase, dtype=torch.float64), Residual(magnitude, force=background_force)
+    return SoundField(BANK, gains, phases, residual, RATE, SAMPLES, origin)
 
 
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize(
-    ("phase", "scaled", "pulse"),
-    [(0.0, False, None), (0.7, False, ForcePulse(1e-3, "hertz")), (0.7, True, None)],
+    ("phase", "scaled", "pulse", "background_force"),
+    [(0.0, False, None, 5.0), (0.7, False, ForcePulse(1e-3, "hertz"), None), (0.7, True, None, None)],
 )
-def test_a_blow_sounds_as_the_fields(name, phase, scaled, pulse):
-    sound_field = sounding(name, phase=phase, scaled=scaled)
+def test_a_blow_sounds_as_the_fields(name, phase, scaled, pulse, background_force):
+    sound_field = sounding(name, phase=phase, scaled=scaled, background_force=background_force)
     table = SampledField.of(sound_field)
     rows = torch.tensor([0, 17, 149])
-    expected = sound_field.render(table.points[rows], forces=2.5, pulse=pulse)
-    error = (table.render(rows, force=2.5, pulse=pulse) - expected).abs().max() / expected.abs().max()
-    assert float(error) < 1e-5
+    for force in (None, 2.5):
+        expected = sound_field.render(table.points[rows], forces=force, pulse=pulse)
+        error = (table.render(rows, force=force, pulse=pulse) - expected).abs().max() / expected.abs().max()
+        assert float(error) < 1e-5
     assert table.shared_damping == (name != "attention with dampings")
 
 

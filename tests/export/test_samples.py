@@ -1,6 +1,7 @@
 """A sampler's grid: every wav is the blow that its row of the table says."""
 
 import csv
+import json
 import re
 from collections import Counter
 from dataclasses import replace
@@ -50,6 +51,17 @@ def test_every_row_is_its_blow(tmp_path):
         assert float(row["peak_db"]) == pytest.approx(20 * np.log10(np.abs(sound).max()), abs=0.01)
     loudest = max(np.abs(each).max() for each in truths)
     assert apart(sounds, 10 ** (-3 / 20) / loudest * np.array(truths)) < 1e-6
+
+
+def test_a_layer_of_twice_the_force_has_twice_the_modes_and_the_same_background(tmp_path):
+    field = table(noisy=True, background_force=3.0)
+    write_grid(field, tmp_path / "grid", contacts=1, layers=(Layer(1.0), Layer(2.0)))
+    soft, hard = (soundfile.read(tmp_path / "grid" / row["file"])[0] for row in rows(tmp_path / "grid"))
+    scale = json.loads((tmp_path / "grid" / "manifest.json").read_text())["scale"]
+    assert apart(2 * soft - hard, scale * 3.0 * field.noise.numpy()) < 1e-5
+    # Unless a force is given, it is that of the recordings on average.
+    write_grid(field, tmp_path / "one", contacts=1)
+    assert [float(row["force"]) for row in rows(tmp_path / "one")] == [3.0]
 
 
 def test_the_instrument_plays_every_file_at_its_key(tmp_path):
@@ -113,7 +125,7 @@ def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path):
         ({"contacts": 93}, "contacts", 93),
         ({"layers": ()}, "layers", 0),
         ({"layers": (Layer(-1.0),)}, "force", -1.0),
-        ({"layers": (Layer(contact_time=2.0),)}, "contact_time", 2.0),
+        ({"layers": (Layer(1.0, contact_time=2.0),)}, "contact_time", 2.0),
         ({"seconds": 0.0}, "seconds", 0.0),
         ({"range_db": -1.0}, "range_db", -1.0),
         ({"level_db": 6.0}, "level_db", 6.0),

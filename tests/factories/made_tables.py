@@ -9,7 +9,13 @@ RATE, SAMPLES, POINTS, MODES = 8000.0, 1600, 9, 4
 
 
 def table(
-    *, phased: bool = False, spatial: bool = False, noisy: bool = False, points: int = POINTS, seed: int = 0
+    *,
+    phased: bool = False,
+    spatial: bool = False,
+    noisy: bool = False,
+    background_force: float | None = None,
+    points: int = POINTS,
+    seed: int = 0,
 ) -> SampledField:
     draw = torch.Generator().manual_seed(seed)
     damping = 8.0 + 30.0 * torch.rand(points, MODES, generator=draw, dtype=torch.float64)
@@ -25,6 +31,7 @@ def table(
         ),
         torch.randn(SAMPLES, generator=draw) * (0.02 if noisy else 0.0),
         RATE,
+        background_force=background_force,
         name="thing",
     )
 

@@ -61,6 +61,12 @@ def test_a_longer_press_strikes_harder(plain: "Page") -> None:
     assert forces[0] == 1.0
     assert 1.5 < forces[1] < 9.0
     assert forces[2] == 10.0
+    # An average impact's is in newtons where the field knows it.
+    page.evaluate("Object.assign(avmsf.studio.bundle.manifest, { perNewton: true, backgroundForce: 147 })")
+    page.mouse.down()
+    page.mouse.up()
+    assert page.inner_text("#strike-facts").endswith(", 150 N")
+    page.evaluate("Object.assign(avmsf.studio.bundle.manifest, { perNewton: false, backgroundForce: null })")
 
 
 def test_keys_turn_and_strike_what_is_in_the_middle(plain: "Page") -> None:

@@ -3,6 +3,7 @@
 import base64
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -137,6 +138,17 @@ def together(table: SampledField, impacts: Sequence[tuple[int, float, int]], sam
     return sound
 
 
+def test_a_harder_impact_has_the_same_background(any_page: "Page", tables: dict[str, SampledField]) -> None:
+    """Of forces relative to the average impact's, which is of 9 N, and in the unit of its sound over its force."""
+    steady = replace(tables["shared"], background_force=9.0)
+    assert make_bundle(steady).manifest["backgroundForce"] == 9.0
+    any_page.evaluate("bundle.manifest.backgroundForce = 9")
+    for force in (0.01, 1.0, 2.0):
+        expected = steady.render(torch.tensor([3]), force=9.0 * force)[0] / 9.0
+        assert error(heard(any_page, [{"row": 3, "force": force}]), expected) < 1e-6
+    any_page.evaluate("delete bundle.manifest.backgroundForce")
+
+
 def test_impacts_overlap_from_the_very_sample_on_at_which_they_begin(page: "Page", table: SampledField) -> None:
     """At the beginning, the end and the middle of blocks of 128 samples, two in one block, two at once."""
     places = [
@@ -232,7 +244,8 @@ def test_a_click_is_heard_live(any_page: "Page") -> None:
 BANK = """({ field, impacts, seconds, voices }) => {
   const rate = 16000, frequency = Float64Array.from(field.frequency), noise = Float32Array.from(field.noise);
   const bank = new Bank({ ...field, frequency, noise }, rate, 128, voices);
-  for (const impact of impacts) bank.strike({ force: [1], strength: 1, loudest: 1, damping: null, ...impact });
+  const usual = { force: [1], strength: 1, noise: 1, loudest: 1, damping: null };
+  for (const impact of impacts) bank.strike({ ...usual, ...impact });
   const sound = new Float64Array(128 * Math.ceil(seconds * rate / 128));
   for (let frame = 0; frame < sound.length; frame += 128) bank.render(sound.subarray(frame, frame + 128), frame);
   const banks = bank.shared === null ? bank.sounding.map((voice) => voice.resonators) : [bank.shared];

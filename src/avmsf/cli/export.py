@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 _CONTACTS = ("position", "contact_table", "unit")
 _USED: dict[Format, tuple[str, ...]] = {
-    "web": ("object", "object_unit", "capture"),
-    "gltf": ("object", "object_unit", "capture", "up", *_CONTACTS),
+    "web": ("object", "object_unit", "capture", "no_noise"),
+    "gltf": ("object", "object_unit", "capture", "up", "no_noise", *_CONTACTS),
     "faust": ("no_noise", *_CONTACTS),
     "avmsf-demo": ("object", "variant", "precision"),
     "wavs": ("forces", "contact_times", "pulse", "seconds", "no_noise", *_CONTACTS),
@@ -85,8 +85,8 @@ class Options(Many):
     """Of --position and --contact-table."""
     overwrite: Flag = False
     """Replace a file, or the folder of an earlier export."""
-    forces: Annotated[tuple[float, ...], tyro.conf.arg(metavar="F ...")] = (1.0,)
-    """wavs: force of each layer."""
+    forces: Annotated[tuple[float, ...], tyro.conf.arg(metavar="F ...")] = ()
+    """wavs: force of each layer; by default that of an average recorded impact."""
     contact_times: Annotated[tuple[float, ...], arg("SECONDS ...")] = ()
     """wavs: of each layer; by default by Hertz's law."""
     seconds: Number = None
@@ -96,7 +96,7 @@ class Options(Many):
     up: Axis = "z"
     """gltf: axis that points up."""
     no_noise: Flag = False
-    """faust, wavs: the modes without the residual noise."""
+    """web, gltf, faust, wavs: the modes without the residual noise."""
     functions: int = 16
     """uff: points with response functions."""
     variant: Annotated[str, tyro.conf.arg(metavar="NAME")] = "original"
@@ -172,6 +172,7 @@ def run(options: Options) -> int:
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
     source, settings = _prepared(load(options.field), options)
+    source = source.without_noise() if options.no_noise else source
     written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
     for remark in written.remarks:
         note(remark)
@@ -200,8 +201,9 @@ def run(options: Options) -> int:
     print_result(text, values)
     following = _NEXT.get(options.output.suffix.lower(), _NEXT[options.to])
     next_step(following.format(shlex.quote(str(options.output)), options.output.name))
-    if options.to == "wavs" and len(options.forces) == 1:
-        next_step("the same command with --overwrite --forces 0.3 1 3, for a layer at each force")
+    if options.to == "wavs" and len(options.forces) < 2:
+        forces = " ".join(format_number(factor * source.average_force, 2) for factor in (0.3, 1.0, 3.0))
+        next_step(f"the same command with --overwrite --forces {forces}, for a layer at each force")
     return 0
 
 
@@ -216,7 +218,7 @@ def _prepared(field: "SoundField", options: Options) -> "_Prepared":
         case "faust":
             sampled = _sampled(field, options)
             asked = options.contacts is not None or options.contacts_given
-            return sampled, {"noise": not options.no_noise, "contacts": len(sampled) if asked else None}
+            return sampled, {"contacts": len(sampled) if asked else None}
         case "wavs":
             return _wavs(field, options)
         case "uff":
@@ -333,14 +335,14 @@ def _demo(field: "SoundField", options: Options) -> "_Prepared":
 def _wavs(field: "SoundField", options: Options) -> "_Prepared":
     from avmsf.export.samples import Layer, hertz_layers
 
-    forces, times = options.forces, options.contact_times
+    sampled = _sampled(field, options)
+    forces, times = options.forces or (sampled.average_force,), options.contact_times
     if len(times) == 1:
         times = times * len(forces)
     if times and len(times) != len(forces):
         wanted = f"one, or one for each of {len(forces)} --forces"
         raise ExportError.expected(wanted, len(times), name="--contact-times")
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=False))
-    sampled = _sampled(field, options)
-    settings = {"layers": layers or hertz_layers(forces, options.pulse), "seconds": options.seconds}
-    settings |= {"noise": not options.no_noise, "contacts": len(sampled)}
+    layers = layers or hertz_layers(forces, options.pulse)
+    settings = {"layers": layers, "seconds": options.seconds, "contacts": len(sampled)}
     return sampled, settings | ({"range_db": math.inf} if options.contacts_given else {})

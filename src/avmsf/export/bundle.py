@@ -80,6 +80,7 @@ def make_bundle(
         "sampleRate": field.sample_rate,
         "samples": field.samples,
         "perNewton": field.per_newton,
+        "backgroundForce": field.background_force,
         "modes": len(field.frequency),
         "supporting": list(field.supporting),
         "points": len(field),

@@ -24,33 +24,34 @@ MAX_NUMBERS = 150_000
 
 
 def write_faust(
-    field: SampledField, path: str | Path, *, contacts: int | None = None, noise: bool = True, overwrite: bool = False
+    field: SampledField, path: str | Path, *, contacts: int | None = None, overwrite: bool = False
 ) -> Written:
     """Write a `.dsp` with controls, or a `.lib` without them, by the path's ending, and a table of the contacts.
 
-    The table is `contacts_path(path)`: the coordinates of each `contact`, object frame, meters. Without `noise` only
-    the modes sound. More than `contacts` are reduced by farthest point sampling, by default to as many as Faust
-    compiles in reasonable time; then a noise so long that few would fit is left out. Raises `ExportError` for another
-    ending, and for `contacts` with more numbers than Faust compiles in reasonable time.
+    The table is `contacts_path(path)`: the coordinates of each `contact`, object frame, meters. More than `contacts`
+    are reduced by farthest point sampling, by default to as many as Faust compiles in reasonable time; then a noise so
+    long that few would fit is left out. Raises `ExportError` for another ending, and for `contacts` with more numbers
+    than Faust compiles in reasonable time.
     """
     path = Path(path)
     check_suffix(path, FORMATS["faust"].suffixes)
-    held, with_noise, reason = len(field), noise and bool(field.noise.any()), ""
+    held, noisy, reason = len(field), bool(field.noise.any()), ""
     if contacts is None:
         reason = ": Faust compiles few in reasonable time"
-        contacts, with_noise = _compiled(field, noise=with_noise)
+        contacts, kept = _compiled(field, noise=noisy)
+        field = field if kept else field.without_noise()
     field = field if held <= contacts else field.take(field.spread(contacts))
-    text = faust_library(field, noise=with_noise)
+    text = faust_library(field)
     if path.suffix == ".dsp":
-        text += _CONTROLS
+        text += _CONTROLS.format(*(field.average_force * factor for factor in (1.0, 100.0, 0.001)))
     remarks = ["all impacts share one bank of resonators; the force of an impact is half a sine over the contact time"]
     if not field.shared_damping:
         remarks.append("dampings are those of the last contact, for earlier impacts too")
     if len(field) < held:
         remarks.append(f"{len(field)} of {held} contacts are written, evenly spread{reason}")
-    if with_noise:
+    if field.noise.any():
         remarks.append("the noise restarts with every impact")
-    elif field.noise.any():
+    elif noisy:
         remarks.append("the residual noise is left out")
     rows = (
         ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
@@ -78,12 +79,12 @@ def _numbers_at_a_point(field: SampledField) -> int:
     return field.gains.shape[1] * (1 + field.has_phases + (not field.shared_damping))
 
 
-def faust_library(field: SampledField, *, noise: bool) -> str:
+def faust_library(field: SampledField) -> str:
     """Return the definitions; `strike(contact, force, contactTime, gate)` is the sound.
 
     Raises ExportError for more than `MAX_NUMBERS`.
     """
-    points, modes = field.gains.shape
+    (points, modes), noise = field.gains.shape, bool(field.noise.any())
     numbers = points * _numbers_at_a_point(field) + noise * field.samples
     if numbers > MAX_NUMBERS:
         samples = f", {field.samples} samples of noise" if noise else ""
@@ -100,7 +101,7 @@ def faust_library(field: SampledField, *, noise: bool) -> str:
         f"noiseDraw = {_waveform(field.noise)};" if noise else "",
         _NOISE.format(samples=field.samples).strip() if noise else "noise(since) = 0.0;",
         _bank(field),
-        _STRIKE.strip(),
+        _STRIKE.format("force" if field.background_force is None else _number(field.background_force)).strip(),
     ]
     return "\n".join(part for part in parts if part) + "\n"
 
@@ -163,15 +164,15 @@ noise(since) = (since > 0) * (place < {samples}) * (noiseDraw, int(min(place, {s
 }};
 """
 _STRIKE = """
-strike(contact, force, contactTime, gate) = force * pulse(contactTime, since) : bank(contact) : +(force * noise(since))
-with {
+strike(contact, force, contactTime, gate) = force * pulse(contactTime, since) : bank(contact) : +({} * noise(since))
+with {{
   since = sinceImpact(gate);
-};
+}};
 """
 _CONTROLS = """
 process = strike(
   int(nentry("contact", 0, 0, points - 1, 1)),
-  hslider("force", 1, 0, 100, 0.001),
+  hslider("force", {:g}, 0, {:g}, {:g}),
   hslider("contactTime[unit:s]", 0, 0, 0.02, 0.0001),
   button("gate"));
 """

@@ -87,6 +87,7 @@ def _document(
         "sampleRate": sampled.sample_rate,
         "samples": sampled.samples,
         "perNewton": sampled.per_newton,
+        "backgroundForce": sampled.background_force,
         "impulse": "1 N s against the normal is an impact of force 1",
     }
     model: dict[str, Any] = {"name": sampled.name or "object", **dict(zip(modal, number, strict=False))}

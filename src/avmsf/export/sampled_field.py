@@ -31,8 +31,8 @@ _DRAWN = 4
 class SampledField:
     """Modal parameters of impacts at some points, perpendicular to the surface unless other directions are given.
 
-    The sound of an impact of force 1 at a point is the sum over modes of the imaginary part of gain exp(-d t + 2 pi i f
-    t), plus the noise: exp(-d t) (Re gain sin(2 pi f t) + Im gain cos(2 pi f t)).
+    The sound of an average recorded impact at a point, over its force, is the sum over modes of the imaginary part of
+    gain exp(-d t + 2 pi i f t), plus the noise: exp(-d t) (Re gain sin(2 pi f t) + Im gain cos(2 pi f t)).
     """
 
     points: Float[Tensor, "points 3"]
@@ -46,11 +46,13 @@ class SampledField:
     gains: Complex64[Tensor, "points modes"]
     """Amplitudes of the sines, and of the cosines times i, in the unit of the training sounds."""
     noise: Float32[Tensor, " samples"]
-    """Residual noise: the realization that `SoundField.render` adds without forces; here it grows with the force."""
+    """Residual noise: the realization that `SoundField.render` adds without forces."""
     sample_rate: float
     """Samples per second of the training sounds, Hz."""
     per_newton: bool = False
     """Whether forces are in newtons; otherwise force 1 is that of an average recorded impact."""
+    background_force: float | None = None
+    """Force of an average recorded impact, if the noise is background (`Residual.force`); None if it grows with it."""
     name: str = ""
     """Name of the object."""
     supporting: tuple[int, ...] = ()
@@ -102,6 +104,7 @@ class SampledField:
             sound_field.noise().float(),
             sound_field.sample_rate,
             sound_field.origin.per_newton,
+            sound_field.residual.force,
             sound_field.origin.capture,
             supporting_columns(sound_field),
         )
@@ -110,6 +113,11 @@ class SampledField:
     def samples(self) -> int:
         """Length of the training sounds."""
         return len(self.noise)
+
+    @property
+    def average_force(self) -> float:
+        """Force of an average recorded impact, as far as it is known."""
+        return self.background_force or 1.0
 
     @property
     def shared_damping(self) -> bool:
@@ -142,6 +150,10 @@ class SampledField:
         """Return `count` rows, or all if there are fewer, by farthest point sampling."""
         return spread_rows(self.points, min(count, len(self)))
 
+    def without_noise(self) -> "SampledField":
+        """Return the field with its modes alone."""
+        return replace(self, noise=torch.zeros_like(self.noise))
+
     def take(self, rows: Int[Tensor, " chosen"]) -> "SampledField":
         """Return the field at some of its points."""
         return replace(
@@ -156,15 +168,13 @@ class SampledField:
         self,
         rows: Int[Tensor, " contacts"],
         *,
-        force: float = 1.0,
+        force: float | None = None,
         samples: int | None = None,
         pulse: ForcePulse | None = None,
-        noise: bool = True,
     ) -> Float32[Tensor, "contacts samples"]:
         """Return the sounds of impacts at the points of some rows, as `SoundField.render` does.
 
-        `samples` is the length, by default that of the training sounds, after whose end there is no noise. With
-        `noise=False` the sounds contain only the modes.
+        `samples` is the length, by default that of the training sounds, after whose end there is no noise.
         """
         length = self.samples if samples is None else samples
         added = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]
@@ -179,7 +189,9 @@ class SampledField:
             )
             parts.append(modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate))
         sounds = torch.cat(parts)
-        return force * (sounds + added if noise else sounds)
+        if force is None:
+            return sounds + added
+        return force * sounds + (force if self.background_force is None else self.background_force) * added
 
 
 def supporting_columns(sound_field: SoundField) -> tuple[int, ...]:

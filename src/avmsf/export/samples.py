@@ -38,7 +38,7 @@ _CONTACT = 5e-4
 class Layer:
     """The force at all contacts for one range of a keyboard's velocities."""
 
-    force: float = 1.0
+    force: float
     """Newtons where the field knows forces, else relative to an average recorded impact."""
     contact_time: float = 0.0
     """Seconds that hammer and object are in contact; 0 is the impact as recorded."""
@@ -63,21 +63,21 @@ def write_grid(
     folder: str | Path,
     *,
     contacts: int = 16,
-    layers: Sequence[Layer] = (Layer(),),
+    layers: Sequence[Layer] | None = None,
     seconds: float | None = None,
     level_db: float = -1.0,
     range_db: float = 40.0,
-    noise: bool = True,
     overwrite: bool = False,
 ) -> Written:
     """Write a float32 wav for every contact and layer, the table and the instrument.
 
     More than `contacts`, of which each has a MIDI note, are reduced by farthest point sampling; those with `range_db`
-    less energy than the loudest are left out. Each has one impact of each of the `layers`, sorted by their level.
-    Sounds last `seconds`, by default as long as the training sounds, and have the residual noise unless `noise` is
-    False. All are scaled by one factor, the manifest's `scale`, so that the loudest peaks at `level_db` relative to
-    full scale. Raises `ExportError` for no layers, more contacts than MIDI has notes, and settings not positive.
+    less energy than the loudest are left out. Each has one impact of each of the `layers`, sorted by their level, by
+    default one of an average recorded force. Sounds last `seconds`, by default as long as the training sounds. All are
+    scaled by one factor, the manifest's `scale`, so that the loudest peaks at `level_db` relative to full scale. Raises
+    `ExportError` for no layers, more contacts than MIDI has notes, and settings not positive.
     """
+    layers = (Layer(field.average_force),) if layers is None else layers
     _check(contacts, layers, seconds, level_db, range_db, field.sample_rate)
     rate = round(field.sample_rate)
     rows, remarks = _chosen(field, contacts, range_db)
@@ -85,7 +85,7 @@ def write_grid(
     rendered = []
     for layer in layers:
         pulse = ForcePulse(layer.contact_time, layer.shape)
-        sounds = field.render(rows, force=layer.force, samples=samples, pulse=pulse, noise=noise)
+        sounds = field.render(rows, force=layer.force, samples=samples, pulse=pulse)
         rendered.append((layer, sounds))
     # From soft to loud; equally loud ones stay in order.
     rendered.sort(key=lambda each: float(each[1].double().square().sum()))

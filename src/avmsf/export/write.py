@@ -26,7 +26,13 @@ WRITERS: dict[Format, Callable[..., Written]] = {
 
 
 def write(
-    field: SoundField, output: str | Path, *, to: Format | None = None, contacts: int | None = None, **options: Any
+    field: SoundField,
+    output: str | Path,
+    *,
+    to: Format | None = None,
+    contacts: int | None = None,
+    noise: bool = True,
+    **options: Any,
 ) -> Written:
     """Write a field for other tools.
 
@@ -37,6 +43,7 @@ def write(
         to: The format of a folder: "web", "wavs" (a sample set) or "avmsf-demo" (the layout of the paper's demo).
         contacts: Number of points, spread over the object, at most; by default as many as the format's tools read
             easily.
+        noise: Whether the residual noise is written, where the format has it.
         options: Of the format's writer in `avmsf.export`, such as `strikes=` of `write_webpage`, or `overwrite=True` to
             replace files.
 
@@ -56,6 +63,7 @@ def write(
             name="to",
         )
     sampled = SampledField.of(field, limit=FORMATS[kind].points if contacts is None else contacts)
+    sampled = sampled if noise else sampled.without_noise()
     if kind == "wavs" or (kind == "faust" and contacts is not None):
         options = {"contacts": len(sampled), **options}
     written = WRITERS[kind](sampled, output, **options)

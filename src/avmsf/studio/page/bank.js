@@ -128,12 +128,8 @@ export class Resonators {
   }
 
   get energy() {
-    let sum = 0;
-    for (let place = 0; place < this.count; place++) {
-      const mode = this.ringing[place];
-      sum += this.re[mode] * this.re[mode] + this.im[mode] * this.im[mode];
-    }
-    return sum;
+    const { re, im } = this;
+    return this.ringing.subarray(0, this.count).reduce((sum, mode) => sum + re[mode] ** 2 + im[mode] ** 2, 0);
   }
 }
 
@@ -142,7 +138,7 @@ export class Resonators {
  *
  * `field`: frequency and damping (null where every impact brings its own), Hz and 1/s; noise, a draw at this rate.
  * An impact: `frame` at which it starts, `sine` and `cosine` a mode, `damping` a mode or null, `force` a sample, its
- * sum `strength`, and `loudest`, the amplitude of its loudest mode when the force is over.
+ * sum `strength`, `noise`, a factor on the draw, and `loudest`, the amplitude of its loudest mode after the force.
  */
 export class Bank {
   constructor(field, rate, block, voices) {
@@ -226,7 +222,7 @@ export class Bank {
       // Behind its end the draw runs backwards and fades, for noise that breaks off is heard as a click.
       const over = place - length;
       const gain = over < 0 ? 1 : 0.5 + 0.5 * Math.cos((Math.PI * Math.min(over, fade)) / fade);
-      out[n] += voice.strength * gain * noise[over < 0 ? place : length - 1 - over];
+      out[n] += voice.noise * gain * noise[over < 0 ? place : length - 1 - over];
     }
     voice.heard += this.block - begin;
   }

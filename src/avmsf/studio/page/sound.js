@@ -79,6 +79,8 @@ class Tuned {
     this.points = manifest.points;
     this.kept = [...tensors.frequency.keys()].filter((mode) => tensors.frequency[mode] < rate / 2);
     this.shared = manifest.damping === "shared";
+    /** Whether the noise is background, as loud under any force. */
+    this.steady = Boolean(manifest.backgroundForce);
     this.frequency = this.pick(tensors.frequency, 0);
     const damping = this.shared ? this.pick(tensors.damping, 0) : null;
     this.field = { frequency: this.frequency, damping, noise };
@@ -100,7 +102,8 @@ class Tuned {
       loudest = Math.max(loudest, Math.hypot(sine[mode], cosine[mode]) * passed * Math.abs(force));
     }
     const damping = this.shared ? null : this.pick(this.tensors.damping, row);
-    return { frame, sine, cosine, damping, force: pulse.map((part) => part * force), strength: force, loudest };
+    const noise = this.steady ? 1 : force;
+    return { frame, sine, cosine, damping, force: pulse.map((part) => part * force), strength: force, noise, loudest };
   }
 
   /** The largest that a sample of an impact of force 1 can be. */
@@ -122,10 +125,9 @@ class Tuned {
   }
 
   peak(row) {
-    const samples = Math.ceil(LOUD_SECONDS * this.rate);
-    const bank = new Bank({ ...this.field, noise: Float32Array.of(0) }, this.rate, samples, 1);
+    const sound = new Float64Array(Math.ceil(LOUD_SECONDS * this.rate));
+    const bank = new Bank({ ...this.field, noise: Float32Array.of(0) }, this.rate, sound.length, 1);
     bank.strike(this.impact(row, {}));
-    const sound = new Float64Array(samples);
     bank.render(sound, 0);
     return sound.reduce((peak, value) => Math.max(peak, Math.abs(value)), 0);
   }
@@ -160,7 +162,7 @@ export async function renderOffline(bundle, impacts, seconds, options = {}) {
   const frame = ({ when = 0 }) => Math.round(when * sampleRate);
   const ready = impacts.map((impact) => tuned.impact(impact.row, impact, frame(impact)));
   // So low that the limiter has nothing to do, whatever the unit; a power of two rounds nothing.
-  const bound = impacts.reduce((sum, { row, force = 1 }) => sum + Math.abs(force) * tuned.bound(row), 0);
+  const bound = impacts.reduce((sum, { row, force = 1 }) => sum + Math.max(1, Math.abs(force)) * tuned.bound(row), 0);
   const level = bound > 0 ? 2 ** -Math.ceil(Math.log2(2 * bound)) : 1;
   bankNode(context, tuned, { level, impacts: ready, voices }).connect(context.destination);
   const sound = (await context.startRendering()).getChannelData(0);
@@ -212,7 +214,7 @@ export class SoundEngine {
     this.node.port.postMessage({ type: "level", level: this.level });
   }
 
-  /** Strike a contact by its row; `force` as the field has it, `contactTime` in seconds, 0 for the recorded hammer. */
+  /** Strike a contact by its row; `force` over an average impact's, `contactTime` in seconds, 0 as recorded. */
   strike(row, { force = 1, contactTime = 0, shape = "half-sine" } = {}) {
     this.node.port.postMessage({ type: "strike", impact: this.tuned.impact(row, { force, contactTime, shape }) });
     this.wake();

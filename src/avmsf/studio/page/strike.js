@@ -16,13 +16,12 @@ const PAUSE_SECONDS = 0.25;
 const MAX_COMPARED_SECONDS = 2.5;
 
 export function strikeTab(studio) {
-  const unit = studio.forceUnit;
   const relative = studio.bundle.manifest.perNewton ? "" : ", × a recorded impact";
   const force = new Slider(`Force of a click${relative}`, {
     low: 0.05,
     high: 20,
     value: 1,
-    words: (value) => `${value.toPrecision(2)}${unit}`,
+    words: (value) => studio.forceText(value),
     onInput: (value) => {
       studio.force = value;
     },

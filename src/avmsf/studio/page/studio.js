@@ -41,8 +41,10 @@ export class Studio extends EventTarget {
     return this.live?.abilities?.includes(ability) ?? false;
   }
 
-  get forceUnit() {
-    return this.bundle.manifest.perNewton ? " N" : " ×";
+  /** A force in words, of its ratio to an average recorded impact's. */
+  forceText(force) {
+    const { perNewton, backgroundForce } = this.bundle.manifest;
+    return `${Number((force * (backgroundForce ?? 1)).toPrecision(2))}${perNewton ? " N" : " ×"}`;
   }
 
   /** Strike a contact, with `factor` times the force that is set. */
@@ -61,8 +63,7 @@ export class Studio extends EventTarget {
     this.view?.mark("struck", mark, this.contacts.position(row), this.contacts.normal(row));
     const where = this.view ? `contact ${row}` : `contact number ${row}`;
     const duration = contactTime === null ? "" : `, ${seconds(contactTime)}`;
-    document.getElementById("strike-facts").textContent =
-      `${where}, ${force.toPrecision(2)}${this.forceUnit}${duration}`;
+    document.getElementById("strike-facts").textContent = `${where}, ${this.forceText(force)}${duration}`;
     this.#notify("struck");
   }
 
