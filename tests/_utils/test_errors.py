@@ -23,31 +23,34 @@ def test_an_error_is_composed_of_its_attributes_and_keeps_them():
     assert str(error) == "a.wav: expected a file, got a folder"
 
 
-def test_a_tensor_that_cannot_be_allocated_lacks_memory() -> None:
+def full() -> Exception:
     with pytest.raises(RuntimeError) as caught:
         torch.empty(1 << 60, dtype=torch.uint8)
-    assert lacks_memory(caught.value)
+    return caught.value
 
 
-def test_the_cause_counts_where_a_library_hides_it() -> None:
+def hidden() -> OSError:
+    """Return an error whose cause a library hides."""
     error = OSError("the library could not be found")
-    assert not lacks_memory(error)
     error.__context__ = OSError("libllvmlite.so: failed to map segment from shared object")
-    assert lacks_memory(error)
+    return error
 
 
 @pytest.mark.parametrize(
     ("error", "lacks"),
     [
+        (full(), True),
+        (hidden(), True),
         (MemoryError(), True),
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), True),
         (OSError("libllvmlite.so: cannot allocate memory in static TLS block"), True),
         (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), True),
         (ImportError("No module named 'torch'"), False),
+        (OSError("the library could not be found"), False),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), False),
         (RuntimeError("shapes cannot be multiplied"), False),
         (RecursionError("maximum recursion depth exceeded"), False),
     ],
 )
-def test_other_errors_do_not(error: Exception, lacks: bool) -> None:
+def test_errors_of_missing_memory_are_told_from_others(error: Exception, lacks: bool) -> None:
     assert lacks_memory(error) is lacks

@@ -13,6 +13,7 @@ from avmsf._utils.parallel import MAX_STARTS, run_tasks, workers_at
 from avmsf._utils.processes import start_child
 from avmsf.errors import AvmsfError, FitError, WorkerError
 from factories.raising import raises
+from factories.running import gone
 
 
 def told(number: int) -> tuple[int, int, str | None]:
@@ -39,26 +40,15 @@ def stays(file: Path) -> None:
     time.sleep(600)
 
 
+def numbers_in(file: Path) -> list[int]:
+    return [int(number) for number in file.read_text().split()]
+
+
 def run(act: object, arguments: dict, count: int = 2, address: str | None = None) -> dict:
     found: dict[str, object] = {}
     with workers_at(count, address, raising=FitError) as workers:
         run_tasks(act, arguments, workers, found.__setitem__, lambda text: None)
     return found
-
-
-def await_end(file: Path) -> None:
-    """Wait until no process of a file's numbers runs."""
-    for number in map(int, file.read_text().split()):
-        for _ in range(100):
-            state = Path(f"/proc/{number}/stat")
-            try:
-                if state.read_text().rpartition(")")[2].split()[0] == "Z":
-                    break
-            except OSError:
-                break
-            time.sleep(0.1)
-        else:
-            pytest.fail(f"process {number} still runs")
 
 
 def test_tasks_return_and_raise_in_processes_of_one_thread() -> None:
@@ -111,7 +101,7 @@ def test_who_stops_waiting_ends_all(tmp_path: Path) -> None:
 
     with workers_at(2, raising=FitError) as workers, pytest.raises(KeyboardInterrupt):
         run_tasks(_either, {"long": tmp_path / "numbers", "short": tmp_path / "short"}, workers, stop, print)
-    await_end(tmp_path / "numbers")
+    assert gone(numbers_in(tmp_path / "numbers"))
 
 
 def _either(file: Path) -> None:
@@ -135,7 +125,7 @@ def test_workers_end_with_their_parent_however_that_ends(tmp_path: Path) -> None
         time.sleep(0.05)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    await_end(file)
+    assert gone(numbers_in(file))
 
 
 def test_workers_that_cannot_be_had_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
+from factories.made_fields import sounding
 
 LENGTH, WIDTH = 0.4, 0.1
 SIZE = (LENGTH**2 + WIDTH**2) ** 0.5
@@ -59,9 +59,7 @@ def bar_contacts(count: int, *, seed: int = 0) -> Tensor:
 
 
 def sound_field(gains: object) -> SoundField:
-    return SoundField(
-        BANK, gains, torch.zeros(4, dtype=torch.float64), Residual(torch.full((9,), 1e-6)), 2000.0, 800, Origin("bar")
-    )  # type: ignore[arg-type]
+    return sounding(gains, bank=BANK, noise=1e-6, rate=2000.0, samples=800, origin=Origin("bar"))
 
 
 def impacts(contacts: Tensor) -> Sites:

@@ -16,7 +16,7 @@ from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
+from factories.made_fields import sounding
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 
 PLATE = Plate()
@@ -63,9 +63,8 @@ def bank() -> ModalBank:
 
 
 def field_of(gains: object, *, phase: float = 0.0) -> SoundField:
-    turned = torch.full((len(bank()),), phase, dtype=torch.float64)
-    noise = Residual(torch.full((65,), 1e-3))
-    return SoundField(bank(), gains, turned, noise, RATE, round(RATE * SECONDS), Origin())
+    samples = round(RATE * SECONDS)
+    return sounding(gains, bank=bank(), phase=phase, noise=1e-3, rate=RATE, samples=samples, origin=Origin())
 
 
 @cache

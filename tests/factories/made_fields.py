@@ -166,10 +166,19 @@ FIELDS: dict[str, Callable[[], GainModel]] = {
 """All there are, by what tests call them; the same object at every call."""
 
 
-def sounding(gains: GainModel) -> SoundField:
-    """Return a field of the plate's modes with noise, a quarter of a second long."""
-    phase = torch.zeros(len(BANK), dtype=torch.float64)
-    return SoundField(BANK, gains, phase, Residual(torch.full((9,), 0.01)), 8000.0, 2000, Origin("plate"))
+def sounding(
+    gains: GainModel,
+    *,
+    bank: ModalBank = BANK,
+    phase: torch.Tensor | float = 0.0,
+    noise: float = 0.01,
+    rate: float = 8000.0,
+    samples: int = 2000,
+    origin: Origin | None = None,
+) -> SoundField:
+    """Return a field of the plate's modes, or of others, with white noise."""
+    phases = torch.as_tensor(phase, dtype=torch.float64).expand(len(bank)).clone()
+    return SoundField(bank, gains, phases, Residual(torch.full((9,), noise)), rate, samples, origin or Origin("plate"))
 
 
 def saved(gains: GainModel, folder: Path) -> Path:

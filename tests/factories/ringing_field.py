@@ -8,7 +8,7 @@ import torch
 from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
+from factories.made_fields import sounding
 
 RATE = 8000.0
 FREQUENCY = (310.0, 565.0, 905.0, 1420.0, 1990.0, 2710.0)
@@ -48,15 +48,8 @@ class SameGains(GainModel):
 
 def ringing_field(*, pitch: float = 1.0, damping: float = 1.0, seconds: float = 0.5, level: float = 1.0) -> SoundField:
     frequency, own = (torch.tensor(each, dtype=torch.float64) for each in (FREQUENCY, DAMPING))
-    return SoundField(
-        ModalBank(pitch * frequency, damping * own),
-        SameGains(level * torch.tensor(GAINS)),
-        torch.zeros(len(FREQUENCY), dtype=torch.float64),
-        Residual(torch.zeros(17)),
-        RATE,
-        round(seconds * RATE),
-        Origin(capture="ringing"),
-    )
+    bank, gains = ModalBank(pitch * frequency, damping * own), SameGains(level * torch.tensor(GAINS))
+    return sounding(gains, bank=bank, noise=0.0, samples=round(seconds * RATE), origin=Origin(capture="ringing"))
 
 
 def sound_of(field: SoundField) -> torch.Tensor:

@@ -218,7 +218,6 @@ def test_a_force_may_be_a_number(given):
 
 SOUND = struck(1, seed=3).sounds[0]
 NOISE = torch.randn(7200, generator=torch.Generator().manual_seed(0))
-DRAWN = NOISE[:9].view(3, 3)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,54 @@
 """Blows on other objects: refused by fields whose modes are so broad that they explain any sound in their band."""
 
+from functools import cache
+
 import pytest
 import torch
+from torch import Tensor
 
+from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate, locate_impacts
+from avmsf.localization.locator import Locator
 from avmsf.localization.streaming import StreamingLocalizer
-from factories.damped_plates import RATE, damped_blows, damped_field, damped_locator
+from avmsf.modal.modes import ModalBank
+from factories.located_plate import TrueGains
+from factories.made_fields import sounding
+from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+
+RATE, SECONDS, LENGTH = 44100.0, 0.4, 0.24
+HIGHEST = {"wood": 6000.0, "plastic": 3000.0}
+
+
+def plate(material: str, length: float = LENGTH) -> Plate:
+    sizes = {"length": length, "width": length / 1.44, "thickness": 0.003}
+    if material == "wood":
+        return Plate(**sizes, young=1.1e10, density=750.0, poisson=0.25, alpha=60.0, beta=2e-6)
+    return Plate(**sizes, young=1.4e9, density=1070.0, poisson=0.35, alpha=30.0, beta=1e-6)
+
+
+@cache
+def damped_field(material: str) -> SoundField:
+    own = plate(material)
+    modes = plate_modes(own, plate_surface_points(own, 1), highest=HIGHEST[material])
+    gains = TrueGains(plate_surface_points(own, 400).float(), plate=own, highest=HIGHEST[material])
+    bank, samples = ModalBank(modes.frequency, modes.damping), round(RATE * SECONDS)
+    return sounding(gains, bank=bank, noise=1e-3, rate=RATE, samples=samples, origin=Origin())
+
+
+@cache
+def damped_locator(material: str) -> Locator:
+    return Locator.of(damped_field(material))
+
+
+def damped_blows(material: str, *, length: float = LENGTH, heard_by: str, noise_db: float = -40.0) -> Tensor:
+    """Return eight blows on a plate, up to the highest frequency that the field of material `heard_by` knows."""
+    generator = torch.Generator().manual_seed(0)
+    struck = plate(material, length)
+    contacts = sample_contacts(struck, 8, generator=generator)
+    recorder = {"sample_rate": RATE, "seconds": SECONDS, "generator": generator, "noise_db": noise_db}
+    return strike(struck, contacts, highest=HIGHEST[heard_by], **recorder).sounds
+
 
 FOREIGN = [("wood", "wood", 0.2), ("wood", "wood", 0.33), ("plastic", "wood", 0.2), ("plastic", "plastic", 0.2)]
 """Material of the field, and material and length of the plate that is struck; the fields' own are .24 m long."""

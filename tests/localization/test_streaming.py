@@ -9,12 +9,10 @@ from torch import Tensor
 
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import LocationError
-from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.locator import Locator
 from avmsf.localization.streaming import WINDOW_SECONDS, LocatedImpact, Ringing, StreamingLocalizer
-from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from factories.made_fields import BANK, positional
+from factories.made_fields import BANK, positional, sounding
 from factories.raising import raises
 
 RATE = 8000.0
@@ -27,9 +25,7 @@ FORCES = (1.0, -0.6, 2.0, 0.7, -1.0)
 
 @cache
 def locator() -> Locator:
-    zero = torch.zeros(len(BANK), dtype=torch.float64)
-    field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), RATE, 4000, Origin("plate"))
-    return Locator.of(field)
+    return Locator.of(sounding(positional(), noise=1e-3, samples=4000))
 
 
 @cache

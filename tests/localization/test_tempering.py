@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import calibrate_tempering
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
 from factories.located_plate import PLATE, mixture_of
+from factories.made_fields import sounding
 from oracles.plate import plate_modes, plate_surface_points, sample_contacts
 
 HIGHEST = 2500.0
@@ -28,8 +28,7 @@ def plate_field(taps: int, *, copies: int = 1, again: int = 1) -> SoundField:
     bank = ModalBank(modes.frequency.repeat(copies) * higher, modes.damping.repeat(copies))
     values = torch.complex(modes.gains, torch.zeros_like(modes.gains)).repeat(1, copies)
     gains = mixture_of(contacts, values, bank, plate_surface_points(PLATE, 600))
-    zero = torch.zeros(len(bank), dtype=torch.float64)
-    return SoundField(bank, gains, zero, Residual(torch.full((9,), 1e-3)), 8000.0, 4000, Origin("plate"))
+    return sounding(gains, bank=bank, noise=1e-3, samples=4000)
 
 
 def test_modes_that_err_alike_tell_no_more_than_one_of_them() -> None:

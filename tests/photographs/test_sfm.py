@@ -5,7 +5,6 @@ import math
 import subprocess
 import sys
 import textwrap
-import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import render_views
 from avmsf.photographs.sfm import WORKER, estimate_cameras
 from factories.raising import raises
+from factories.running import gone
 
 VIEWS, SIZE = 10, 256
 
@@ -202,26 +202,13 @@ SLEEP = """
 """
 
 
-def gone(pid: int) -> bool:
-    def alive() -> bool:
-        try:
-            return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        except (FileNotFoundError, ProcessLookupError):
-            return False
-
-    deadline = time.monotonic() + 10
-    while alive() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return not alive()
-
-
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="sees processes through /proc")
 def test_time_ends_the_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = pictures(tmp_path / "cup", "abc")
     pretend(tmp_path, monkeypatch, SLEEP)
     with raises(CaptureError, name="features", value=3.0):
         estimate_cameras(folder / "images", folder, timeout=3.0)
-    assert gone(int((tmp_path / "pid").read_text()))
+    assert gone([int((tmp_path / "pid").read_text())])
     assert [path.name for path in folder.iterdir()] == ["images"]
 
 

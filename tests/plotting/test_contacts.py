@@ -10,16 +10,14 @@ import torch
 import trimesh
 from matplotlib.colors import to_hex
 
-from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
-from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.plotting.clouds import ALL_SIDES, view_from
 from avmsf.plotting.contacts import contact_colors, draw_contact, write_contact_cloud
 from avmsf.plotting.pictures import save_picture
 from avmsf.plotting.style import FIRST, SECOND
-from factories.made_fields import BANK, positional
+from factories.made_fields import BANK, positional, sounding
 
 RATE, SAMPLES = 8000.0, 3000
 STRUCK = 68
@@ -28,9 +26,7 @@ STRUCK = 68
 @cache
 def contact() -> ContactPosterior:
     """Return where a plate's field locates its own sound at the point `STRUCK`, with noise 60 dB down."""
-    zero = torch.zeros(len(BANK), dtype=torch.float64)
-    field = SoundField(BANK, positional(), zero, Residual(torch.full((9,), 1e-3)), RATE, SAMPLES, Origin("plate"))
-    locator = Locator.of(field)
+    locator = Locator.of(sounding(positional(), noise=1e-3, samples=SAMPLES))
     gains = locator.gains[[STRUCK]].to(torch.complex128)
     (sound,) = synthesize(gains, BANK.frequency, BANK.damping, samples=SAMPLES, sample_rate=RATE)
     noise = torch.randn(SAMPLES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

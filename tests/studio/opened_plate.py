@@ -6,21 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import soundfile
-import torch
 
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import save
-from avmsf.modal.residual_noise import Residual
 from avmsf.studio.opening import Opened
 from factories.capture_folder import ring
-from factories.made_fields import BANK, FIELDS
+from factories.made_fields import FIELDS, sounding
 
 RATE = 8000
 
 
 def plate_field(kind: str = "positional") -> SoundField:
-    phase = torch.zeros(len(BANK), dtype=torch.float64)
-    return SoundField(BANK, FIELDS[kind](), phase, Residual(torch.full((9,), 1e-6)), float(RATE), 2400, Origin("plate"))
+    return sounding(FIELDS[kind](), noise=1e-6, samples=2400)
 
 
 def open_plate(home: Path, kind: str = "positional") -> Opened:

@@ -16,6 +16,7 @@ from avmsf.errors import CaptureError
 from avmsf.studio.jobs import Job, Jobs
 from avmsf.studio.responses import RequestError
 from factories.raising import raises
+from factories.running import alive, gone
 from served import run_async
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
@@ -113,21 +114,6 @@ def test_who_comes_later_gets_what_was_missed() -> None:
         return [[number async for number, _ in job.listen(after=after)] for after in (0, 3)]
 
     assert run_async(listen()) == [[0, 1, 2, 3, 4], [3, 4]]
-
-
-def alive(process: int) -> bool:
-    try:
-        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != "Z"
-
-
-def gone(processes: list[int]) -> bool:
-    deadline = time.monotonic() + 10
-    while any(map(alive, processes)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return not any(map(alive, processes))
 
 
 LIFELINE = """

@@ -1,4 +1,4 @@
-"""Sliders: pitch, decay, brightness and levels, alone, together and undone."""
+"""Sliders and edits: pitch, decay, brightness and levels, alone, together and undone, the same all over the object."""
 
 import math
 from dataclasses import replace
@@ -7,24 +7,22 @@ import pytest
 import torch
 
 from avmsf.editing.material import change_material, guess_materials, infer_material, rayleigh_damping
-from avmsf.editing.modal_edit import adjust_modes, brightness_center
+from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit, adjust_modes, brightness_center
 from avmsf.errors import EditError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
-from factories.made_fields import BANK, FIELDS, places
+from factories.made_fields import BANK, FIELDS, places, sounding
 from factories.raising import raises
 
 PLACES = places(7, seed=8)
-RATE = 8000.0
 
 
-def field(name: str = "positional") -> SoundField:
-    phase = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6], dtype=torch.float64)
-    return SoundField(BANK, FIELDS[name](), phase, Residual(torch.full((9,), 1e-9)), RATE, 600, Origin("plate"))
+def plate_field(name: str = "positional") -> SoundField:
+    phase, origin = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6]), Origin("plate", report={"gains": "made"})
+    return sounding(FIELDS[name](), phase=phase, noise=1e-9, samples=600, origin=origin)
 
 
 def change_db(before: SoundField, after: SoundField) -> torch.Tensor:
@@ -42,7 +40,7 @@ def expect_same(found: SoundField, expected: SoundField) -> None:
 
 @pytest.mark.parametrize("name", ["positional", "attention with dampings", "elastic"])
 def test_pitch_moves_frequencies_and_decay_the_ring_times(name):
-    before, factors = field(name), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
+    before, factors = plate_field(name), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
     after = adjust_modes(before, pitch=1.2, decay=factors)
     torch.testing.assert_close(after.bank.frequency, 1.2 * before.bank.frequency)
     torch.testing.assert_close(1 / after.bank.damping, factors / before.bank.damping)
@@ -56,7 +54,7 @@ def test_pitch_moves_frequencies_and_decay_the_ring_times(name):
 
 
 def test_brightness_is_decibels_an_octave_about_the_center():
-    before = field()
+    before = plate_field()
     center = brightness_center(before)
     # Gains over the whole object, by hand.
     known = before.known(before.gain_field.points)
@@ -72,7 +70,7 @@ def test_brightness_is_decibels_an_octave_about_the_center():
 
 
 def test_levels_raise_and_mute_single_modes(tmp_path):
-    before = field()
+    before = plate_field()
     after = adjust_modes(before, gains_db=[0.0, 6.0, -math.inf, -6.0, 0.0])
     assert not bool(after.gains(PLACES)[:, 2].any())
     louder = change_db(before, after)
@@ -83,7 +81,7 @@ def test_levels_raise_and_mute_single_modes(tmp_path):
 
 
 def test_two_edits_are_the_one_with_both_and_an_edit_can_be_undone():
-    before, factors = field(), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
+    before, factors = plate_field(), torch.linspace(0.5, 1.5, 5, dtype=torch.float64)
     one = {"pitch": 1.2, "decay": factors, "brightness_db": 4.0, "gains_db": 3 * factors}
     other = {"pitch": 0.7, "decay": 2.0, "brightness_db": -7.0, "gains_db": -4 * factors}
     both = {"pitch": 1.2 * 0.7, "decay": 2 * factors, "brightness_db": -3.0, "gains_db": -factors}
@@ -95,7 +93,7 @@ def test_two_edits_are_the_one_with_both_and_an_edit_can_be_undone():
 
 
 def test_modes_beyond_half_the_sample_rate_are_silent_and_come_back():
-    before = field()
+    before = plate_field()
     high = adjust_modes(before, pitch=2.0)
     assert high.origin.report["edits"][-1]["silent_hertz"] == [4600.0]
     muted = adjust_modes(high, gains_db=[0.0, 0.0, 0.0, 0.0, -math.inf])
@@ -122,22 +120,87 @@ def test_modes_beyond_half_the_sample_rate_are_silent_and_come_back():
 )
 def test_values_that_cannot_be_are_refused(name, row, value, given):
     with raises(EditError, name=name, row=row, value=value):
-        adjust_modes(field(), **{name: given})
+        adjust_modes(plate_field(), **{name: given})
     for name in ("pitch", "decay", "gains_db", "brightness_db"):
         with raises(EditError, name=name):
-            adjust_modes(field(), **{name: math.nan})
+            adjust_modes(plate_field(), **{name: math.nan})
     with raises(EditError, name="gain factor", row=0, value=math.inf):
-        adjust_modes(field(), gains_db=1e5)
+        adjust_modes(plate_field(), gains_db=1e5)
 
 
 def test_adjusted_modes_keep_the_material():
     """An octave lower, ceramic's dampings would be those of another material."""
     frequency = torch.tensor([1600.0, 2500.0, 4100.0, 6000.0, 9000.0], dtype=torch.float64)
     damping = rayleigh_damping(2.0 * math.pi * frequency, CERAMIC)
-    ceramic = replace(field(), bank=ModalBank(frequency, damping), sample_rate=48000.0)
+    ceramic = replace(plate_field(), bank=ModalBank(frequency, damping), sample_rate=48000.0)
     assert infer_material(ceramic, option="--from")[0] == CERAMIC
     lower = adjust_modes(adjust_modes(ceramic, pitch=0.25), decay=torch.linspace(0.1, 0.5, 5), brightness_db=3.0)
     assert guess_materials(lower.bank)[0][0] != CERAMIC
     assert infer_material(lower, option="--from")[0] == CERAMIC
     wooden = change_material(lower, CERAMIC, WOOD)
     assert infer_material(adjust_modes(wooden, pitch=2.0), option="--from")[0] == WOOD
+
+
+def made_edit(*, pitch: float = math.log(0.7)) -> ModalEdit:
+    return ModalEdit(
+        torch.tensor(pitch, dtype=torch.float64),
+        torch.tensor([0.02, -0.01, 0.0, 0.03, 0.0], dtype=torch.float64),
+        torch.tensor(math.log(3.0), dtype=torch.float64),
+        torch.tensor([0.0, 0.1, -0.1, 0.0, 0.2], dtype=torch.float64),
+        torch.tensor([0.0, 0.5, -0.5, 0.1, 1.0], dtype=torch.float64),
+    )
+
+
+def test_the_formula_of_the_paper():
+    field, edit = plate_field("elastic"), made_edit()
+    bank = edit.of(field).bank
+    torch.testing.assert_close(bank.frequency, 0.7 * field.bank.frequency * edit.shift.exp(), rtol=1e-13, atol=0)
+    torch.testing.assert_close(bank.damping, 3.0 * field.bank.damping * edit.damping_shift.exp(), rtol=1e-13, atol=0)
+    assert (edit.pitch_factor, edit.decay_factor) == (pytest.approx(0.7), pytest.approx(1 / 3))
+    # Gains that follow frequencies keep their product with them.
+    new = replace(edit, scale=torch.zeros(5, dtype=torch.float64)).following(field.bank).of(field)
+    contacts = places(3, seed=4)
+    before, after = (each.bank.frequency.float() * each.known(contacts).mean for each in (field, new))
+    torch.testing.assert_close(after, before, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_gain_ratios_between_contacts_stay(kind):
+    field, edit = plate_field(kind), made_edit()
+    before, after = (each.known(places(7, seed=5)) for each in (field, edit.of(field)))
+    # To the last digits of float32.
+    torch.testing.assert_close(after.mean, before.mean * edit.scale.exp().float(), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("pitch", [math.log(0.7), math.log(2.5)])
+def test_what_is_optimized_is_what_the_edited_field_renders(pitch):
+    # At 2.5 times the pitch two modes lie above half the rate, and are silent in both.
+    field, edit = plate_field("elastic"), made_edit(pitch=pitch)
+    contacts = places(4, seed=6)
+    sounds = FieldAtContacts.at(field, contacts, samples=field.samples).sounds(edit)
+    rendered = edit.of(field).render(contacts)
+    torch.testing.assert_close(sounds, rendered, rtol=0, atol=2e-6 * float(rendered.abs().max()))
+
+
+def test_an_edited_field_saves_loads_and_is_edited_again(tmp_path):
+    once = made_edit().of(plate_field("elastic"), settings={"prompt": "wood"})
+    save(once, tmp_path / "edited.safetensors")
+    again = made_edit().of(load(tmp_path / "edited.safetensors"))
+    direct = made_edit().of(once)
+    contacts = places(3, seed=8)
+    assert torch.equal(again.render(contacts), direct.render(contacts))
+    entries = again.origin.report["edits"]
+    assert [each.get("prompt") for each in entries] == ["wood", None]
+    assert [each["edit"] for each in entries] == ["guided", "guided"]
+    assert entries[0]["pitch"] == pytest.approx(0.7)
+    # As in an edit by hand: what rings a third as long.
+    assert entries[0]["decay"] == pytest.approx(1 / 3)
+    assert again.origin.report["gains"] == "made"
+
+
+def test_edits_that_cannot_be_are_refused():
+    edit = ModalEdit(*(torch.zeros(size, dtype=torch.float64) for size in ((), (3,), (), (3,), (3,))))
+    with raises(EditError, name="shift", value=3):
+        edit.of(plate_field("elastic"))
+    with raises(EditError, name="frequency", row=0, value=math.inf):
+        ModalEdit.none(plate_field("elastic").bank, pitch=800.0).of(plate_field("elastic"))
