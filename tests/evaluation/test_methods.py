@@ -125,7 +125,7 @@ def made(name: str, seed: int = 0) -> Renderer:
     return tiny(method_named(name)).fit(plate_task(parts()[0], seed=seed))
 
 
-NAMES = [name for name, entry in METHODS.items() if not entry.path and "editing" not in entry.make]
+NAMES = [name for name, entry in METHODS.items() if not entry.path and not entry.is_edit]
 # To choose takes a fit of every kind for every contact left out.
 fitted_quickly = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name == "field-auto" else name for name in NAMES]

@@ -9,9 +9,9 @@ reference, at equal level. Higher is better: `clap`, the cosine of the sounds an
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,12 @@ from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.clap import Clap, ClapCurve
-from avmsf.evaluation.methods import FieldMethod, FunctionMethod, method_named
+from avmsf.evaluation.methods import FieldMethod, method_named
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.evaluation.registry import EditProtocolSettings
 from avmsf.evaluation.splits import Case
-from avmsf.evaluation.task import Contacts, EditRequest, Sounds, Task
+from avmsf.evaluation.task import Contacts, Sounds, Task
 from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.clips import level, with_length
@@ -175,25 +175,35 @@ class Edits:
             raise EvaluationError.expected(wanted, source, got=got, name=identifier)
         return tuple(found)
 
-    def request(self, identifier: str, case: Case, field: SoundField) -> EditRequest:
-        """Return what a case asks of an object, by its fitted field. Raises as the dataset and the model do."""
+    def task(self, task: Task, case: Case, original: SoundField) -> "EditTask":
+        """Return a task with what a case asks of the object. Raises as the dataset does."""
         reference = None
         if self.settings.model is None:
             impacts = self.dataset.capture(case.goal).impacts
             reference = Reference.of(impacts.sounds, sample_rate=impacts.sample_rate, name=case.goal)
-        guide = replace(self.settings.guide, seed=self.seed)
-        return EditRequest(
-            field,
-            self.materials[identifier],
-            case.target,
-            guide if self.clap is not None else replace(guide, preview_every=0),
-            self.finder,
-            None if reference is not None else case.goal,
-            reference,
-            self.model,
-            self.clap,
-            self.settings.generated,
-        )
+        prompt = case.goal if reference is None else None
+        source = self.materials[task.name]
+        return EditTask(
+            **vars(task), original=original, source=source, target=case.target, prompt=prompt, reference=reference,
+            edits=self,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EditTask(Task):
+    """A change of one object's material."""
+
+    original: SoundField
+    """The object's field, fitted to its recordings."""
+    source: str
+    target: str
+    """Its material, and the new one."""
+    prompt: str | None
+    """What the new sound is like in words, for the model of `edits`."""
+    reference: Reference | None
+    """Sounds of the new material, in place of words."""
+    edits: Edits
+    """Models and settings of all edits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,56 +245,47 @@ class Generated:
         return self.sound.expand(len(contacts), -1)
 
 
-def edit_method(name: str, *, edit: str, **settings: Any) -> FunctionMethod:
-    """Return the method that calls the function `edit` of this module with what a task asks, and with settings."""
-    return FunctionMethod(name, partial(_edited, globals()[edit], settings))
-
-
-def _edited(change: Callable[..., Edited | Generated], settings: Mapping[str, Any], task: Task) -> Edited | Generated:
-    if task.edit is None:
-        raise EvaluationError.expected("the protocol edit", name="protocol", advice="choose other methods")
-    return change(task.edit, **settings)
-
-
-def unedited(request: EditRequest) -> Edited:
+def unedited(task: EditTask) -> Edited:
     """Return the object as it was: what an edit has to better."""
-    return Edited(request.field)
+    return Edited(task.original)
 
 
-def physics(request: EditRequest) -> Edited:
+def physics(task: EditTask) -> Edited:
     """Edit by the laws of elasticity with both materials' constants. Raises SimulationError for an unknown one."""
-    old, new = (material_named(name) for name in (request.source, request.target))
-    return Edited(change_material(request.field, old, new))
+    old, new = (material_named(name) for name in (task.source, task.target))
+    return Edited(change_material(task.original, old, new))
 
 
-def guided(request: EditRequest, *, parameters: str) -> Edited:
+def guided(task: EditTask, *, parameters: str) -> Edited:
     """Edit towards the prompt or the reference, with the parameters of this name. Raises as `edit_towards`."""
-    guide: Guide | None = request.reference
-    if request.model is not None and request.prompt is not None:
-        guide = DecoderDistillation(request.model, request.prompt, sample_rate=request.field.sample_rate)
-    if guide is None:
-        raise EvaluationError.expected("a prompt and a model, or a reference", name="edit")
-    field, config, how = request.field, request.config, PARAMETERIZATIONS[parameters]
-    if request.clap is None or request.prompt is None:
-        return Edited(edit_towards(field, guide, config=config, parameters=how))
-    curve = ClapCurve(request.clap, request.prompt, field)
-    edited = edit_towards(field, guide, config=config, parameters=how, progress=curve.add)
+    edits, field, prompt = task.edits, task.original, task.prompt
+    guide: Guide | None = task.reference
+    if edits.model is not None and prompt is not None:
+        guide = DecoderDistillation(edits.model, prompt, sample_rate=field.sample_rate)
+    assert guide is not None
+    config = replace(edits.settings.guide, seed=edits.seed)
+    if edits.clap is None or prompt is None:
+        config = replace(config, preview_every=0)
+        return Edited(edit_towards(field, guide, config=config, parameters=PARAMETERIZATIONS[parameters]))
+    curve = ClapCurve(edits.clap, prompt, field)
+    edited = edit_towards(field, guide, config=config, parameters=PARAMETERIZATIONS[parameters], progress=curve.add)
     return Edited(edited, tuple(curve.scores.items()))
 
 
-def generation(request: EditRequest) -> Generated:
+def generation(task: EditTask) -> Generated:
     """Generate a sound from the prompt (the paper's baseline), and find its modes from the onset on.
 
-    Raises EvaluationError without a model and a prompt, and as `prepare` and `extract_sounds` for a sound without an
-    impact or without modes.
+    Raises EvaluationError without a model, and as `prepare` and `extract_sounds` for a sound without an impact or
+    without modes.
     """
-    if request.model is None or request.prompt is None:
+    edits = task.edits
+    if edits.model is None or task.prompt is None:
         raise EvaluationError.expected("a text-to-audio model", name="edit.model", advice="give --set edit.model=")
-    rate, seconds = request.model.sample_rate, request.generated
-    made = request.model.generate(request.prompt, seconds=seconds, seed=request.config.seed).double().cpu()
-    recording = Recording(f"generated from {request.prompt!r}", made[None].numpy(), rate, "FLOAT")
+    rate, seconds = edits.model.sample_rate, edits.settings.generated
+    made = edits.model.generate(task.prompt, seconds=seconds, seed=edits.seed).double().cpu()
+    recording = Recording(f"generated from {task.prompt!r}", made[None].numpy(), rate, "FLOAT")
     sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))
-    modes = extract_sounds(sound[None], sample_rate=rate, method=request.finder)
+    modes = extract_sounds(sound[None], sample_rate=rate, method=edits.finder)
     return Generated(audible_modes(modes.bank, modes.gains), sound.float(), rate)
 
 
@@ -302,24 +303,20 @@ def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = m
 
 
 def score_edit(
-    edited: Edited | Generated,
-    sounds: Sounds,
-    contacts: Contacts,
-    request: EditRequest,
-    spaces: Mapping[str, MaterialSpace],
+    edited: Edited | Generated, sounds: Sounds, contacts: Contacts, task: EditTask
 ) -> tuple[dict[str, tuple[float | None, ...]], dict[str, float], dict[str, Any]]:
     """Return an edit's values for each sound, those of the whole, and what figures are drawn of, as plain values."""
+    spaces, clap = task.edits.spaces, task.edits.clap
     places = {name: space.place(edited.modes(contacts)) for name, space in spaces.items()}
-    figures = {name: space.distance(places[name], request.target) for name, space in spaces.items()}
+    figures = {name: space.distance(places[name], task.target) for name, space in spaces.items()}
     values: dict[str, tuple[float | None, ...]] = {}
-    report: dict[str, Any] = {"source": request.source, "target": request.target, "prompt": request.prompt}
+    report: dict[str, Any] = {"source": task.source, "target": task.target, "prompt": task.prompt}
     report["places"] = {name: place.tolist() for name, place in places.items()}
-    if request.reference is not None:
-        distance = spectral_distance(sounds, request.reference, sample_rate=edited.sample_rate)
+    if task.reference is not None:
+        distance = spectral_distance(sounds, task.reference, sample_rate=edited.sample_rate)
         values["spectral"] = tuple(distance.tolist())
-    if request.clap is not None and request.prompt is not None:
-        scores = request.clap.score(sounds, [request.prompt], sample_rate=edited.sample_rate)
-        values["clap"] = tuple(scores.tolist())
+    if clap is not None and task.prompt is not None:
+        values["clap"] = tuple(clap.score(sounds, [task.prompt], sample_rate=edited.sample_rate).tolist())
         if isinstance(edited, Edited) and edited.clap:
             report["clap"] = list(edited.clap)
     return values, figures, report

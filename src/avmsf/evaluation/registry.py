@@ -7,6 +7,7 @@ function. Importing this module loads nothing that computes.
 import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from avmsf.editing.config import GuidedEditConfig
@@ -79,6 +80,8 @@ class MethodEntry:
     """The folder or file that it reads, as the setting `path`, for a method whose name goes on with `:` and a path."""
     is_folder: bool = False
     """Whether that is a folder."""
+    is_edit: bool = False
+    """Whether it edits sounds, of the protocol `edit` alone; its function gets an `editing.EditTask`."""
 
 
 def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
@@ -87,9 +90,13 @@ def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
 
 _process, _network = (_made("methods:field_method", visual_input=each) for each in ("surface", "visual"))
 _paper = _made("methods:field_method", visual_input="paper", published=True)
-_EDIT = "editing:edit_method"
-"""Makes the methods of the protocol `edit`."""
-_edit, _guided = _made(_EDIT), _made(_EDIT, edit="guided")
+_edit = partial(MethodEntry, is_edit=True)
+
+
+def _guided(title: str, parameters: str) -> MethodEntry:
+    return _edit(title, "editing:guided", settings={"parameters": parameters})
+
+
 METHODS: dict[str, MethodEntry] = {
     "white-noise": MethodEntry("Gaussian noise at the level of the training recordings", "methods:white_noise"),
     "random-impact": MethodEntry("a recording of another object", "methods:random_impact"),
@@ -170,13 +177,13 @@ METHODS: dict[str, MethodEntry] = {
         path="a folder with a folder of wav files for every object",
         is_folder=True,
     ),
-    "unedited": _edit("the field before the edit", edit="unedited"),
-    "generation": _edit("a sound that the model generates from the prompt alone", edit="generation"),
-    "edit-independent": _guided("guided edit of every mode by itself (Audio-SDS)", parameters="independent"),
-    "edit-published": _guided("guided edit with the paper's parameters", parameters="published"),
-    "edit-hierarchical": _guided("guided edit with this package's parameters", parameters="hierarchical"),
-    "edit-searched": _guided("guided edit of every mode by itself, after a search", parameters="searched"),
-    "edit-physics": _edit("the laws of elasticity with both materials' constants", edit="physics"),
+    "unedited": _edit("the field before the edit", "editing:unedited"),
+    "generation": _edit("a sound that the model generates from the prompt alone", "editing:generation"),
+    "edit-independent": _guided("guided edit of every mode by itself (Audio-SDS)", "independent"),
+    "edit-published": _guided("guided edit with the paper's parameters", "published"),
+    "edit-hierarchical": _guided("guided edit with this package's parameters", "hierarchical"),
+    "edit-searched": _guided("guided edit of every mode by itself, after a search", "searched"),
+    "edit-physics": _edit("the laws of elasticity with both materials' constants", "editing:physics"),
 }
 """All methods by name, in the order of tables."""
 _TABLE = (
@@ -303,13 +310,13 @@ def method_entry(name: str) -> MethodEntry:
 def suited_methods(protocol: str) -> list[str]:
     """Return the names of the methods that edit sounds, or of those that predict them, as the protocol asks."""
     edits = PROTOCOLS[protocol].scoring == "edits"
-    return [name for name, row in METHODS.items() if (row.make == _EDIT) == edits]
+    return [name for name, row in METHODS.items() if row.is_edit == edits]
 
 
 def expect_suited(method: str, protocol: str) -> None:
     """Raise `EvaluationError` for a method whose sounds cannot be those of the protocol's training recordings."""
     edits = PROTOCOLS[protocol].scoring == "edits"
-    if (method_entry(method).make == _EDIT) != edits:
+    if method_entry(method).is_edit != edits:
         wanted = f"a method that {'edits' if edits else 'predicts'} sounds, such as {PROTOCOLS[protocol].methods[0]}"
         raise EvaluationError.expected(f"{wanted}, for {protocol}", method, name="method")
     if kind_of(method) == "recorded" and protocol == "shots":

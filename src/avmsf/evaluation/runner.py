@@ -19,7 +19,7 @@ from avmsf._utils.device import one_thread
 from avmsf._utils.parallel import run_tasks, workers_at
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError, WorkerError
-from avmsf.evaluation.editing import Edited, Generated, score_edit
+from avmsf.evaluation.editing import Edited, EditTask, Generated, score_edit
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import FieldMethod, RecordedMethod, method_named
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
@@ -130,7 +130,7 @@ class CaseRun:
             task = self._aligned_task(recordings)
             if edits is not None:
                 field = self._shared(self._stored_field)(edits.field_method, task)
-                task = replace(task, edit=edits.request(self.data.identifier, self.case, field))
+                task = edits.task(task, self.case, field)
             renderer, fit_seconds = self._fitted(method, task)
             begun = time.perf_counter()
             with torch.no_grad():
@@ -138,9 +138,8 @@ class CaseRun:
             render_seconds = time.perf_counter() - begun
             maps, report = dict[str, str](), report_of(renderer)
             figures: Mapping[str, float | None] = {}
-            if edits is not None and task.edit is not None and isinstance(renderer, Edited | Generated):
-                contacts = recordings.test.contacts
-                values, figures, report = score_edit(renderer, sounds, contacts, task.edit, edits.spaces)
+            if isinstance(task, EditTask) and isinstance(renderer, Edited | Generated):
+                values, figures, report = score_edit(renderer, sounds, recordings.test.contacts, task)
             elif self.evaluation.protocol.scoring == "contacts":
                 values, maps = self._located(method.name, recordings, renderer, published)
             else:

@@ -11,17 +11,12 @@ from torch import Tensor
 
 from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.capture.impacts import Impacts
-from avmsf.editing.config import GuidedEditConfig
-from avmsf.editing.reference import Reference
-from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.clap import Clap
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.finders import ModeFinder
 
 Contacts = Float[Tensor, "contacts 3"]
 """Points in the object frame, meters; or as directions, unit vectors."""
@@ -88,31 +83,6 @@ length 1."""
 
 
 @dataclass(frozen=True, eq=False)
-class EditRequest:
-    """A change of one object's material."""
-
-    field: SoundField
-    """The object's field, fitted to its recordings."""
-    source: str
-    target: str
-    """Its material, and the new one."""
-    config: GuidedEditConfig
-    """Settings of a descent."""
-    finder: ModeFinder
-    """How modes of a generated sound are found."""
-    prompt: str | None = None
-    """What the new sound is like in words; goes with a model."""
-    reference: Reference | None = None
-    """Sounds of the new material, in place of words."""
-    model: StableAudio | None = None
-    """Text-to-audio model."""
-    clap: Clap | None = None
-    """The network of the CLAP score, if there is one."""
-    generated: float = 3.0
-    """Seconds of a sound that is generated from the prompt alone."""
-
-
-@dataclass(frozen=True, eq=False)
 class Task:
     """One object and one choice of training contacts.
 
@@ -148,8 +118,6 @@ class Task:
     """Material of the object in the dataset, in lower case; None where it is unknown."""
     device: str | None = None
     """Device to train on; None for a GPU where there is one."""
-    edit: EditRequest | None = None
-    """What is asked of the object by the protocol `edit`."""
 
 
 @runtime_checkable
