@@ -338,4 +338,4 @@ def test_a_field_written_at_fewer_contacts_than_it_has_says_so_unless_they_are_a
         avmsf.write(field(), tmp_path / str(contacts), to="wavs", contacts=contacts).remarks for contacts in (None, 3)
     ]
     said = [[each for each in remarks if "of the field's" in each] for remarks in said]
-    assert said == [[f"written: 16 of the field's {held} contacts; contacts= sets the number"], []]
+    assert said == [[f"written: 16 of the field's {held} contacts; `contacts` sets the number"], []]

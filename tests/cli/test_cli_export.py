@@ -154,7 +154,6 @@ WRONG: dict[str, dict[str, Any]] = {
     "wavs s2.wav": {"file": "s2.wav", "name": "suffix", "value": ".wav"},
     "web page.glb": {"file": "page.glb", "name": "suffix", "value": ".glb"},
     "faust a": {"file": "a", "name": "suffix", "value": ""},
-    "sfz s": {"name": "--to", "value": "sfz"},
     "wavs out --contacts 0": {"name": "--contacts", "value": 0},
     "wavs out --forces 1 2 3 --contact-times 0 0": {"name": "--contact-times", "value": 2},
     "wavs out --position 0.05 0.03 0.002 --contacts 3": {"name": "--position", "value": 2},

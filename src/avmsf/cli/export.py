@@ -2,15 +2,14 @@
 
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from avmsf._utils.text import counted, format_number
+from avmsf._utils.text import format_number
 from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
 from avmsf.cli.many import Many, run_many
@@ -25,10 +24,8 @@ from avmsf.pipeline.config import CACHE, SURFACE
 if TYPE_CHECKING:
     from avmsf.export.sampled_field import SampledField
     from avmsf.field.sound_field import SoundField
+    from avmsf.gaussians.cloud import GaussianCloud
     from avmsf.mesh.surface import Surface
-
-    _Prepared = tuple[SampledField, dict[str, Any]]
-    """What a writer writes, and its settings."""
 
 _CONTACTS = ("position", "contact_table", "unit")
 _USED: dict[Format, tuple[str, ...]] = {
@@ -150,13 +147,6 @@ class Options(Many):
         (New(suffixes, or_folder=self.to == "web") if suffixes else New()).check(self.output)
         check_free(self.output, folder=self.output.suffix.lower() not in suffixes, overwrite=self.overwrite)
 
-    @classmethod
-    def parse(cls, words: Sequence[str]) -> "Options":
-        """Return the options that the words spell."""
-        if ("--to", "sfz") in pairwise(words):
-            raise ExportError.expected("--to wavs, which writes an SFZ instrument too", "sfz", name="--to")
-        return super().parse(words)
-
 
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
@@ -164,16 +154,21 @@ def run(options: Options) -> int:
         return run_many("export", options, raising=ExportError)
     from avmsf.export.faust import contacts_path
     from avmsf.export.samples import INSTRUMENT
-    from avmsf.export.write import WRITERS
+    from avmsf.export.write import write
     from avmsf.field.store import load
 
     for each in fields(options):
         users = [name for name, used in _USED.items() if each.name in used]
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
-    source, settings = _prepared(load(options.field), options)
-    source = source.without_noise() if options.no_noise else source
-    written = WRITERS[options.to](source, options.output, overwrite=options.overwrite, **settings)
+    field = load(options.field)
+    source, settings = _source(field, options), _settings(field, options)
+    if options.to == "avmsf-demo" and options.object is not None:
+        source, settings["cloud"] = _at_gaussians(field, options.object, options.contacts or FORMATS[options.to].points)
+    written = write(
+        source, options.output, to=options.to, contacts=options.contacts, noise=not options.no_noise,
+        overwrite=options.overwrite, **settings,
+    )  # fmt: skip
     for remark in written.remarks:
         note(remark)
     if written.error:
@@ -202,47 +197,39 @@ def run(options: Options) -> int:
     following = _NEXT.get(options.output.suffix.lower(), _NEXT[options.to])
     next_step(following.format(shlex.quote(str(options.output)), options.output.name))
     if options.to == "wavs" and len(options.forces) < 2:
-        forces = " ".join(format_number(factor * source.average_force, 2) for factor in (0.3, 1.0, 3.0))
+        forces = " ".join(format_number(factor * (field.residual.force or 1.0), 2) for factor in (0.3, 1.0, 3.0))
         next_step(f"the same command with --overwrite --forces {forces}, for a layer at each force")
     return 0
 
 
-def _prepared(field: "SoundField", options: Options) -> "_Prepared":
-    """Return what a format's writer writes, and its settings."""
-    match options.to:
-        case "web":
-            return _sampled(field, options), _page_settings(field, options)
-        case "gltf":
-            shown, meters = _object(field, options)
-            return _sampled(field, options), {"object": shown, "meters": meters, "up": options.up}
-        case "faust":
-            sampled = _sampled(field, options)
-            asked = options.contacts is not None or options.contacts_given
-            return sampled, {"contacts": len(sampled) if asked else None}
-        case "wavs":
-            return _wavs(field, options)
-        case "uff":
-            return _sampled(field, options), {"functions": options.functions}
-        case "avmsf-demo":
-            return _demo(field, options)
-
-
-def _sampled(field: "SoundField", options: Options) -> "SampledField":
-    """Return the field at the contacts of the options, or at its own points spread over the object."""
+def _source(field: "SoundField", options: Options) -> "SoundField | SampledField":
+    """Return the field, or what it is at the contacts of the options."""
     from avmsf.cli.contacts import check_given_contacts, given_contacts
     from avmsf.export.sampled_field import SampledField
-    from avmsf.field.positions import points_on_object
 
-    if options.contacts_given:
-        contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
-        check_given_contacts(contacts, field)
-        return SampledField.of(field, contacts.places, directions=contacts.directions)
-    points = points_on_object(field.gain_field)
-    sampled = SampledField.of(field, points, limit=options.contacts or FORMATS[options.to].points)
-    if len(sampled) < len(points) and options.contacts is None:
-        held = counted(len(points), "contact")
-        note(f"written: {len(sampled)} of the field's {held}; --contacts sets the number")
-    return sampled
+    if not options.contacts_given:
+        return field
+    contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
+    check_given_contacts(contacts, field)
+    return SampledField.of(field, contacts.places, directions=contacts.directions)
+
+
+def _settings(field: "SoundField", options: Options) -> dict[str, Any]:
+    """Return the settings of a format's writer."""
+    match options.to:
+        case "web":
+            return _page_settings(field, options)
+        case "gltf":
+            shown, meters = _object(field, options)
+            return {"object": shown, "meters": meters, "up": options.up}
+        case "faust":
+            return {}
+        case "wavs":
+            return _wav_settings(options, field.residual.force or 1.0)
+        case "uff":
+            return {"functions": options.functions}
+        case "avmsf-demo":
+            return {"variant": options.variant, "precision": options.precision}
 
 
 def _object(field: "SoundField", options: Options) -> "tuple[Path | Surface | None, float]":
@@ -313,36 +300,31 @@ def _page_settings(field: "SoundField", options: Options) -> dict[str, Any]:
     }
 
 
-def _demo(field: "SoundField", options: Options) -> "_Prepared":
+def _at_gaussians(field: "SoundField", path: Path, limit: int) -> "tuple[SampledField, GaussianCloud]":
+    """Return the field at Gaussians of a file, and these, at most `limit`. Raises `ExportError` for another file."""
     from avmsf.export.geometry import read_gaussians
     from avmsf.export.sampled_field import SampledField, spread_rows
     from avmsf.field.positions import points_on_object
 
-    source, most = options.object, options.contacts or FORMATS["avmsf-demo"].points
-    settings = {"variant": options.variant, "precision": options.precision}
-    if source is None:
-        return _sampled(field, options), settings
-    cloud = read_gaussians(source, points_on_object(field.gain_field))
+    cloud = read_gaussians(path, points_on_object(field.gain_field))
     if cloud is None:
         wanted, advice = "a .ply of Gaussians", "name one, or leave --object out for a disc at each contact"
-        raise ExportError.expected(wanted, got="another file", file=source, name="--object", advice=advice)
-    _note_size(field, source)
-    if len(cloud) > most:
-        cloud = cloud.take(spread_rows(cloud.centers, most))
-    return SampledField.of(field, cloud.centers), {**settings, "cloud": cloud}
+        raise ExportError.expected(wanted, got="another file", file=path, name="--object", advice=advice)
+    _note_size(field, path)
+    if len(cloud) > limit:
+        cloud = cloud.take(spread_rows(cloud.centers, limit))
+    return SampledField.of(field, cloud.centers), cloud
 
 
-def _wavs(field: "SoundField", options: Options) -> "_Prepared":
+def _wav_settings(options: Options, average_force: float) -> dict[str, Any]:
     from avmsf.export.samples import Layer, hertz_layers
 
-    sampled = _sampled(field, options)
-    forces, times = options.forces or (sampled.average_force,), options.contact_times
+    forces, times = options.forces or (average_force,), options.contact_times
     if len(times) == 1:
         times = times * len(forces)
     if times and len(times) != len(forces):
         wanted = f"one, or one for each of {len(forces)} --forces"
         raise ExportError.expected(wanted, len(times), name="--contact-times")
     layers = tuple(Layer(force, each, options.pulse) for force, each in zip(forces, times, strict=False))
-    layers = layers or hertz_layers(forces, options.pulse)
-    settings = {"layers": layers, "seconds": options.seconds, "contacts": len(sampled)}
-    return sampled, settings | ({"range_db": math.inf} if options.contacts_given else {})
+    settings = {"layers": layers or hertz_layers(forces, options.pulse), "seconds": options.seconds}
+    return settings | ({"range_db": math.inf} if options.contacts_given else {})

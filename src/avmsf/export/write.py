@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from avmsf._utils.text import counted
 from avmsf.errors import ExportError
 from avmsf.export import write_demo, write_faust, write_gltf, write_grid, write_universal, write_webpage
 from avmsf.export.sampled_field import SampledField
@@ -26,7 +25,7 @@ WRITERS: dict[Format, Callable[..., Written]] = {
 
 
 def write(
-    field: SoundField,
+    field: SoundField | SampledField,
     output: str | Path,
     *,
     to: Format | None = None,
@@ -37,7 +36,7 @@ def write(
     """Write a field for other tools.
 
     Args:
-        field: The field.
+        field: The field, or what it is at points of your own, all of which are written.
         output: File or folder. The ending decides the format: .html a web page, .glb glTF, .dsp and .lib Faust, .uff
             modal analysis.
         to: The format of a folder: "web", "wavs" (a sample set) or "avmsf-demo" (the layout of the paper's demo).
@@ -62,13 +61,17 @@ def write(
             file=output,
             name="to",
         )
-    sampled = SampledField.of(field, limit=FORMATS[kind].points if contacts is None else contacts)
-    sampled = sampled if noise else sampled.without_noise()
-    if kind == "wavs" or (kind == "faust" and contacts is not None):
+    remarks: tuple[str, ...] = ()
+    if isinstance(field, SampledField):
+        sampled = field
+    else:
+        sampled = SampledField.of(field, limit=FORMATS[kind].points if contacts is None else contacts)
+        held = len(points_on_object(field.gain_field))
+        if contacts is None and len(sampled) < held:
+            remarks = (f"written: {len(sampled)} of the field's {held} contacts; `contacts` sets the number",)
+    if not noise:
+        sampled = sampled.without_noise()
+    if kind == "wavs" or (kind == "faust" and (contacts is not None or isinstance(field, SampledField))):
         options = {"contacts": len(sampled), **options}
     written = WRITERS[kind](sampled, output, **options)
-    held = len(points_on_object(field.gain_field))
-    if contacts is not None or len(sampled) == held:
-        return written
-    remark = f"written: {len(sampled)} of the field's {counted(held, 'contact')}; contacts= sets the number"
-    return replace(written, remarks=(remark, *written.remarks))
+    return replace(written, remarks=(*remarks, *written.remarks))
