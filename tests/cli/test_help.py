@@ -1,4 +1,4 @@
-"""What `--help` prints of every verb, and hints for names of earlier versions."""
+"""What `--help` prints of every verb, and settings by name."""
 
 import re
 from dataclasses import replace
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.cli import RENAMED, VERBS, main
+from avmsf.cli import VERBS, main
 from avmsf.cli.edit import Options as EditOptions
 from avmsf.cli.evaluate import Options as EvaluateOptions
 from avmsf.cli.fit import Options as FitOptions
@@ -20,13 +20,6 @@ from factories.raising import raises
 Streams = pytest.CaptureFixture[str]
 MOST_LINES = 50
 """Of a help at 80 columns."""
-
-
-def test_names_of_earlier_versions_lead_to_those_of_today(capsys: Streams) -> None:
-    words = {word: [word] for word in RENAMED} | {"--at": ["render", "field.safetensors", "--at", "0", "0", "0"]}
-    for word, command in words.items():
-        assert main(command) == 2
-        assert RENAMED.get(word, "--position") in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -1,6 +1,5 @@
 """A capture folder: `impacts.csv`, its wav files, perhaps `capture.toml` and a surface; read, checked and written."""
 
-import csv
 import json
 import warnings
 from collections.abc import Collection, Iterator, Sequence
@@ -10,7 +9,7 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from avmsf._utils.files import new_folder
-from avmsf._utils.text import counted, listed
+from avmsf._utils.text import counted, csv_text, listed
 from avmsf.capture.audio import Recording, read_recording, wav_bytes
 from avmsf.capture.checks import check_contacts, check_surface, find_surface
 from avmsf.capture.filenames import files_in, number_key
@@ -194,12 +193,10 @@ def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None)
         header, columns = [*header, *DIRECTION], [*columns, impacts.directions]
     if impacts.forces is not None:
         header, columns = [*header, FORCE], [*columns, impacts.forces[:, None]]
-    with open(folder / TABLE, "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(header)
-        # Seventeen digits hold a float64 exactly.
-        for name, values in zip(names, torch.cat(columns, dim=1).tolist(), strict=True):
-            table.writerow([name, *(f"{value:.17g}" for value in values)])
+    # Seventeen digits hold a float64 exactly.
+    digits = [[f"{value:.17g}" for value in values] for values in torch.cat(columns, dim=1).tolist()]
+    table = csv_text([header, *([name, *cells] for name, cells in zip(names, digits, strict=True))])
+    (folder / TABLE).write_text(table, encoding="utf-8", newline="")
     if capture.surface is not None:
         write_surface(capture.surface, folder / "surface.ply")
     # TOML's strings are JSON's, but for the character 127.

@@ -45,24 +45,6 @@ VERBS = {
     "demo": "Run a complete example: from photographs and recordings of a mug to its sound field, sounds and images.",
 }
 """Each verb's module in this package, and the first sentence of its help, in the order of the work."""
-RENAMED = {
-    "play": "studio",
-    "dataset": "check",
-    "lift": "fit --until features",
-    "features": "fit --until features",
-    "splat": "fit --until gaussians",
-    "surface": "fit --until surface",
-    "reconstruct": "fit",
-    "train": "fit",
-    "view-cloud": "info",
-    "show": "info",
-    "efficiency": "evaluate shots",
-    "learning": "evaluate shots",
-    "help": "--help",
-    "version": "--version",
-    "-V": "--version",
-}
-"""What does the work of verbs of earlier versions, and of words that other programs know."""
 BAD_INPUT = 2
 """The exit code of input that cannot be used."""
 INTERRUPTED, CLOSED, TERMINATED = 130, 141, 143
@@ -201,7 +183,7 @@ def _explain(words: list[str]) -> int:
     """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
     if words and words[0] not in ("-h", "--help"):
         given = None if words[0] in _COMMON else words[0]
-        near = [RENAMED[words[0]]] if words[0] in RENAMED else get_close_matches(words[0], VERBS, n=1)
+        near = get_close_matches(words[0], VERBS, n=1)
         advice = f"did you mean {near[0]}? `avmsf --help` lists all" if near else "`avmsf --help` lists all"
         return _fail(AvmsfError.expected("a command", given, name="avmsf", advice=advice))
     indent = max(map(len, VERBS)) + 4

@@ -4,12 +4,11 @@ The folder of `--output` has a file or folder for each input, by its name, next 
 what is complete is not made again. It also has `results.csv`, a row for each input, with the reason where it failed.
 """
 
-import csv
 import io
 import json
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -19,7 +18,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 from avmsf._utils.caching import source_digest
 from avmsf._utils.files import write_whole
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, csv_text
 from avmsf.cli.options import Common, option_of
 from avmsf.cli.output import display, next_step, note, print_json, show, show_plainly, table
 from avmsf.cli.paths import Existing, InputError, New, OutputError, arg, path_mark
@@ -132,7 +131,8 @@ def run_many(verb: str, options: Many, *, raising: type[AvmsfError]) -> int:
         finally:
             rows = [_row(options, name, found[name]) for name in tasks if name in found]
             if rows:
-                write_whole(folder / RESULTS, _csv(rows), raising=OutputError)
+                cells = [list(rows[0]), *(row.values() for row in rows)]
+                write_whole(folder / RESULTS, csv_text(cells), raising=OutputError)
     failures = [row for row in rows if row["failure"]]
     heads = [each for each in rows[0] if each != "failure"]
     title = f"{counted(len(rows), 'input')}, {len(failures)} failed"
@@ -190,13 +190,6 @@ def _row(options: Many, name: str, values: Values) -> dict[str, str]:
     cells = {head: str(cell) for head, cell in options.cells(values).items()}
     seconds = f"{values['seconds']:.1f}" if "seconds" in values else ""
     return {"name": name, "state": values["state"], "seconds": seconds, **cells, "failure": values.get("failure", "")}
-
-
-def _csv(rows: Sequence[Mapping[str, str]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([list(rows[0]), *(list(row.values()) for row in rows)])
-    return text.getvalue()
 
 
 def _absolute(options: M) -> M:

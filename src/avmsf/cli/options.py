@@ -25,8 +25,6 @@ Name = Annotated[str | None, arg("NAME")]
 """Options that may be left out."""
 Device = Annotated[str | None, arg("cpu|cuda")]
 Unit = Literal["m", "cm", "mm", "in", "ft"]
-_RENAMED = {"--at": "--position", "--picture": "--plots", "--to-material": "--to"}
-"""Options of earlier versions, and what they are called now."""
 _BORDERS = re.compile(r"[─│╭╮╰╯|+]|-{3,}")
 """What tyro draws around a message."""
 _MORE = re.compile(r"Argument helptext:|For full helptext|Got errors:")
@@ -68,11 +66,8 @@ class Common:
 def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | None = None) -> T:
     """Return the options that the words spell; leaves by SystemExit for help.
 
-    Raises `InputError` for what cannot be understood, and for an option that has another name now.
+    Raises `InputError` for what cannot be understood.
     """
-    for word in words:
-        if word in _RENAMED:
-            raise InputError.expected(_RENAMED[word], got=word, name=word)
     given: dict[str, Any] = {} if default is None else {"default": default}
     try:
         with redirect_stderr(io.StringIO()) as box:

@@ -1,13 +1,11 @@
 """`avmsf suggest`: where to record next, as a table, a list and a figure."""
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from avmsf._utils.text import counted, format_number
+from avmsf._utils.text import counted, csv_text, format_number
 from avmsf.cli.options import Common, Flag, expect_capture, read_settings
 from avmsf.cli.output import doing, next_step, print_json, say, show, table
 from avmsf.cli.paths import FieldFile, OtherCapture, PictureFolder, SettingsFile
@@ -118,10 +116,8 @@ def _write(folder: Path, field: "SoundField", found: "Suggestions", rows: Sequen
     from avmsf.plotting.pictures import save_picture
     from avmsf.plotting.uncertainty import draw_uncertainty
 
-    words = io.StringIO()
     digits = [[f"{each:.6g}" if isinstance(each, float) else each for each in row] for row in rows]
-    csv.writer(words, lineterminator="\n").writerows(digits)
-    write_whole(folder / TABLE, words.getvalue())
+    write_whole(folder / TABLE, csv_text(digits))
     points = field.gain_field.points[:: max(1, len(field.gain_field.points) // _DRAWN_POINTS)]
     picture = draw_uncertainty(
         points,

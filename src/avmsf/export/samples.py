@@ -1,7 +1,5 @@
 """A grid of impacts as wav files, with a table of them and an SFZ instrument, for samplers."""
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ import torch
 from jaxtyping import Float32, Float64, Int, Int64
 from torch import Tensor
 
-from avmsf._utils.text import counted
+from avmsf._utils.text import counted, csv_text
 from avmsf.capture.audio import wav_bytes
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
@@ -109,7 +107,7 @@ def write_grid(
             how = (f"{layer.force:g}", f"{layer.contact_time:g}", LOWEST_NOTE + place, *range_)
             record = (name, *where, *how, f"{samples / rate:.6g}", level, row)
             records.append(dict(zip(COLUMNS, record, strict=True)))
-    files[TABLE] = _table(records).encode()
+    files[TABLE] = csv_text([COLUMNS, *(record.values() for record in records)]).encode()
     files[INSTRUMENT] = _instrument(field.name, records, curves).encode()
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in ordered]
@@ -154,14 +152,6 @@ def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
         advice = "fit the field again, or export smaller forces"
         raise ExportError.expected("finite numbers", got="NaN or infinity", name="samples", advice=advice)
     return wav_bytes(sound.numpy(), rate)
-
-
-def _table(records: Sequence[Mapping[str, object]]) -> str:
-    memory = io.StringIO()
-    writer = csv.DictWriter(memory, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(records)
-    return memory.getvalue()
 
 
 def _curves(amplitude: Float64[np.ndarray, " layers"], edges: Int[np.ndarray, " edges"]) -> list[str]:

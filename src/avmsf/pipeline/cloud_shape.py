@@ -28,8 +28,7 @@ def shape_of_cloud(cloud: GaussianCloud, views: Sequence[View] = (), *, cells: i
     """Return the shape of the object that Gaussians show; masks of views say where its outlines are.
 
     Where fewer than 3 views have masks, pictures of the Gaussians from all sides stand for them. Raises SceneError for
-    numbers that are not finite, for fewer than 100 Gaussians that can be seen, for Gaussians in one place, and as
-    `object_surface` does.
+    fewer than 100 Gaussians that can be seen, for Gaussians in one place, and as `object_surface` does.
     """
     cloud = _visible(cloud)
     rasterizer = choose_rasterizer(cloud.centers.device)
@@ -57,13 +56,6 @@ def views_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer, *, size: int) -
 
 def _visible(cloud: GaussianCloud) -> GaussianCloud:
     """Return the Gaussians of enough opacity to be seen. Raises SceneError where they cannot be an object."""
-    for name, values in vars(cloud).items():
-        wrong = torch.nonzero(~torch.isfinite(values.detach().reshape(len(values), -1)).all(1)).flatten()
-        if len(wrong):
-            row, advice = int(wrong[0]), "remove what is not finite with GaussianCloud.take"
-            found = values[row].tolist()
-            got = f"{found} ({len(wrong)} Gaussians)"
-            raise SceneError.expected("finite numbers", found, got=got, row=row, name=name, advice=advice)
     visible = cloud.detach().take(cloud.opacities.detach() >= _MIN_OPACITY)
     advice = "fit the Gaussians again, with more steps or better masks"
     if len(visible) < _MIN_COUNT:
