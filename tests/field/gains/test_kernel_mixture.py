@@ -15,6 +15,7 @@ from avmsf.field.gains.mixture import (
     Hypotheses,
     KernelMixture,
     log_evidence,
+    mean_magnitude,
     posterior_weights,
 )
 from oracles import gain_model as oracle
@@ -118,8 +119,8 @@ def test_evidence_does_not_depend_on_the_batches(monkeypatch):
 def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
     joint = torch.from_numpy(joint_kernels().copy())
     cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
-    mean = torch.einsum("hpc,hcs->ps", cross, mixture().solve())
-    spread = (mixture().second_moment(cross, own) - mean.square()).sqrt()
+    mean, square = mixture().average(cross, own, lambda mean, _: mean, lambda mean, variance: mean.square() + variance)
+    spread = (square - mean.square()).sqrt()
     for series in range(SERIES):
         expected = textbook_prediction(
             list(range(CONTACTS)), list(range(CONTACTS, CONTACTS + PLACES)), series, noise=False
@@ -150,17 +151,16 @@ def test_the_prior_of_the_scale_is_integrated_over():
     assert difference == pytest.approx(np.tile(difference[:1], (KERNELS, 1)), abs=1e-6)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_mean_magnitude_is_that_of_draws_from_the_hypotheses(share):
-    """Without their deviations for a share of zero."""
+def test_mean_magnitude_is_that_of_draws_from_the_hypotheses():
+    """With their deviations and without."""
     joint = torch.from_numpy(joint_kernels().copy())
     cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
-    found = mixture().mean_magnitude(cross, own, share)
+    found = mixture().average(cross, own, mean_magnitude, lambda mean, _: mean.abs())
+    places = list(range(CONTACTS, CONTACTS + PLACES))
     for series in range(SERIES):
-        places = list(range(CONTACTS, CONTACTS + PLACES))
         expected = textbook_prediction(list(range(CONTACTS)), places, series, noise=False)
-        both = (1.0 - share) * expected.of_means + share * expected.magnitude
-        assert found[:, series].numpy() == pytest.approx(both, rel=1e-4, abs=1e-12)
+        assert found[0][:, series].numpy() == pytest.approx(expected.magnitude, rel=1e-4, abs=1e-12)
+        assert found[1][:, series].numpy() == pytest.approx(expected.of_means, rel=1e-4, abs=1e-12)
 
 
 def test_standard_error_is_the_root_of_the_mean_noise_variance():
@@ -174,13 +174,12 @@ def test_standard_error_is_the_root_of_the_mean_noise_variance():
 
 
 def test_smoother_takes_the_values_to_the_mean_at_the_contacts():
-    mean = torch.einsum("hpc,hcs->ps", mixture().kernels, mixture().solve())
-    smoothed = torch.einsum("scd,ds->cs", mixture().smoother(), mixture().values)
-    assert torch.allclose(smoothed, mean, rtol=1e-9, atol=1e-12)
     other = torch.randn(CONTACTS, SERIES, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
-    moved = replace(mixture(), values=other)
-    mean = torch.einsum("hpc,hcs->ps", moved.kernels, moved.solve())
-    assert torch.allclose(torch.einsum("scd,ds->cs", mixture().smoother(), other), mean, rtol=1e-9, atol=1e-12)
+    for given in (mixture(), replace(mixture(), values=other)):
+        own = torch.diagonal(given.kernels, dim1=1, dim2=2)
+        (mean,) = given.average(given.kernels, own, lambda mean, _: mean)
+        smoothed = torch.einsum("scd,ds->cs", mixture().smoother(), given.values)
+        assert torch.allclose(smoothed, mean, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("groups", [torch.arange(CONTACTS), GROUPS])

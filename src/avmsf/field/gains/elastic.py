@@ -124,13 +124,6 @@ class Elastic(KernelFamily):
         mixed = (one @ other.flatten(0, 1).T).reshape(len(one), *other.shape[:2]).transpose(0, 1)
         return mixed + self._residual_kernel(sites, others) * self.shares[:, -1, None, None]
 
-    def mean(
-        self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
-    ) -> Float64[Tensor, "sites series"]:
-        """Return the family's part of the means: the sum over the known impacts comes before the places."""
-        weights = torch.einsum("cj,jcs->js", self._along(known), coefficients[:-1])
-        return self._along(sites) @ weights + self._residual_kernel(sites, known) @ coefficients[-1]
-
     def categories(self) -> Int[Tensor, " kernels"]:
         """Return one category for each profile and remainder: the shape that is its center has a prior of its own."""
         one = torch.arange(_PROFILES * len(RESIDUALS)).reshape(_PROFILES, 1, len(RESIDUALS))

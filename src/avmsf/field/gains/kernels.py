@@ -176,18 +176,6 @@ class KernelFamily(ABC):
         """Return the kernels of each impact with itself."""
         return self.shares @ self.diagonal(sites)
 
-    def coefficients(
-        self, solved: Float64[Tensor, "kernels contacts series"]
-    ) -> Float64[Tensor, "basis contacts series"]:
-        """Return the coefficients of the basis in the means, from those of the kernels (`KernelMixture.solve`)."""
-        return torch.einsum("hb,hcs->bcs", self.shares, solved)
-
-    def mean(
-        self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
-    ) -> Float64[Tensor, "sites series"]:
-        """Return the family's part of the means at impacts, whose coefficients are those of the known impacts."""
-        return torch.einsum("bpc,bcs->ps", self.basis(sites, known), coefficients)
-
 
 def scaled(
     shares: Float64[Tensor, "kernels basis"], diagonal: Float64[Tensor, "basis contacts"]

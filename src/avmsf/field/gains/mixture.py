@@ -26,7 +26,7 @@ to series. So a series whose few values say little borrows from the others (MacK
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -54,6 +54,9 @@ _MEMORY = 4_000_000
 _TOGETHER = 64
 """Kernels whose predictions are one product."""
 _TINY = torch.finfo(torch.float64).tiny
+
+Statistic = Callable[[Float64[Tensor, "some pairs places"], Float64[Tensor, "some pairs places"]], Tensor]
+"""Of normal values, from their means and variances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,18 +137,6 @@ class KernelMixture:
         """Eigenvalues and eigenvectors of the kernels."""
         return _eigen(self.kernels)
 
-    @cached_property
-    def projected(self) -> Float64[Tensor, "kernels contacts series"]:
-        """The values along the eigenvectors, z = U' y."""
-        return self.eigen[1].mT @ self.values
-
-    def solve(self) -> Float64[Tensor, "kernels contacts series"]:
-        """Return the sum over noise shares of weight times C^-1 y: a mean at a place is k' times it, over kernels."""
-        pairs = self._pairs
-        averaged = self.projected.new_zeros(len(self.kernels), self.values.shape[1], len(self.values))
-        averaged.index_put_((pairs.kernel, pairs.series), pairs.weight[:, None] * pairs.solved, accumulate=True)
-        return self.eigen[1] @ averaged.mT
-
     def standard_error(self) -> Float64[Tensor, " series"]:
         """Return the standard deviation of the noise in each value."""
         return self._summed(self._pairs.weight * self._pairs.scale * self._pairs.variance).sqrt()
@@ -180,7 +171,7 @@ class KernelMixture:
             found.mean[rows] = self.values[rows] - middle.T
             found.deviation[rows] = (square - middle.square()).clamp_min(_TINY).sqrt().T
             found.of_means[rows] = self._summed(weights[:, None] * location.abs()).T
-            found.magnitude[rows] = self._summed(weights[:, None] * _mean_magnitude(location, variance)).T
+            found.magnitude[rows] = self._summed(weights[:, None] * mean_magnitude(location, variance)).T
         return found
 
     def _left_out(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -206,47 +197,25 @@ class KernelMixture:
         variance = scale[:, None] * (own - pairs.variance[:, None]).clamp_min(0.0)
         return weights, error, variance, scale * pairs.variance
 
-    def second_moment(
-        self, cross: Float64[Tensor, "kernels places contacts"], own: Float64[Tensor, "kernels places"]
-    ) -> Float64[Tensor, "places series"]:
-        """Return the mean square at places, without noise.
-
-        `cross` holds each kernel's covariances between places and contacts, `own` its variance at each place.
-        """
-        found = torch.zeros(self.values.shape[1], cross.shape[1], dtype=torch.float64)
-        for pairs, mean, within in self._predicted(cross, own):
-            square = pairs.weight[..., None] * mean.square_().add_(within)
-            found.index_add_(0, pairs.series.flatten(), square.flatten(0, 1))
-        return found.T
-
-    def mean_magnitude(
+    def average(
         self,
         cross: Float64[Tensor, "kernels places contacts"],
         own: Float64[Tensor, "kernels places"],
-        share: float,
-    ) -> Float64[Tensor, "places series"]:
-        """Return the mean magnitude at places, of which `share` takes the deviation within hypotheses into account.
+        *statistics: Statistic,
+    ) -> list[Float64[Tensor, "places series"]]:
+        """Return the means over hypotheses of statistics of the values at places, without noise.
 
-        The rest is the mean over hypotheses of the magnitude of each one's mean. `cross` and `own` as in
-        `second_moment`.
+        `cross` holds each kernel's covariances between places and contacts, `own` its variance at each place.
         """
-        found = torch.zeros(self.values.shape[1], cross.shape[1], dtype=torch.float64)
-        for pairs, mean, within in self._predicted(cross, own):
-            magnitude = mean.abs()
-            if share:
-                magnitude = magnitude.lerp(_mean_magnitude(mean, within.clamp_min_(0.0)), share)
-            magnitude *= pairs.weight[..., None]
-            found.index_add_(0, pairs.series.flatten(), magnitude.flatten(0, 1))
-        return found.T
-
-    def _predicted(
-        self, cross: Float64[Tensor, "kernels places contacts"], own: Float64[Tensor, "kernels places"]
-    ) -> Iterator[tuple["_Pairs", Float64[Tensor, "some pairs places"], Float64[Tensor, "some pairs places"]]]:
-        """Yield the hypotheses of some kernels [kernels, pairs], with their means and variances at places."""
+        found = [torch.zeros(self.values.shape[1], cross.shape[1], dtype=torch.float64) for _ in statistics]
         for rows, pairs in self._padded:
             along = (cross[rows] @ self.eigen[1][rows]).mT
+            mean = pairs.solved @ along
             variance = pairs.scale[..., None] * (own[rows][:, None] - pairs.inverse @ along.square())
-            yield pairs, pairs.solved @ along, variance
+            for total, statistic in zip(found, statistics, strict=True):
+                values = pairs.weight[..., None] * statistic(mean, variance)
+                total.index_add_(0, pairs.series.flatten(), values.flatten(0, 1))
+        return [each.T for each in found]
 
     @cached_property
     def _pairs(self) -> "_Pairs":
@@ -254,7 +223,7 @@ class KernelMixture:
         kernel, noise, series = torch.nonzero(self.weights, as_tuple=True)
         variance = self.noise_variance[noise, series]
         inverse = 1.0 / (self.eigen[0][kernel] + variance[:, None])
-        projected = self.projected[kernel, :, series]
+        projected = (self.eigen[1].mT @ self.values)[kernel, :, series]
         quadratic = (projected.square() * inverse).sum(1)
         weight, scale = self.weights[kernel, noise, series], quadratic / len(self.values)
         return _Pairs(kernel, series, weight, variance, inverse, projected * inverse, quadratic, scale)
@@ -342,9 +311,9 @@ def posterior_weights(
     return (weights / weights.sum(0)).reshape(joint.shape)
 
 
-def _mean_magnitude(mean: Float64[Tensor, "*shape"], variance: Float64[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]:
+def mean_magnitude(mean: Float64[Tensor, "*shape"], variance: Float64[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]:
     """Return the mean of the magnitude of normal variables: that of the folded normal distribution."""
-    deviation = variance.sqrt()
+    deviation = variance.clamp_min(0.0).sqrt()
     scaled = mean / deviation.clamp_min(_TINY)
     around = deviation * math.sqrt(2.0 / math.pi) * torch.exp(-0.5 * scaled.square())
     return around + mean * torch.erf(scaled * math.sqrt(0.5))

@@ -1,6 +1,6 @@
 """The gain model: kernel families weighed by evidence, and their predictions anywhere on the object."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
@@ -18,7 +18,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import POSITIONAL, Family, KernelFamily, Sites, Visual
-from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions
+from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions, Statistic, mean_magnitude
 from avmsf.field.gains.model import Directions, GainModel, Gains, Points, complex_of, series_of
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.symmetry.characters import Group
@@ -106,17 +106,23 @@ class MixtureGains(GainModel):
 
     def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean gains of impacts, see `sites`."""
-        return Gains.of(self._mean(self.sites(points, directions)))
+        return Gains.of(*self._average(self.sites(points, directions), lambda mean, _: mean))
 
     def point_estimate(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean magnitudes of the gains, as far as `spread_share` goes, with the signs of the mean gains."""
-        sites = self.sites(points, directions)
-        return Gains.of(self._batched(self._magnitude, sites).copysign(self._mean(sites)))
+
+        def magnitude(mean: Tensor, variance: Tensor) -> Tensor:
+            certain = mean.abs()
+            return certain.lerp(mean_magnitude(mean, variance), self.spread_share) if self.spread_share else certain
+
+        found, mean = self._average(self.sites(points, directions), magnitude, lambda mean, _: mean)
+        return Gains.of(found.copysign(mean))
 
     def posterior(self, points: Points, directions: Directions = None) -> Gains:
         """Return the mean gains with the standard deviation of both parts, without the noise of a measurement."""
         sites = self.sites(points, directions)
-        return replace(Gains.of(self._mean(sites)), std=_parts(self._batched(self._std, sites)).float())
+        mean, square = self._average(sites, lambda mean, _: mean, lambda mean, variance: mean.square() + variance)
+        return replace(Gains.of(mean), std=_parts((square - mean.square()).clamp_min(0.0).sqrt()).float())
 
     def noise(self) -> Float64[Tensor, "modes 2"]:
         """Return the standard deviation of the noise in both parts of a measured gain."""
@@ -327,39 +333,20 @@ class MixtureGains(GainModel):
         return self.training.directions[torch.from_numpy(near)]
 
     @cached_property
-    def _coefficients(self) -> list[Float64[Tensor, "_basis contacts series"]]:
-        solved = torch.split(self.mixture.solve(), list(map(len, self.families)))
-        return [family.coefficients(each) for family, each in zip(self.families, solved, strict=True)]
-
-    @cached_property
     def _left_out(self) -> Predictions:
         """Of the measured gains: those that were refined end to end have seen the recordings that are left out."""
         mixture = self.mixture if self.measured is None else replace(self.mixture, values=series_of(self.measured))
         return mixture.leave_out(self.places)
 
-    def _mean(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        pairs = zip(self.families, self._coefficients, strict=True)
-        means = [family.mean(sites, self.training, coefficients) for family, coefficients in pairs]
-        return torch.stack(means).sum(0)
-
-    def _magnitude(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        return self.mixture.mean_magnitude(*self._covariances(sites), self.spread_share)
-
-    def _std(self, sites: Sites) -> Float64[Tensor, "sites series"]:
-        square = self.mixture.second_moment(*self._covariances(sites))
-        return (square - self._mean(sites).square()).clamp_min(0.0).sqrt()
-
-    def _covariances(
-        self, sites: Sites
-    ) -> tuple[Float64[Tensor, "kernels sites contacts"], Float64[Tensor, "kernels sites"]]:
-        """Return each kernel's covariances between sites and the training impacts, and its variance at each site."""
-        cross = [family.between(sites, self.training) for family in self.families]
-        return torch.cat(cross), torch.cat([family.own(sites) for family in self.families])
-
-    def _batched(self, compute: Callable[[Sites], Tensor], sites: Sites) -> Float64[Tensor, "sites series"]:
-        """Return what is computed of sites, in batches whose covariances fit the memory."""
-        size = max(1, _MEMORY // (len(self.mixture.kernels) * len(self.contacts)))
-        return torch.cat([compute(sites.take(rows)) for rows in torch.split(torch.arange(len(sites)), size)])
+    def _average(self, sites: Sites, *statistics: Statistic) -> list[Float64[Tensor, "sites series"]]:
+        """Return the means over hypotheses of statistics of gains, in batches whose covariances fit the memory."""
+        size, parts = max(1, _MEMORY // (len(self.mixture.kernels) * len(self.contacts))), []
+        for rows in torch.split(torch.arange(len(sites)), size):
+            some = sites.take(rows)
+            cross = torch.cat([family.between(some, self.training) for family in self.families])
+            own = torch.cat([family.own(some) for family in self.families])
+            parts.append(self.mixture.average(cross, own, *statistics))
+        return [torch.cat(each) for each in zip(*parts, strict=True)]
 
 
 def _parts(series: Float64[Tensor, "contacts series"]) -> Float64[Tensor, "contacts modes 2"]:

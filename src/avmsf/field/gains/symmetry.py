@@ -86,16 +86,6 @@ class Symmetric(KernelFamily):
         count = torch.bincount(self._category)[self._category].double()
         return -count.log()[:, None].expand(-1, len(log_frequency))
 
-    def mean(
-        self, sites: Sites, known: Sites, coefficients: Float64[Tensor, "basis contacts series"]
-    ) -> Float64[Tensor, "sites series"]:
-        """Return the family's part of the means, motion by motion: all images at once would take much memory."""
-        found, row = torch.zeros(len(sites), coefficients.shape[2], dtype=torch.float64), 0
-        for moved in self._moved(sites, known):
-            found += torch.einsum("bpc,bcs->ps", moved, coefficients[row : row + len(moved)])
-            row += len(moved)
-        return found
-
     def _moved(self, sites: Sites, others: Sites) -> Iterator[Float64[Tensor, "kernels sites others"]]:
         for group, base in zip(self.groups, self._bases, strict=True):
             for image in _images(group, others, directional=self._directional):
