@@ -1,12 +1,24 @@
-"""What errors hold, the message that they compose of it, and which of them are of missing memory."""
+"""What errors hold, texts of others, names of the hub, progress and compiled loops."""
 
 import errno
+import io
+import math
 import os
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from types import SimpleNamespace
 
+import numba.core.caching
 import pytest
 import torch
 
-from avmsf.errors import CaptureError, lacks_memory
+from avmsf._utils.compiled import compiled
+from avmsf._utils.files import model_folder
+from avmsf._utils.progress import ProgressDisplay
+from avmsf._utils.text import MAX_TOML_BYTES, format_number, parse_json, read_json, read_text, read_toml
+from avmsf.errors import CaptureError, SceneError, download_failure, lacks_memory
+from factories.raising import raises
 
 
 def test_an_error_is_composed_of_its_attributes_and_keeps_them():
@@ -54,3 +66,149 @@ def hidden() -> OSError:
 )
 def test_errors_of_missing_memory_are_told_from_others(error: Exception, lacks: bool) -> None:
     assert lacks_memory(error) is lacks
+
+
+def test_line_ends_and_marks_do_not_matter(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
+    path.write_bytes(b"\xef\xbb\xbfa\r\nb\rc\n")
+    assert read_text(path) == "a\nb\nc\n"
+
+
+def test_length_is_bounded_whatever_the_file_says_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
+    path.write_text("x" * 10)
+    assert read_text(path, max_bytes=10) == "x" * 10
+    with pytest.raises(ValueError) as caught:
+        read_text(path, max_bytes=9)
+    assert "9" in str(caught.value)
+    # A device has no size, and no end.
+    with pytest.raises(ValueError) as caught:
+        read_text(Path("/dev/zero"))
+    assert "16,777,216" in str(caught.value)
+
+
+def test_json_and_toml_have_bounded_depth(tmp_path: Path) -> None:
+    assert parse_json("[" * 100 + "]" * 100)
+    (tmp_path / "x.json").write_text('{"a":' * 100_000)
+    (tmp_path / "x.toml").write_text("a = " + "[" * 3000 + "]" * 3000)
+    for read in (
+        lambda: parse_json("[" * 100_000),
+        lambda: read_json(tmp_path / "x.json"),
+        lambda: read_toml(tmp_path / "x.toml"),
+    ):
+        with pytest.raises(ValueError) as caught:
+            read()
+        assert isinstance(caught.value.__cause__, RecursionError)
+    (tmp_path / "x.toml").write_text("#" * (MAX_TOML_BYTES + 1))
+    with pytest.raises(ValueError):
+        read_toml(tmp_path / "x.toml")
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (None, "–"),
+        (math.nan, "–"),
+        (0.0, "0"),
+        (0.01234, "0.0123"),
+        (1.53e-4, "1.53e-04"),
+        (8.5, "8.50"),
+        (1234.5, "1234"),
+    ],
+)
+def test_numbers_have_three_significant_digits(value: float | None, words: str) -> None:
+    assert format_number(value) == words
+
+
+class Gate(BaseHTTPRequestHandler):
+    """Refuses everything, with the code that is the first part of the path."""
+
+    def do_HEAD(self) -> None:
+        self.send_error(int(self.path.split("/")[1]))
+
+    def do_GET(self) -> None:
+        self.do_HEAD()
+
+    def log_message(self, *_: object) -> None:
+        return
+
+
+@pytest.mark.parametrize("code", [401, 404, 503, None])
+def test_why_a_model_cannot_be_had_is_the_servers_code_or_that_there_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None
+) -> None:
+    client = pytest.importorskip("huggingface_hub")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    with HTTPServer(("127.0.0.1", 0), Gate) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        place = "http://127.0.0.1:9" if code is None else f"http://127.0.0.1:{server.server_port}/{code}"
+        with pytest.raises(OSError) as caught:
+            client.snapshot_download("owner/model", cache_dir=tmp_path, endpoint=place)
+        server.shutdown()
+    assert download_failure(caught.value) == (
+        "the server cannot be reached" if code is None else f"the server answered with code {code}"
+    )
+
+
+def test_an_owner_and_a_model_are_a_name_and_a_path_is_none(tmp_path: Path) -> None:
+    assert model_folder("laion/clap-htsat-unfused", "a model", raising=SceneError) is None
+    assert model_folder(tmp_path, "a model", raising=SceneError) == tmp_path
+    paths = ["./model", "../model", "~/model", "/model", "model/", "model", "a/b/c", Path("owner/model")]
+    for path in paths:
+        with raises(SceneError, file=Path(path).expanduser(), name="source", value=str(path)):
+            model_folder(path, "a model", raising=SceneError)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stream", "options", "count"),
+    [
+        (io.StringIO, {"shown": False}, 1),
+        (io.StringIO, {}, 4),
+        (io.StringIO, {"verbose": True}, 5),
+        (Terminal, {}, None),
+    ],
+)
+def test_a_stage_is_a_line_quiet_leaves_notes_and_verbose_adds_parts(stream, options, count, monkeypatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stderr", stderr := stream())
+    display = ProgressDisplay(**options)
+    # Names that would be markup or a control sequence.
+    for _ in range(2):
+        with display:
+            display.listener.log("reading [bold]mug\x1b]0;title\x07")
+            display.listener.step("splat", 1, 2, "loss [red]1")
+            display.listener.ready("splat", 2.0)
+            display.listener.ready("modes", None)
+            display.objects()("mug", 1, 1)
+            display.listener.note("few recordings")
+    lines = stderr.getvalue().splitlines()
+    assert count is None or len(lines) == 2 * count
+    assert options or any(line.endswith("2.0 s") and "splat" in line for line in lines)
+    assert "\x07" not in stderr.getvalue()
+    assert ("[red]1" in stderr.getvalue()) == (stream is Terminal)
+
+
+def twice(value: float) -> float:
+    return 2 * value
+
+
+def test_a_loop_is_compiled_and_kept():
+    made = compiled()(twice)
+    assert made(1.5) == 3.0
+    assert made.stats.cache_path is not None
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(monkeypatch: pytest.MonkeyPatch, full: bool):
+    if full:
+        monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=0))
+    else:
+        monkeypatch.setattr(numba.core.caching.CompileResultCacheImpl, "_locator_classes", [])
+    made = compiled(error_model="numpy")(twice)
+    assert made(1.5) == 3.0
+    assert made.stats.cache_path is None

@@ -1,6 +1,7 @@
-"""The open field: revisions, what edits make of it, and that nobody's work is overwritten in silence."""
+"""The open field: revisions, what edits make of it, that nobody's work is overwritten in silence, and one locator."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from avmsf.export.sampled_field import SampledField
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
+from avmsf.localization.locator import Locator
 from avmsf.studio.edit import REST, Sliders
 from avmsf.studio.files import resample, sample
 from avmsf.studio.responses import RequestError
@@ -231,3 +233,19 @@ def test_the_table_of_an_edited_field_is_the_one_made_anew(kind: str) -> None:
     assert resample(silent, muted, before) is None
     assert resample(found, after, before) is None
     assert resample(sampled, before, plate_field("attention" if kind != "attention" else "positional")) is None
+
+
+def test_threads_that_prepare_and_locate_at_once_get_what_one_alone_gets() -> None:
+    field = plate_field("elastic")
+    sounds = [field.render(field.gain_field.points[[row]])[0] for row in (3, 40, 90, 130)]
+    alone = [Locator.of(field).locate(sound).probability for sound in sounds]
+    locator = Locator.of(field)
+
+    def locate(number: int) -> torch.Tensor:
+        locator.prepare(400 + 80 * (number % 4))
+        return locator.locate(sounds[number % 4]).probability
+
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(locate, range(8)))
+    for number, probability in enumerate(found):
+        assert torch.equal(probability, alone[number % 4])
