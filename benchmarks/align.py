@@ -19,10 +19,10 @@ from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
-from avmsf.field.estimators import GainEstimator
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.training import GainEstimator
 from avmsf.modal.extraction.alignment import Alignment, align, coherence, strongest_modes
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.extraction.quality import measure_quality

@@ -11,12 +11,11 @@ import torch
 
 from avmsf.errors import FieldFileError, FitError
 from avmsf.field.config import FitConfig
-from avmsf.field.estimators import Progress
 from avmsf.field.fit import fingerprint
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.sound_field import SoundField
-from avmsf.field.training import AdamW, TrainingRun
+from avmsf.field.training import AdamW, Progress, TrainingRun
 from factories.plate_field import QUICK, few_impacts, plate_features, plate_fit
 from factories.raising import raises
 
@@ -124,7 +123,7 @@ def test_the_state_is_kept_while_the_fit_runs(tmp_path, monkeypatch):
 def test_a_fit_that_diverged_between_two_reads_of_the_loss_leaves_no_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setattr("avmsf._utils.checkpoint.SAVE_SECONDS", 0.0)
     # As on a GPU.
-    monkeypatch.setattr("avmsf.field.estimators.steps_between_losses", lambda device: 100)
+    monkeypatch.setattr("avmsf.field.training.steps_between_losses", lambda device: 100)
     with raises(FitError, name=STAGES[0]):
         fitted(tmp_path / "state", config=replace(CONFIG, warmup_steps=0, learning_rate=1e30))
     kept = torch.load(tmp_path / "state", weights_only=True) if (tmp_path / "state").exists() else None

@@ -13,10 +13,10 @@ from avmsf.errors import FitError
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.estimators import Progress
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import spectral_loss
 from avmsf.field.sound_field import SoundField
+from avmsf.field.training import Progress
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.modes import ModalBank
@@ -323,10 +323,3 @@ def test_resolutions_follow_the_sample_rate():
     assert PAPER.resolutions(48000.0)[1] == (64, 64, 64, 64)
     assert PAPER.interleave == 1, "the paper compares all frames at every step"
     assert FitConfig(fft_sizes=(24,)).resolutions(400.0)[0] == (6,)
-
-
-def test_the_network_has_the_configs_sizes():
-    shape = FitConfig(clusters=3, bands=2, width=5, hidden=6, layers=1, feature_scale=0.5).shape
-    assert (shape.clusters, shape.bands, shape.width, shape.hidden, shape.layers) == (3, 2, 5, 6, 1)
-    assert shape.feature_scale == 0.5
-    assert shape.spatial_damping is False

@@ -8,12 +8,11 @@ import torch
 from avmsf._utils.device import without_denormals
 from avmsf.errors import FitError
 from avmsf.field.config import PAPER, FitConfig
-from avmsf.field.estimators import GainEstimator
 from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import Resolution, SpectralTarget
-from avmsf.field.training import Targets, TrainingRun
+from avmsf.field.training import GainEstimator, Targets, TrainingRun
 from factories.plate_field import QUICK, few_impacts, plate_fit
 from factories.raising import raises
 

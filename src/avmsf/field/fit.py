@@ -17,7 +17,6 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
-from avmsf.field.estimators import GainEstimator, Progress, Trainer
 from avmsf.field.gains.data import GainData, gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
@@ -26,6 +25,7 @@ from avmsf.field.header import SUPPORTING
 from avmsf.field.next_contacts import suggest
 from avmsf.field.quality import FieldQuality, PlaceErrors, smallest_within_error
 from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.training import GainEstimator, Progress, Trainer
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual_noise import Residual, estimate_residual, missing_background
 

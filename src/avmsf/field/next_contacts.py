@@ -6,7 +6,6 @@ from typing import SupportsIndex
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_count, as_vectors, short_repr
@@ -16,6 +15,7 @@ from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
+from avmsf.field.positions import off_surface
 from avmsf.field.posterior import energy_of, fitted_mixture
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.points import farthest_points
@@ -24,8 +24,6 @@ MAX_POINTS = 400
 """Points of the surface that the expected error is summed over, and that are candidates unless others are given."""
 MAX_CANDIDATES = 500
 """Candidates that are weighed; of more, as many that lie far apart. The memory grows with their square."""
-_MAX_OFF_RATIO = 0.05
-"""Distance of a candidate from the surface over the object's size, from which on it is not on the object."""
 _SAME_POSITION_RATIO = 1e-6
 """Distance between two places over the object's size, below which they are one."""
 
@@ -96,7 +94,7 @@ def suggest(
             pool, directions = _reachable(gains, points)
         else:
             pool = given
-            _expect_on_surface(pool, gains.points.double())
+            _expect_on_surface(pool, gains)
         same = _SAME_POSITION_RATIO * float((points.amax(0) - points.amin(0)).norm())
         allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
         if not bool(allowed.any()):
@@ -219,14 +217,13 @@ def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates:
         raise FitError.expected("a length above 0", found, row=zero[0], name="directions", advice=advice)
 
 
-def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], surface: Float64[Tensor, "points 3"]) -> None:
+def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], gains: MixtureGains) -> None:
     if not len(candidates):
         raise FitError.expected("1 position or more", 0, got="none", name="candidates", advice="leave it out")
-    distance = torch.from_numpy(cKDTree(surface.numpy()).query(candidates.numpy())[0])
-    worst = int(distance.argmax())
-    if float(distance[worst]) > _MAX_OFF_RATIO * float((surface.amax(0) - surface.amin(0)).norm()):
-        found = [round(each, 4) for each in candidates[worst].tolist()]
+    row, distance = max(off_surface(candidates, gains), key=lambda each: each[1], default=(0, 0.0))
+    if distance:
+        found = [round(each, 4) for each in candidates[row].tolist()]
         raise FitError.expected(
-            "a position on the object's surface", found, got=f"{found} m, {float(distance[worst]):.2g} m from it",
-            row=worst, name="candidates", advice="check the unit and the frame",
+            "a position on the object's surface", found, got=f"{found} m, {distance:.2g} m from it",
+            row=row, name="candidates", advice="check the unit and the frame",
         )  # fmt: skip

@@ -19,13 +19,13 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.fem.material import Material, material_named
 from avmsf.field.config import AUTO, NETWORK, GainModelName
-from avmsf.field.estimators import Progress
 from avmsf.field.fit import fit as fit_field
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.kernels import Visual
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
+from avmsf.field.training import Progress
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once

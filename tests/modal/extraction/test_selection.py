@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from avmsf.modal.extraction.esprit import candidates
-from avmsf.modal.extraction.forward import choose
 from avmsf.modal.extraction.least_squares import NormalEquations
-from avmsf.modal.extraction.selection import Selection, chance_ratio, merge
+from avmsf.modal.extraction.selection import Selection, chance_ratio, choose, merge
 from avmsf.modal.inner_products import gram, poles_of
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize

@@ -15,10 +15,9 @@ from avmsf._utils.text import RecordError, count_of, like, record_of, without_de
 from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import ADDED_SETTINGS, AttentionShape
-from avmsf.field.estimators import FittedGains, GainEstimator, Trainer
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import Directions, GainModel, Gains, Points
-from avmsf.field.training import TrainableGains
+from avmsf.field.training import FittedGains, GainEstimator, TrainableGains, Trainer
 from avmsf.mesh.points import farthest_points
 
 SHARED, PER_CONTACT = "shared", "per-contact"

@@ -16,7 +16,6 @@ from avmsf.features.feature_field import GEOMETRY, FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, body_name
 from avmsf.fem.thickness import search_thickness
 from avmsf.field.config import AUTO, NETWORK, GainModelName
-from avmsf.field.estimators import FittedGains, GainEstimator, Trainer
 from avmsf.field.gains.attention import SHARED, Attention
 from avmsf.field.gains.data import GainData, along_phase
 from avmsf.field.gains.elastic import Elastic
@@ -26,6 +25,7 @@ from avmsf.field.gains.outliers import ContactAssessment, others, predicts_bette
 from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.regression import Regression, Solution, sites_of
 from avmsf.field.gains.symmetry import Symmetric
+from avmsf.field.training import FittedGains, GainEstimator, Trainer
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.symmetry.characters import Group, groups_of
 from avmsf.symmetry.symmetries import Symmetries
@@ -142,7 +142,8 @@ class MixtureEstimator(GainEstimator):
             if updated is not None:
                 found = fit(found.rows, [*found.bodies, updated])
         kept, names = set(found.rows.tolist()), data.train.names
-        report = found.report() | {"unavailable": missing} | assessment.report(data.train)
+        report = {"bodies": sorted(found.entries, key=lambda each: -each["weight"])} | assessment.report(data.train)
+        report["unavailable"] = missing
         report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
         report["supports_tried"] = tried
         report["support_evidence"] = evidence

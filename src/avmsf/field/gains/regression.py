@@ -42,36 +42,15 @@ class Solution:
     model: MixtureGains
     rows: Int[Tensor, " rows"]
     bodies: Sequence[CandidateBody]
-    units: Sequence[str]
-    """The surface's most probable unit with each body; empty for the present one."""
-    factors: Sequence[float]
-    """On the nominal frequencies of each body in its unit."""
-    weights: Sequence[float]
-    """Each body's posterior probability, mean over modes by their energy."""
+    entries: Sequence[dict[str, Any]]
+    """What the gains say of each body, as plain values: its posterior probability, mean over modes by their energy, the
+    surface's most probable unit with it (empty for the present one), and the factor on its frequencies in that unit."""
 
     @property
     def best(self) -> CandidateBody | None:
         """The most probable body."""
-        row = max(range(len(self.bodies)), key=self.weights.__getitem__, default=None)
+        row = max(range(len(self.bodies)), key=lambda row: self.entries[row]["weight"], default=None)
         return None if row is None else self.bodies[row]
-
-    def report(self) -> dict[str, Any]:
-        """Return the bodies as plain values, the most probable one first."""
-        found: list[dict[str, Any]] = [
-            {
-                "body": body.name,
-                "wall_thickness": body.thickness,
-                "support": FREE if body.support is None else body.support.name,
-                "support_stiffness": None if body.support is None else body.support.stiffness,
-                "updating_nats": body.updated,
-                "refined": body.fine,
-                "weight": weight,
-                "unit": unit,
-                "frequency_factor": factor,
-            }
-            for body, unit, factor, weight in zip(self.bodies, self.units, self.factors, self.weights, strict=True)
-        ]
-        return {"bodies": sorted(found, key=lambda each: -each["weight"])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +104,22 @@ class Regression:
         share = measured.energy / measured.energy.sum().clamp_min(torch.finfo(torch.float64).tiny)
         parts = zip(model.families, (model.shares() @ share).tolist(), strict=True)
         weights = {id(family.modes): part for family, part in parts if isinstance(family, Elastic)}
-        found = [weights.get(id(each.modes), 0.0) for each in elastic]
         units = ["", *list(self.unit_ratios)[1:]]
-        return Solution(
-            model, rows, bodies, [units[each.unit] for each in elastic],
-            [each.material_factor for each in elastic], found,
-        )  # fmt: skip
+        entries = [
+            {
+                "body": body.name,
+                "wall_thickness": body.thickness,
+                "support": FREE if body.support is None else body.support.name,
+                "support_stiffness": None if body.support is None else body.support.stiffness,
+                "updating_nats": body.updated,
+                "refined": body.fine,
+                "weight": weights.get(id(each.modes), 0.0),
+                "unit": units[each.unit],
+                "frequency_factor": each.material_factor,
+            }
+            for body, each in zip(bodies, elastic, strict=True)
+        ]
+        return Solution(model, rows, bodies, entries)
 
     def evidence(self, rows: Int[Tensor, " rows"], bodies: Sequence[CandidateBody]) -> list[float]:
         """Return the log evidence of the gains of some contacts with each body by itself."""

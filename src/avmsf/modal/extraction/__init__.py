@@ -8,13 +8,13 @@ In go `Impacts`; out comes an `Extraction`: a `ModalBank`, each recording's comp
    power leaves the noise. `Impacts.delayed` cuts the recordings anew, between samples by a windowed sinc.
    `Alignment.apply` aligns recordings that were held out; `alignment_report` says what was done.
 2. `finders`: frequencies and dampings, by one of two methods. `HighResolution`: matrix pencils (ESPRIT) in subbands
-   (`esprit`), forward selection by orthogonal least squares (`selection`, `forward`) and variable projection
+   (`esprit`), forward selection by orthogonal least squares (`selection`) and variable projection
    (`least_squares.refine`). `ShortTime`: the paper's regression in each bin of a short-time spectrum (`stft`).
 3. `least_squares.fit_gains`: the complex gains of these modes in each recording, whichever method found them; at poles
    of each recording's own where frequencies shift between recordings (`frequency_shifts`).
 
-`quality` judges how well the recordings support each mode; `polarity` and `recorder_faults` find what is wrong with
-single recordings. Start reading at `extract.extract_modes`.
+`quality` judges how well the recordings support each mode; `recorder_faults` finds what is wrong with recordings. Start
+reading at `extract.extract_modes`.
 
 A new method is a subclass of `finders.ModeFinder`, its entry in `finders.FINDERS` and its name in
 `avmsf.modal.config.ExtractionMethod`: commands, settings, evaluations and files take it from there.

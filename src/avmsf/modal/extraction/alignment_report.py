@@ -5,8 +5,13 @@ from dataclasses import dataclass
 from avmsf._utils.text import listed
 from avmsf.capture import Impacts
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.polarity import inverted_recordings
-from avmsf.modal.extraction.recorder_faults import gain_changes, noise_drop, rate_factors, uneven_decay
+from avmsf.modal.extraction.recorder_faults import (
+    gain_changes,
+    inverted_recordings,
+    noise_drop,
+    rate_factors,
+    uneven_decay,
+)
 
 _SHOWN = 8
 """Recordings that a sentence names."""
