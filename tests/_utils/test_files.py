@@ -20,8 +20,6 @@ from avmsf.errors import AvmsfError, ExportError, FolderInUseError
 from avmsf.export.writing import write_folder
 from factories.raising import raises
 
-NUMBERS = (errno.ENOSPC, errno.EACCES, errno.EROFS, errno.ENAMETOOLONG, errno.EIO)
-
 
 def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
@@ -32,7 +30,7 @@ def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_pa
         assert str(refused.value).endswith(way_out(OSError(number, "")))
     # Each cause has its own advice, but these two.
     assert way_out(OSError(errno.EEXIST, "")) == way_out(OSError(errno.ENOTDIR, ""))
-    numbers = (*NUMBERS, errno.EEXIST, errno.EISDIR)
+    numbers = [errno.ENOSPC, errno.EACCES, errno.EROFS, errno.ENAMETOOLONG, errno.EIO, errno.EEXIST, errno.EISDIR]
     assert len({way_out(OSError(number, "")) for number in numbers}) == len(numbers)
 
 

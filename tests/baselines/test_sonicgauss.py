@@ -18,7 +18,6 @@ from avmsf.baselines.sonicgauss.small import (
     RATE,
     PatchCodec,
     SmallConfig,
-    SmallSonicGauss,
     SmallWeights,
     fit_small,
     log_magnitudes,
@@ -230,16 +229,11 @@ def test_a_file_of_other_weights_is_refused_by_the_tensors_name(tmp_path):
         assert name in str(caught.value)
 
 
-def lively_network() -> SmallSonicGauss:
-    """Return a network whose gates, zero at the start of training, are open."""
+def test_the_contact_and_the_object_change_the_velocity_and_the_order_of_tokens_does_not():
     network = weights.__wrapped__().network.requires_grad_(False)
+    # Gates, zero at the start of training, are open.
     for layer in (network.output, network.modulation, *(block.modulation for block in network.blocks)):
         torch.nn.init.normal_(layer.weight, generator=torch.Generator().manual_seed(0))
-    return network
-
-
-def test_the_contact_and_the_object_change_the_velocity_and_the_order_of_tokens_does_not():
-    network = lively_network()
     latents, times = torch.randn(1, PATCHES, LATENTS), torch.tensor([0.5])
     features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
     base = network(latents, times, network.condition(features, place))

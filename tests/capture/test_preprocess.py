@@ -19,7 +19,6 @@ from factories.plate_capture import fill_plate
 from oracles.plate import Plate, sample_contacts, strike
 
 HAMMER = CaptureSettings(force_channel=1, response_channel=2, seconds=0.4)
-HEARD = CaptureSettings(seconds=0.3)
 MARGIN = 160
 """20 ms at 8 kHz."""
 NAMES = ("a.wav", "b.wav", "c.wav")
@@ -353,9 +352,9 @@ def test_a_force_channel_says_where_an_impulse_response_starts(tmp_path: Path) -
 
 
 def test_a_dataset_s_gain_is_divided_out_of_the_margins_too() -> None:
-    files = pre_triggered(40, 300, 1000)
+    files, heard = pre_triggered(40, 300, 1000), CaptureSettings(seconds=0.3)
     plain, divided = (
-        preprocess([(Impact(name, [0.0] * 3, gain_db=gain), recording(each)) for name, each in files.items()], HEARD)[0]
+        preprocess([(Impact(name, [0.0] * 3, gain_db=gain), recording(each)) for name, each in files.items()], heard)[0]
         for gain in (0.0, 20.0)
     )
     for name in ("before", "sounds", "after"):

@@ -18,7 +18,6 @@ from factories.capture_folder import HEADER, RATE, ROWS, fill, ring
 from factories.raising import raises, warns
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
-AWAY = [f"a{number}.wav" for number in range(200)]
 FORCES, DIRECTIONS = f"{HEADER},force_newtons", f"{HEADER},nx,ny,nz"
 CLIPPED = np.clip(8 * ring(), -1, 1)
 LEVELS = {f"{number}.wav": ring(seed=number) for number in range(7)}

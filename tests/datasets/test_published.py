@@ -211,11 +211,6 @@ def copied(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "RealImpact"))
 
 
-def row_of(sound: np.ndarray) -> float:
-    """Return the row that the height of a sound's first sample tells."""
-    return float((sound[0] / 0.01 - 1) * ROWS)
-
-
 def test_every_blow_is_heard_by_the_closest_microphone(whole: Path) -> None:
     capture = RealImpact(whole).capture(NAME)
     home = whole / NAME / "preprocessed"
@@ -224,7 +219,8 @@ def test_every_blow_is_heard_by_the_closest_microphone(whole: Path) -> None:
     # Every distance there is, the plain way.
     distance = np.array([np.linalg.norm(corners - listener, axis=1).min() for listener in listeners[:600]])
     best = int(distance.argmin())
-    rows = [round(row_of(sound)) for sound in capture.impacts.sounds.numpy()]
+    # The height of a sound's first sample tells its row.
+    rows = [round((float(sound[0]) / 0.01 - 1) * ROWS) for sound in capture.impacts.sounds.numpy()]
     assert rows == [best + 600 * blow for blow in range(5)]
     assert np.partition(distance, 1)[1] > distance[best] + 1e-3
     assert capture.impacts.names == tuple(f"vertex_{vertices[row]}.wav" for row in rows)

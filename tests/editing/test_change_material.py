@@ -33,7 +33,6 @@ from factories.raising import raises
 from oracles.block import block
 from oracles.plate import Plate, plate_modes, sample_contacts
 
-RATE = 44100.0
 CONTACTS = sample_contacts(Plate(), 8, generator=torch.Generator().manual_seed(0))
 OTHER = Material("other", 1900.0, 9.1e10, 0.29, 3.0, 8e-8)
 THIRD = Material("third", 4300.0, 5e9, 0.1, 0.0, 2e-6)
@@ -56,7 +55,7 @@ def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor
     passed = torch.linalg.solve(model.mixture.smoother(), series.T[..., None])[..., 0].T
     model = model.with_values(torch.complex(*passed.contiguous().chunk(2, dim=1)))
     phase, noise = torch.zeros_like(frequency), Residual(torch.full((9,), 1e-9))
-    return SoundField(bank, model, phase, noise, RATE, 2000, Origin("plate"))
+    return SoundField(bank, model, phase, noise, 44100.0, 2000, Origin("plate"))
 
 
 RATIO = {each: each.young / each.density for each in (STEEL, NOMINAL)}

@@ -62,21 +62,6 @@ def test_a_blow_sounds_as_the_fields(name, phase, scaled, pulse, background_forc
     assert table.shared_damping == (name != "attention with dampings")
 
 
-def test_the_formula_holds_in_plain_sums():
-    """Of amplitudes, dampings and noise as they lie in the table, without the package's synthesis."""
-    sound_field = sounding("attention with dampings", phase=0.4)
-    table = SampledField.of(sound_field, limit=20)
-    row = 11
-    times = torch.arange(SAMPLES, dtype=torch.float64) / 8000.0
-    sound = table.noise.double().clone()
-    for mode, (frequency, damping) in enumerate(zip(table.frequency, table.damping[row], strict=True)):
-        angle = 2 * torch.pi * frequency * times
-        swing = table.gains[row, mode].real * torch.sin(angle) + table.gains[row, mode].imag * torch.cos(angle)
-        sound += torch.exp(-damping * times) * swing
-    expected = sound_field.render(table.points[[row]])[0].double()
-    torch.testing.assert_close(sound, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
-
-
 @pytest.mark.parametrize("scaled", [False, True])
 def test_normals_of_an_elastic_model_are_its_bodys(scaled):
     table = SampledField.of(sounding("elastic", scaled=scaled))

@@ -89,10 +89,6 @@ PAGE = {
 }
 
 
-def imports_of(html: str) -> dict[str, str]:
-    return json.loads(re.search(r'<script type="importmap">(.*?)</script>', html)[1])["imports"]
-
-
 def source_of(url: str) -> str:
     return base64.b64decode(url.removeprefix("data:text/javascript;base64,")).decode()
 
@@ -100,7 +96,7 @@ def source_of(url: str) -> str:
 def test_one_file_holds_all_that_lay_beside_the_page() -> None:
     bundle = make_bundle(struck_table(shared=True))
     html = single_file(bundle, PAGE)
-    imports = imports_of(html)
+    imports = json.loads(re.search(r'<script type="importmap">(.*?)</script>', html)[1])["imports"]
     assert source_of(imports["three"]) == "export const scene = 1;"
     # Two names of one file are one module.
     assert source_of(imports["three/addons/a.js"]) == 'export * from "three";'

@@ -75,7 +75,11 @@ def true_field(points: int = 1500) -> SoundField:
 @cache
 def locator_of(taps: int | None = None) -> Locator:
     """Return a locator, of true gains without `taps`."""
-    return Locator.of(true_field() if taps is None else fitted_field(taps))
+    if taps is None:
+        return Locator.of(true_field())
+    impacts = struck(taps, seed=5)
+    values = fit_gains(impacts.sounds, bank(), sample_rate=RATE).to(torch.complex128)
+    return Locator.of(field_of(mixture_of(impacts.contacts, values, bank(), plate_surface_points(PLATE, 1500))))
 
 
 def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLATE):
@@ -84,13 +88,6 @@ def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLA
     return strike(
         plate, contacts, sample_rate=RATE, seconds=SECONDS, generator=generator, noise_db=noise_db, highest=HIGHEST
     )
-
-
-@cache
-def fitted_field(taps: int) -> SoundField:
-    impacts = struck(taps, seed=5)
-    values = fit_gains(impacts.sounds, bank(), sample_rate=RATE).to(torch.complex128)
-    return field_of(mixture_of(impacts.contacts, values, bank(), plate_surface_points(PLATE, 1500)))
 
 
 def mixture_of(

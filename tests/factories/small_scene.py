@@ -25,16 +25,10 @@ def slab() -> Surface:
     return Surface(torch.tensor(corners), torch.tensor(faces))
 
 
-def painted_slab() -> TexturedMesh:
-    """Return the slab with a color that changes from corner to corner."""
-    surface = slab()
-    paint = torch.rand(8, 3, generator=torch.Generator().manual_seed(1))
-    return TexturedMesh.build(surface.vertices, surface.faces, colors=paint[surface.faces])
-
-
 def slab_views(size: int = 48) -> tuple[View, ...]:
-    """Return 24 pictures of the painted slab before black."""
-    mesh = painted_slab()
+    """Return 24 pictures of the slab before black; its color changes from corner to corner."""
+    surface, paint = slab(), torch.rand(8, 3, generator=torch.Generator().manual_seed(1))
+    mesh = TexturedMesh.build(surface.vertices, surface.faces, colors=paint[surface.faces])
     cameras = orbit_cameras(mesh.surface, size=size, azimuths=8)
     return render_views(mesh, cameras, background=(0.0, 0.0, 0.0), supersample=2)
 

@@ -56,17 +56,10 @@ def own_tokens(encoder: DinoEncoder, picture: torch.Tensor) -> torch.Tensor:
     return states[extra:].reshape(rows, columns, -1).permute(2, 0, 1)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(4, 4), (3, 7), (1, 1)])
-def test_the_map_is_the_models_own_grid(folder, rows, columns):
-    encoder, picture = load(folder), image(rows * PATCH, columns * PATCH)
-    assert encoder.name == "DINOv2 from the folder tiny"
-    # The same numbers through the same layers in float32; the resize to the same size may round.
-    torch.testing.assert_close(encoder.describe(picture), own_tokens(encoder, picture), rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(("height", "width"), [(43, 70), (29, 55), (5, 90), (71, 13)])
-def test_any_size_is_described_in_its_place(folder, height, width):
+@pytest.mark.parametrize(("height", "width"), [(56, 56), (42, 98), (14, 14), (43, 70), (29, 55), (5, 90), (71, 13)])
+def test_the_map_is_the_models_own_grid_of_any_size_in_its_place(folder, height, width):
     encoder, picture = load(folder), image(height, width)
+    assert encoder.name == "DINOv2 from the folder tiny"
     found = encoder.describe(picture)
     rows, columns = -(-height // PATCH), -(-width // PATCH)
     # Continued by hand: the last row and column again and again.

@@ -76,18 +76,6 @@ def painted_sphere(cameras: list[Camera], *, columns: int = 80, rows: int = 55) 
     return Painted([sphere_places(camera).permute(2, 0, 1).float() for camera in small])
 
 
-def facing(points: torch.Tensor, least: float):
-    """A weighting that counts only views that see a sphere's points no flatter than a cosine of `least`."""
-
-    def weigh(visibility):
-        towards = visibility.camera.position - points
-        return (
-            visibility.seen * ((points / RADIUS * towards / towards.norm(dim=1, keepdim=True)).sum(1) > least).double()
-        )
-
-    return weigh
-
-
 def sphere_cloud(points: torch.Tensor, scale: float = 0.004) -> GaussianCloud:
     count = len(points)
     rotations = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1)
@@ -113,7 +101,13 @@ def test_a_map_of_places_in_the_image_is_read_where_the_points_are(columns, rows
 def test_every_point_gets_its_own_position():
     points = sphere_points()
     views = [view_of(camera) for camera in AROUND]
-    lifted = lift_points(points, views, painted_sphere(AROUND), depth_map=sphere_depth, weighting=facing(points, 0.5))
+
+    def steep(visibility):
+        """Count only views that see a point no flatter than at 60 degrees."""
+        towards = visibility.camera.position - points
+        return visibility.seen * ((points / RADIUS * towards / towards.norm(dim=1, keepdim=True)).sum(1) > 0.5).double()
+
+    lifted = lift_points(points, views, painted_sphere(AROUND), depth_map=sphere_depth, weighting=steep)
     known = lifted.seen > 0
     # Six views that each count a cap of 60 degrees.
     assert int(known.sum()) > 400

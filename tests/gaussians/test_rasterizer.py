@@ -19,7 +19,6 @@ from oracles.gaussian_image import render_everywhere, splats
 
 NAMES = tuple(each.name for each in fields(GaussianCloud))
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
-UP = torch.tensor([0.0, 0.0, 1.0])
 
 
 def cloud_of(count: int = 250, *, degree: int = 1, seed: int = 0) -> GaussianCloud:
@@ -39,7 +38,7 @@ def cloud_of(count: int = 250, *, degree: int = 1, seed: int = 0) -> GaussianClo
 
 def camera_of(width: int = 83, height: int = 61, *, distance: float = 0.35) -> Camera:
     position = distance * torch.tensor([0.6, -0.64, 0.48])
-    camera = Camera.looking(position, torch.zeros(3), up=UP, focal=70.0, width=width, height=height)
+    camera = Camera.looking(position, torch.zeros(3), up=torch.eye(3)[2], focal=70.0, width=width, height=height)
     # Off the middle, and with pixels that are not square.
     return Camera(camera.world_to_camera, (70.0, 74.0), (width / 2 + 3.3, height / 2 - 1.7), width, height)
 

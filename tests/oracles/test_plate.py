@@ -3,10 +3,9 @@
 import math
 
 import numpy as np
-import scipy.signal
 import torch
 
-from oracles.plate import Plate, plate_modes, plate_surface_points, ring, sample_contacts
+from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -53,24 +52,6 @@ def test_gains_are_mass_normal_shapes_at_both_ends():
     heard = plate_modes(plate, pickup).gains[0]
     assert torch.allclose(torch.diagonal(inner), heard, rtol=1e-10)
     assert float((inner - torch.diag(torch.diagonal(inner))).abs().max()) < 1e-10 * float(heard.max())
-
-
-def test_sounds_are_those_of_two_pole_filters():
-    plate, rate, samples = Plate(), 44100.0, 30000
-    contacts = sample_contacts(plate, 2, generator=seeded())
-    modes = plate_modes(plate, contacts)
-    impulse = np.zeros(samples)
-    impulse[0] = 1.0
-    expected = np.zeros((2, samples))
-    for frequency, damping, gains in zip(modes.frequency, modes.damping, modes.gains.T, strict=True):
-        radius, angle = math.exp(-float(damping) / rate), 2 * math.pi * float(frequency) / rate
-        atom = scipy.signal.lfilter(
-            [0.0, radius * math.sin(angle)], [1.0, -2 * radius * math.cos(angle), radius**2], impulse
-        )
-        expected += gains.numpy()[:, None] * atom
-    sounds = ring(modes, sample_rate=rate, samples=samples).numpy()
-    # The recursion's rounding grows with its 30,000 steps.
-    np.testing.assert_allclose(sounds, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
 def test_a_hammers_half_sine_excites_each_mode_by_its_spectrum():

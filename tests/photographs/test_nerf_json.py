@@ -30,17 +30,13 @@ def pose(matrix: np.ndarray) -> dict[str, Any]:
     return {"transform_matrix": matrix.tolist()}
 
 
-def facing_down_z(folder: Path) -> Path:
-    """Three cameras on the z axis's side, their matrices written by hand: the first at z = 5 with no rotation."""
+def test_without_rotation_a_camera_looks_down_z_with_x_right_and_y_up(tmp_path: Path) -> None:
+    # By hand: the first at z = 5 with no rotation.
     right = [[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]  # at x = 5, backward is +x
     left = [[0, 0, -1, -5], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]]
     poses = {"a": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]], "b": right, "c": left}
     rows = [{"file_path": f"images/{name}.png", "transform_matrix": pose} for name, pose in poses.items()]
-    return write_transforms(folder, rows)
-
-
-def test_without_rotation_a_camera_looks_down_z_with_x_right_and_y_up(tmp_path: Path) -> None:
-    folder = facing_down_z(tmp_path)
+    folder = write_transforms(tmp_path, rows)
     views = read_views(folder)
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     pixels, depth = views[0].camera.project(points)

@@ -10,7 +10,6 @@ import trimesh
 
 from avmsf.errors import SceneError
 from avmsf.mesh.level_set import enclose
-from avmsf.photographs.cameras import View
 from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction import ObjectShape, object_surface
 from avmsf.reconstruction.distance import distance_from
@@ -222,17 +221,13 @@ def test_views_do_not_bound_the_wall_of_a_supposed_cavity(block: ObjectShape, cu
     assert cup_shape.thickness_range[1] < 0.06 * cup_shape.diagonal
 
 
-def _grown(view: View, pixels: int) -> View:
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(pixels) + 1,) * 2)
-    change = cv2.dilate if pixels > 0 else cv2.erode
-    return replace(view, mask=torch.from_numpy(change(view.mask.numpy(), kernel)))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("pixels", [-2, 2])
 def test_masks_that_are_all_too_large_or_too_small_leave_the_size_as_it_is(pixels: int) -> None:
     mesh = ball(RADIUS)
-    views = [_grown(view, pixels) for view in views_of(mesh)]
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(pixels) + 1,) * 2)
+    change = cv2.dilate if pixels > 0 else cv2.erode
+    views = [replace(view, mask=torch.from_numpy(change(view.mask.numpy(), kernel))) for view in views_of(mesh)]
     shape = object_surface(views, depth_of(mesh), cells=COARSE)
     # A pixel is 1 mm wide there.
     radii = np.linalg.norm(mesh_of(shape.solid()).vertices, axis=1)

@@ -24,17 +24,13 @@ from factories.raising import raises
 LEGS = torch.tensor([[0.11, 0.03, -0.002], [-0.05, 0.07, -0.002], [-0.03, -0.08, -0.002]], dtype=torch.float64)
 
 
-def coupled(count: int = 8, *, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return undamped frequencies, two of them close, and a damping matrix that is far from diagonal."""
-    generator = torch.Generator().manual_seed(seed)
-    frequency = torch.sort(300.0 + 4000.0 * torch.rand(count, generator=generator, dtype=torch.float64))[0]
-    frequency[1] = frequency[0] + 3.0
-    root = torch.randn(count, count, generator=generator, dtype=torch.float64)
-    return frequency, 20.0 * torch.eye(count, dtype=torch.float64) + 5.0 * root @ root.T
-
-
 def test_coupled_modes_move_as_the_equation_of_motion_integrated():
-    frequency, damping = coupled()
+    # Two frequencies are close, and the damping matrix is far from diagonal.
+    generator = torch.Generator().manual_seed(0)
+    frequency = torch.sort(300.0 + 4000.0 * torch.rand(8, generator=generator, dtype=torch.float64))[0]
+    frequency[1] = frequency[0] + 3.0
+    root = torch.randn(8, 8, generator=generator, dtype=torch.float64)
+    damping = 20.0 * torch.eye(8, dtype=torch.float64) + 5.0 * root @ root.T
     vibration = damped(frequency, damping, highest=20000.0)
     push = torch.linspace(-1.0, 2.0, len(frequency), dtype=torch.float64)
     weights = vibration.accelerations * (vibration.pushes @ push.to(torch.complex128))

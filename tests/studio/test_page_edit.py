@@ -44,11 +44,6 @@ def requests_of(page: "Page") -> list[tuple[str, Any]]:
     return asked
 
 
-def edit_elsewhere(server: Served, **words: Any) -> None:
-    base = server.manifest()["live"]["revision"]
-    assert server.ask("POST", "edit", {"base": base, **words}).status == 200
-
-
 def slider(page: "Page", name: str) -> "Locator":
     return page.locator("#sheet-edit .slider", has_text=name).first
 
@@ -102,7 +97,7 @@ def test_another_tabs_edit_is_shown_and_not_overwritten(edits: Edits, act: str, 
     page, server = edits
     move(page, "Decay time")
     until_revision(page, 2)
-    edit_elsewhere(server, size=2.0, pitch=1.25)
+    assert server.ask("POST", "edit", {"base": 2, "size": 2.0, "pitch": 1.25}).status == 200
     if act == "slider":
         move(page, "Pitch")
     elif act == "save":

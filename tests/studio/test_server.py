@@ -62,10 +62,6 @@ def tensor(running: Served, manifest: Any, name: str) -> np.ndarray:
     return np.frombuffer(content, np.dtype(told["dtype"]).newbyteorder("<"), count).reshape(told["shape"])
 
 
-def unpacked(text: str) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(text), "<f4")
-
-
 def test_the_page_gets_the_field_that_is_open(plate: Served) -> None:
     manifest = plate.manifest()
     assert manifest["live"]["revision"] == 1
@@ -96,7 +92,8 @@ def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
         [found] = answer.words["impacts"]
         [(seconds, expected)] = locate_impacts(field, sound, locator=Locator.of(field, points=points))
         assert (found["row"], found["seconds"]) == (expected.most_probable, seconds)
-        assert np.array_equal(unpacked(found["probability"]), expected.probability.float())
+        probability = np.frombuffer(base64.b64decode(found["probability"]), "<f4")
+        assert np.array_equal(probability, expected.probability.float())
         assert found["explained_energy"] > 0.95
 
 

@@ -41,16 +41,6 @@ window.loaded = loadBundle().then((bundle) => { window.bundle = bundle; });
 """
 
 
-def lay_out(folder: Path, table: SampledField) -> Path:
-    make_bundle(table).write(folder)
-    (folder / "page").mkdir()
-    for module in PAGE.glob("*.js"):
-        shutil.copy(module, folder / "page")
-    (folder / "page" / "start.js").write_text(MODULE)
-    (folder / "index.html").write_text(BLANK + START)
-    return folder
-
-
 KINDS = ("shared", "perContact")
 
 
@@ -65,7 +55,12 @@ def pages(
 ) -> Iterator[dict[str, "Page"]]:
     opened = {kind: browser.new_page() for kind in KINDS}
     for kind, page in opened.items():
-        page.goto(serve(lay_out(tmp_path_factory.mktemp(kind), tables[kind])))
+        folder = tmp_path_factory.mktemp(kind)
+        make_bundle(tables[kind]).write(folder)
+        shutil.copytree(PAGE, folder / "page")
+        (folder / "page" / "start.js").write_text(MODULE)
+        (folder / "index.html").write_text(BLANK + START)
+        page.goto(serve(folder))
         page.evaluate("window.loaded")
     yield opened
     for page in opened.values():
@@ -129,15 +124,6 @@ def test_a_impact_is_what_python_renders(page: "Page", table: SampledField, impa
     assert error(heard(page, [impact]), expected) < 1e-6
 
 
-def together(table: SampledField, impacts: Sequence[tuple[int, float, int]], samples: int) -> torch.Tensor:
-    """Return the sum of impacts on rows, of some force, from some sample on."""
-    sound = torch.zeros(samples, dtype=torch.float64)
-    for row, force, frame in impacts:
-        one = table.render(torch.tensor([row]), force=force, samples=table.samples)[0].double()
-        sound[frame:] += one[: samples - frame]
-    return sound
-
-
 def test_a_harder_impact_has_the_same_background(any_page: "Page", tables: dict[str, SampledField]) -> None:
     """Of forces relative to the average impact's, which is of 9 N, and in the unit of its sound over its force."""
     steady = replace(tables["shared"], background_force=9.0)
@@ -161,7 +147,11 @@ def test_impacts_overlap_from_the_very_sample_on_at_which_they_begin(page: "Page
         (0, 1.0, 9000),
     ]
     impacts = [{"row": row, "force": force, "when": frame / RATE} for row, force, frame in places]
-    assert error(heard(page, impacts), together(table, places, table.samples)) < 1e-6
+    expected = torch.zeros(table.samples, dtype=torch.float64)
+    for row, force, frame in places:
+        one = table.render(torch.tensor([row]), force=force, samples=table.samples)[0].double()
+        expected[frame:] += one[: table.samples - frame]
+    assert error(heard(page, impacts), expected) < 1e-6
 
 
 @pytest.mark.parametrize("rate", [11_025.0, 44_100.0])
