@@ -65,6 +65,14 @@ def test_what_hardly_decays_is_hum():
     assert len(find(torch.stack([humming] * 2), least_damping=2.0)) == 2
 
 
+def test_half_the_rate_is_no_mode():
+    # It was found beneath half the rate by the last bit, where the samples of a sine are all zero.
+    times = torch.arange(8000, dtype=torch.float64) / RATE
+    highest = torch.exp(-20.0 * times) * torch.cos(math.pi * torch.arange(8000))
+    sounds = torch.stack([(gain * highest).float() + tone(1000.0, 20.0) for gain in (1.0, 0.1, 0.9, 0.35, 0.77)])
+    assert find(sounds).frequency.tolist() == pytest.approx([1000.0], abs=0.1)
+
+
 @pytest.mark.parametrize(("showing", "expected"), [(1, 1), (2, 1), (3, 2), (5, 2)])
 def test_a_mode_must_show_in_half_the_recordings(showing: int, expected: int):
     sounds = [tone(1000.0, 20.0) + (tone(3000.0, 15.0) if row < showing else 0.0) for row in range(5)]

@@ -121,8 +121,8 @@ class Lines:
         adjacent = torch.nn.functional.pad(gain, (1, 1))
         candidate = (gain >= adjacent[:, :-2]) & (gain > adjacent[:, 2:])
         candidate &= gain > gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
-        # The lowest bin holds the recorder's offset and the room's rumble.
-        candidate[:, 0] = False
+        # The lowest bin holds the recorder's offset and the room's rumble; at half the rate a sine's samples are zero.
+        candidate[:, [0, -1]] = False
         return self._agreed(candidate, count)
 
     def _agreed(self, candidate: Bool[Tensor, "contacts bins"], count: int) -> ModalBank:
