@@ -175,9 +175,7 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
         drawn[title] = (found, truth)
         return Figure()
 
-    monkeypatch.setattr(
-        ObjectInputs, "features", lambda inputs, *given, **named: PlateInputs().features(*given, **named)
-    )
+    monkeypatch.setattr(ObjectInputs, "features", PlateInputs.features)
     monkeypatch.setattr(FieldMethod, "fit", quick)
     monkeypatch.setattr("avmsf.evaluation.runner.located", watched)
     monkeypatch.setattr(report, "draw_contact", draw)

@@ -79,8 +79,8 @@ def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path)
     def begin(name: str, encoder: str | None) -> None:
         methods, settings = (method_named(name),), MetricSettings(cdpam=False)
         evaluation = Evaluation(
-            CaptureCollection(tmp_path), "plates", PROTOCOLS["farthest"], methods, PlateInputs(),
-            metric_settings=settings, encoder=encoder,
+            "plates", PROTOCOLS["farthest"], methods, PlateInputs(CaptureCollection(tmp_path), tmp_path), settings,
+            encoder=encoder,
         )  # fmt: skip
         evaluation.begin(ResultsFolder(tmp_path / "results"))
 

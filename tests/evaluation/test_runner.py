@@ -53,8 +53,8 @@ def plates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def planned(folder: Path, *methods: str | Method, protocol: str = "farthest", seed: int = 0) -> Evaluation:
     chosen = tuple(method_named(each) if isinstance(each, str) else each for each in methods or CHEAP)
-    inputs, dataset = PlateInputs(), CaptureCollection(folder)
-    return Evaluation(dataset, "plates", PROTOCOLS[protocol], chosen, inputs, seed=seed, metric_settings=NO_CDPAM)
+    inputs = PlateInputs(CaptureCollection(folder), folder, seed=seed)
+    return Evaluation("plates", PROTOCOLS[protocol], chosen, inputs, NO_CDPAM)
 
 
 def summed(results: Path) -> dict:
@@ -262,9 +262,8 @@ class Plate:
 def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) -> CaseRun:
     own = None if own_starts is None else Plate(own_starts)
     settings = MetricSettings(level="raw", cdpam=False)
-    evaluation = Evaluation(
-        Plate(impacts), "plates", PROTOCOLS["farthest"], (), PlateInputs(), metric_settings=settings, own_starts=own
-    )
+    inputs = PlateInputs(Plate(impacts), folder)
+    evaluation = Evaluation("plates", PROTOCOLS["farthest"], (), inputs, settings, own_starts=own)
     case = Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, STRIKES)))
     return CaseRun(evaluation, ObjectData(evaluation, "a"), case, folder=folder, number=1, stores_sounds=False)
 

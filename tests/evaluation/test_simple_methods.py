@@ -94,12 +94,8 @@ def test_the_floor_is_the_noise_alone():
     assert 10 * math.log10(float(left)) < -90.0
 
 
-def test_neighbors_and_extractions_that_do_not_fit_are_refused():
+def test_an_extraction_of_other_impacts_is_refused():
     train, test = split(plate_impacts(), 0.2)
-    with raises(EvaluationError, name="count", value=7):
-        MeanWaveform(train, count=7)
-    with raises(EvaluationError, name="count", value=0):
-        MeanGains(train, true_extraction(train), count=0)
     with raises(EvaluationError, name="extraction", value=24):
         MeanGains(train, true_extraction(test))
 

@@ -47,12 +47,6 @@ def fill_plates(
 class PlateInputs(ObjectInputs):
     """Positions of a plate, and no looks and no shape."""
 
-    def __init__(self) -> None:
-        """Read no dataset."""
-
-    def __repr__(self) -> str:
-        return "PlateInputs()"
-
     def features(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
         if visual_input not in ("surface", "positions"):
             raise SceneError(f"{identifier}: nothing shows its look")

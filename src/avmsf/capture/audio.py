@@ -202,9 +202,12 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
 
 
 def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> bytes:
-    """Return a wav file of float32 samples at `rate`, Hz, the same for the same samples."""
+    """Return a wav file of samples at `rate`, Hz, int16 or else as float32; the same for the same samples."""
     memory = io.BytesIO()
-    soundfile.write(memory, samples.astype(np.float32), rate, subtype="FLOAT", format="WAV")
+    if samples.dtype == np.int16:
+        soundfile.write(memory, samples, rate, subtype="PCM_16", format="WAV")
+    else:
+        soundfile.write(memory, samples.astype(np.float32), rate, subtype="FLOAT", format="WAV")
     content = memory.getvalue()
     # The time of writing is behind the name, the length and the version, four bytes each, of the chunk PEAK.
     start = content.find(b"PEAK", 0, 256) + 12

@@ -5,7 +5,7 @@ tables for people or with `--json` as one object. Each module of a verb has `Opt
 makes the command line, and `run(options)`, which imports what computes, calls the package and prints: start reading
 with `render`. `options` parses and checks before anything is loaded, `settings` reads `--set` and `--config`, `paths`
 says what files and folders have to be, `many` runs a verb for each of several inputs, `contacts` reads positions,
-`report` and `edit_report` say what fields and edits are, `writing` has wav files, `output` prints.
+`report` and `edit_report` say what fields and edits are, `output` prints.
 """
 
 import _thread
@@ -98,7 +98,7 @@ def _run(words: list[str]) -> int:
             options = options_of(words[0], words[1:])
             options.check_inputs()
             goes_on = "; repeat the command to continue" if options.resumes else ""
-            display.shown, display.verbose = not options.quiet, options.verbose
+            display.shown, display.verbose = not options.only_results, options.verbose
             show_plainly()
             display.doing("loading")
             code: int = import_module(f"avmsf.cli.{words[0]}").run(options)

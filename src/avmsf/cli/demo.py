@@ -64,10 +64,11 @@ def run(options: Options) -> int:
     except OSError as error:
         path, reason = error.filename or folder, error.strerror or str(error)
         raise OutputError.expected("a writable path", reason, file=path, advice=way_out(error)) from error
-    common = [f"--{name}" for name in ("quiet", "verbose", "json") if getattr(options, name)]
+    given = {"--quiet": options.only_results, "--verbose": options.verbose, "--json": options.json}
+    common = [name for name, present in given.items() if present]
     for command in COMMANDS:
         words = shlex.split(command.format(shlex.quote(str(folder))))
-        if not options.quiet:
+        if not options.only_results:
             show(f"\n$ avmsf {shlex.join(words)}")
         code = main([*words, *common])
         if code:

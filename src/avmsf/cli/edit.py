@@ -213,7 +213,7 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
     """Return the field edited towards a prompt, recordings, or the sound of a material in place of `old`."""
     from avmsf._utils.text import format_number
     from avmsf.cli.output import display
-    from avmsf.cli.writing import peak_factor, write_sound
+    from avmsf.cli.render import peak_factor, write_sound
     from avmsf.editing.guided import PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
     from avmsf.editing.reference import Reference
     from avmsf.evaluation.clap import Clap, ClapCurve
@@ -252,7 +252,7 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
 
 def _prompted(prompt: str, options: Options, sample_rate: float) -> Any:
     """Return the guide by a text; write the sound of the text alone where that is asked for."""
-    from avmsf.cli.writing import write_sound
+    from avmsf.cli.render import write_sound
     from avmsf.editing.distillation import DecoderDistillation
     from avmsf.editing.stable_audio import StableAudio
 

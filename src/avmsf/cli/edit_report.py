@@ -11,8 +11,8 @@ from torch import Tensor
 from avmsf._utils.text import counted, format_number
 from avmsf.cli.contacts import check_given_contacts, given_contacts
 from avmsf.cli.output import decimals, say, table
+from avmsf.cli.render import peak_factor, write_sound
 from avmsf.cli.report import MAX_LISTED_MODES
-from avmsf.cli.writing import peak_factor, write_sound
 from avmsf.editing.modal_edit import remarks
 from avmsf.evaluation.clap import CLAP
 from avmsf.field.sound_field import SoundField

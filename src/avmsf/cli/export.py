@@ -60,7 +60,7 @@ class Options(Many):
     folder of their exports, --capture one of their captures.
     """
 
-    fields: tyro.conf.Positional[FieldFiles]
+    inputs: tyro.conf.Positional[FieldFiles]
     """Field files, as `avmsf fit` writes them."""
     to: Format
     """Format to write."""
@@ -101,19 +101,18 @@ class Options(Many):
     precision: Annotated[Precision, arg("float16|float32")] = "float32"
     """avmsf-demo: number format of the gains."""
 
-    given = "fields"
     alone = ("object", *_CONTACTS)
 
     @property
     def field(self) -> Path:
         """The field, where there is one."""
-        return self.fields[0]
+        return self.inputs[0]
 
     def of(self, given: Path, output: Path) -> "Options":
         """Return the options for one of many fields."""
         capture = None if self.capture is None else self.capture / output.name
         path = output.with_name(f"{output.name}{''.join(FORMATS[self.to].suffixes[:1])}")
-        return replace(self, fields=(given,), output=path, capture=capture)
+        return replace(self, inputs=(given,), output=path, capture=capture)
 
     def read(self) -> Iterator[Path]:
         """Return the files and folders on whose content the output depends."""
@@ -133,7 +132,7 @@ class Options(Many):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        if len(self.fields) > 1:
+        if len(self.inputs) > 1:
             return
         given = sum((bool(self.position), self.contact_table is not None, self.contacts is not None))
         if self.contacts_given and given > 1:
@@ -150,7 +149,7 @@ class Options(Many):
 
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
-    if len(options.fields) > 1:
+    if len(options.inputs) > 1:
         return run_many("export", options, raising=ExportError)
     from avmsf.export.faust import contacts_path
     from avmsf.export.samples import INSTRUMENT

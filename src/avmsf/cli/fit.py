@@ -61,7 +61,7 @@ class Options(Configured, Many):
     Of several captures, -o is a folder: it gets a file of each, and a table.
     """
 
-    captures: tyro.conf.Positional[
+    inputs: tyro.conf.Positional[
         Annotated[
             tuple[Path, ...],
             arg("CAPTURE ..."),
@@ -107,19 +107,18 @@ class Options(Configured, Many):
     """paper: all settings as published; takes hours."""
 
     usual = PRESETS["default"]
-    given = "captures"
     alone = ("features",)
 
     @property
     def capture(self) -> Path:
         """The capture, where there is one."""
-        return self.captures[0]
+        return self.inputs[0]
 
     def of(self, given: Path, output: Path) -> "Options":
         """Return the options for one of many captures."""
         cache, plots = (None if each is None else each / output.name for each in (self.cache, self.plots))
         path = output.with_name(f"{output.name}{_SUFFIXES[self.until][0]}")
-        return replace(self, captures=(given,), output=path, cache=cache, plots=plots)
+        return replace(self, inputs=(given,), output=path, cache=cache, plots=plots)
 
     def cells(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Return what the table of many shows of a field."""
@@ -151,7 +150,7 @@ class Options(Configured, Many):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        if one := len(self.captures) == 1:
+        if one := len(self.inputs) == 1:
             self._check_capture()
         config = self.all_settings
         if one and self.output is not None:
@@ -192,7 +191,7 @@ class Options(Configured, Many):
 
 def run(options: Options) -> int:
     """Fit, write, and print a summary."""
-    if len(options.captures) > 1:
+    if len(options.inputs) > 1:
         return run_many("fit", options, raising=FitError)
     from avmsf._utils.device import TRAINABLE, usable_device
 

@@ -37,16 +37,10 @@ class Many(Common, ABC):
     """Of several: so many at a time, on one thread each."""
     ray: Annotated[str | None, arg("ADDRESS")] = None
     """Of several: a ray cluster with the same paths."""
-    given: ClassVar[str]
-    """The name of the inputs' option."""
+    inputs: tuple[Path, ...]
+    """What has an output each."""
     alone: ClassVar[tuple[str, ...]]
     """Options that only one input can have."""
-
-    @property
-    def inputs(self) -> tuple[Path, ...]:
-        """The inputs, each of which has an output."""
-        inputs: tuple[Path, ...] = getattr(self, self.given)
-        return inputs
 
     @property
     def written(self) -> Path | None:
@@ -73,10 +67,9 @@ class Many(Common, ABC):
     def check_inputs(self) -> None:
         """Raise as `Common`, of several inputs for what they share: what is wrong with one of them costs it alone."""
         if not self.inputs:
-            raise InputError.expected("1 or more", 0, got="none", name=self.given)
+            raise InputError.expected("1 or more", 0, got="none", name="inputs")
         several = len(self.inputs) > 1
-        shared: dict[str, Any] = {self.given: ()} if several else {}
-        super(Many, replace(self, **shared)).check_inputs()
+        super(Many, replace(self, inputs=()) if several else self).check_inputs()
         if several:
             self.tasks()
 

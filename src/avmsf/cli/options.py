@@ -39,7 +39,7 @@ S = TypeVar("S", bound="Configured")
 class Common:
     """Options of all verbs."""
 
-    quiet: Flag = False
+    only_results: Annotated[Flag, tyro.conf.arg(name="quiet")] = False
     """Print only results, warnings and errors."""
     verbose: Flag = False
     """Print each step of the work as it begins."""

@@ -52,8 +52,6 @@ from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.config import PRESETS, PipelineConfig
 from avmsf.pipeline.stages import digest_files, digest_of
 
-NEIGHBORS = 3
-"""Number of nearest recordings that are averaged (the paper's KNN), or all where there are fewer."""
 _SAME_POSITION_M = 1e-6
 """Distance of one contact from itself after float32, far below that of any two."""
 NETWORK = PipelineConfig(gain_model="network")
@@ -121,22 +119,21 @@ def nearest_recording(task: Task) -> NearestRecording:
 
 def mean_waveform(task: Task, *, by_direction: bool = False) -> MeanWaveform:
     """Return the mean of the nearest training recordings (the paper's KNN)."""
-    return MeanWaveform(task.train, min(NEIGHBORS, len(task.train)), by_direction)
+    return MeanWaveform(task.train, by_direction=by_direction)
 
 
 def mean_gains(task: Task) -> MeanGains:
     """Return the shared modes with the mean of the nearest recordings' gains."""
-    count = min(NEIGHBORS, len(task.train))
-    return MeanGains(task.train, task.modes(), count=count, noise=True, seed=task.seed)
+    return MeanGains(task.train, task.modes(), noise=True, seed=task.seed)
 
 
 def mean_trained_gains(task: Task) -> MeanGains:
     """Return the trained field of `paper` with the mean of its own gains at the nearest training contacts."""
-    field, count = task.field("paper"), min(NEIGHBORS, len(task.train))
+    field = task.field("paper")
     gains = 1j * field.complex_gains(task.train.contacts)
     trained = Extraction(field.bank, gains.to(torch.complex64), field.residual)
     # The network knows no directions: its gains are of one sign wherever a hammer came from.
-    return MeanGains(replace(task.train, directions=None), trained, count=count, noise=True, seed=task.seed)
+    return MeanGains(replace(task.train, directions=None), trained, noise=True, seed=task.seed)
 
 
 def spline_gains(task: Task) -> SplineGains:

@@ -56,9 +56,9 @@ class ObjectInputs:
     """What bodies are made of. With `gaussians`, nothing reads the object's mesh, where the dataset has one."""
     body: BodyConfig = field(default_factory=BodyConfig)
     device: str | None = None
-    """Device of Gaussians and DINOv2; None for a GPU where there is one."""
+    """Device of Gaussians, DINOv2 and training, with the same result up to rounding; None for a GPU if there is one."""
     seed: int = 0
-    """Seed of the points on a mesh."""
+    """Seed of the points on a mesh, and of the methods."""
 
     def features(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
         """Return what `visual_input` means for an object, from at most `views` views, or from all for None.

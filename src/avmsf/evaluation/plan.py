@@ -28,21 +28,17 @@ from avmsf.pipeline.features import choose_encoder
 class Evaluation:
     """Data set, protocol, methods and settings of an evaluation."""
 
-    dataset: Dataset
     title: str
     """Name of the dataset in reports; one folder of results has one."""
     protocol: Protocol
     methods: tuple[Method, ...]
     inputs: ObjectInputs
-    seed: int = 0
-    """Random seed of the methods."""
+    """Data set, seed and device of the methods, and what they read of the objects."""
     metric_settings: MetricSettings = field(default_factory=MetricSettings)
     finder: ModeFinder = field(default_factory=HighResolution)
     """Extraction of modes, once per case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the features, as plain values."""
-    device: str | None = None
-    """Device that methods train on, with the same result up to rounding; None for a GPU where there is one."""
     encoder: str | None = None
     """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
     time_zero: str | None = None
@@ -66,7 +62,7 @@ class Evaluation:
             "protocol": self.protocol.name,
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,
-            "seed": self.seed,
+            "seed": self.inputs.seed,
             "time_zero": self.time_zero,
             "metrics": _plain(self.metric_settings),
             "columns": list(METRICS),
@@ -122,16 +118,13 @@ def plan_evaluation(
     )
     body = asdict(settings.body)
     return Evaluation(
-        dataset,
         title,
         protocol,
         methods,
         inputs,
-        seed,
         metrics,
         finder,
         {"scene": asdict(scene), "paper": asdict(paper), "geometry": settings.geometry, "body": body, **edit},
-        device,
         None if lift == settings.lift else lift.encoder,
         time_zero,
         edits=edits,

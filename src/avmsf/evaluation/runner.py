@@ -56,7 +56,7 @@ class ObjectData:
 
     def __init__(self, evaluation: Evaluation, identifier: str) -> None:
         """Read an object. Raises AvmsfError, OSError or ValueError where it is damaged."""
-        dataset, inputs = evaluation.dataset, evaluation.inputs
+        inputs, dataset = evaluation.inputs, evaluation.inputs.dataset
         capture = dataset.capture(identifier)
         surface = capture.surface
         self.identifier, self.facts = identifier, dataset.facts(identifier)
@@ -80,9 +80,7 @@ class ObjectData:
         self.bodies = once(partial(inputs.bodies, identifier))
         self.family = once(partial(inputs.family, identifier))
         self.gaussians = once(partial(inputs.cloud, identifier))
-        self.other_recording = once(
-            partial(draw_other_recording, dataset, identifier, self.impacts, seed=evaluation.seed)
-        )
+        self.other_recording = once(partial(draw_other_recording, dataset, identifier, self.impacts, seed=inputs.seed))
 
 
 class _Recordings:
@@ -218,7 +216,7 @@ class CaseRun:
             train=recordings.train,
             contacts=data.impacts.contacts,
             names=data.impacts.names,
-            seed=self.evaluation.seed,
+            seed=self.evaluation.inputs.seed,
             modes=self._shared(recordings.modes),
             features=self._shared(lambda visual_input: data.features(visual_input, views)),
             bodies=self._shared(data.bodies),
@@ -227,7 +225,7 @@ class CaseRun:
             gaussians=self._shared(lambda: data.gaussians(views)),
             field=self._shared(self._field),
             material=data.facts.material,
-            device=self.evaluation.device,
+            device=self.evaluation.inputs.device,
         )
 
     def _shared(self, make: Callable[Given, Result]) -> Callable[Given, Result]:

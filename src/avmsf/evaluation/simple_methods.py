@@ -49,14 +49,15 @@ class _Neighbors:
     train: Impacts
     count: int
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.count <= len(self.train):
-            raise EvaluationError.expected(f"1 to {len(self.train)} training impacts", self.count, name="count")
+    @property
+    def neighbors(self) -> int:
+        """How many are averaged: all where there are fewer than `count`."""
+        return min(self.count, len(self.train))
 
     @property
     def report(self) -> dict[str, Any]:
         """How many are averaged, as plain values."""
-        return {"neighbors": self.count}
+        return {"neighbors": self.neighbors}
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +160,11 @@ class MeanWaveform(_Neighbors, _Trained):
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the mean of the nearest training contacts' sounds."""
         if not self.by_direction or directions is None or self.train.directions is None:
-            return self.train.sounds[nearest_points(self.train.contacts, contacts, count=self.count)].mean(dim=1)
+            return self.train.sounds[nearest_points(self.train.contacts, contacts, count=self.neighbors)].mean(dim=1)
         known = Sites(self.train.contacts.double(), normalize(self.train.directions.double()))
         asked = Sites(contacts.double(), normalize(directions.double()))
         size = float((known.points.amax(0) - known.points.amin(0)).norm())
-        rows, signs = asked.nearest(known, size=size, count=self.count)
+        rows, signs = asked.nearest(known, size=size, count=self.neighbors)
         return (signs[:, :, None].to(self.train.sounds) * self.train.sounds[rows]).mean(dim=1)
 
 
@@ -174,13 +175,9 @@ class MeanGains(_Neighbors, ModalBaseline):
     count: int = 3
     """How many contacts' amplitudes are averaged."""
 
-    def __post_init__(self) -> None:
-        ModalBaseline.__post_init__(self)
-        _Neighbors.__post_init__(self)
-
     def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return the mean of the nearest training contacts' amplitudes."""
-        nearest = self.amplitudes[nearest_points(self.train.contacts, contacts, count=self.count)]
+        nearest = self.amplitudes[nearest_points(self.train.contacts, contacts, count=self.neighbors)]
         return torch.complex(nearest.real.mean(dim=1), nearest.imag.mean(dim=1))
 
 

@@ -161,15 +161,12 @@ class Shots:
 
 @dataclass(frozen=True)
 class FewerViews:
-    """The training contacts of `Farthest`, with all views of the object and with fewer."""
-
-    counts: tuple[int | None, ...] = (None, 12)
-    """Numbers of views; None is all."""
+    """The training contacts of `Farthest`, with all views of the object and with 12."""
 
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the case of `Farthest`, once for each number of views."""
+        """Return the case of `Farthest` twice."""
         (case,) = Farthest().cases(impacts)
-        return tuple(replace(case, label=f"{views or 'all'} views", views=views) for views in self.counts)
+        return tuple(replace(case, label=f"{views or 'all'} views", views=views) for views in (None, 12))
 
 
 @dataclass(frozen=True, eq=False)

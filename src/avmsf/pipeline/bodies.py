@@ -31,7 +31,7 @@ from avmsf.pipeline.config import BodyConfig
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.recipe import Hammer
 
-SAMPLE_RATE = 44_100.0
+_SAMPLE_RATE = 44_100.0
 """Hz: that of most recordings."""
 _HIGHEST = 0.499
 """Highest frequency of a mode over the sample rate."""
@@ -90,7 +90,6 @@ def guess_field(
     *,
     body: BodyConfig | None = None,
     modes: int = 128,
-    sample_rate: float = SAMPLE_RATE,
     config: FitConfig | None = None,
     settings: CaptureSettings | None = None,
     name: str = "",
@@ -100,7 +99,7 @@ def guess_field(
     """Return the field of a free body of a material, by finite elements, without any recording.
 
     `surface` is in meters. It is filled, unless `body.wall` states the thickness of a wall. At most `modes` modes are
-    kept, those that sound below half of `sample_rate`, Hz. Sounds are in pascals per newton of peak force of a small
+    kept, those that sound below half of 44.1 kHz. Sounds are in pascals per newton of peak force of a small
     steel hammer (`Hammer`), at a distance of 1 m (`radiated_pressure`). There is no residual noise. Elastic modes are
     cached in the folder `cache`; `log` receives messages on the progress.
 
@@ -115,7 +114,7 @@ def guess_field(
     vibration = damped(
         found.elastic.frequency,
         torch.diag(rayleigh(found.elastic.frequency, material)),
-        highest=_HIGHEST * sample_rate,
+        highest=_HIGHEST * _SAMPLE_RATE,
     )
     # Rayleigh damping does not couple modes: each damped one has one shape.
     rows = vibration.pushes.abs().argmax(dim=1)
@@ -140,8 +139,8 @@ def guess_field(
         BodyGains(points, replace(elastic, shapes=shapes)),
         torch.zeros_like(vibration.frequency),
         Residual(torch.zeros(_BINS)),
-        sample_rate,
-        round(settings.kept_seconds(sample_rate) * sample_rate),
+        _SAMPLE_RATE,
+        round(settings.kept_seconds(_SAMPLE_RATE) * _SAMPLE_RATE),
         Origin(name, (), True, config or FitConfig(), report, settings),
     )
 

@@ -58,8 +58,11 @@ class StagedFit:
     """What the features' file says of itself; empty where no features were made."""
     modes: Extraction
     """The modes that the field started from."""
-    surface: Path | None = None
-    """The object's surface in the cache; None where its shape is unknown or the gain model needs none."""
+
+    @property
+    def surface(self) -> Path | None:
+        """The object's surface in the cache; None where its shape is unknown or the gain model needs none."""
+        return self.stages[SURFACE].path if SURFACE in self.stages else None
 
 
 def fit(
@@ -230,9 +233,7 @@ def _fit_shape(
         estimator()
     found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
     field = pipeline.add(Stage(FIELD, train_field, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
-    surface = pipeline.made.get(SURFACE)
-    modes = extract_once(train, method, found.path)
-    return StagedFit(field.path, pipeline.made, shape.report, modes, None if surface is None else surface.path)
+    return StagedFit(field.path, pipeline.made, shape.report, extract_once(train, method, found.path))
 
 
 def _is_final(path: Path, config: PipelineConfig, bodies: Callable[[], object]) -> bool:
