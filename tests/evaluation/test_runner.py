@@ -350,7 +350,7 @@ def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_ow
 
 def evaluate_plates(data: Path, results: Path) -> None:
     evaluation = planned(data, protocol="leave-one-out")
-    run_objects(evaluation, evaluation.dataset.objects(), ResultsFolder(results))
+    run_objects(evaluation, evaluation.inputs.dataset.objects(), ResultsFolder(results))
     summed(results)
 
 
@@ -387,9 +387,9 @@ def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path, a
     heard = list[int]()
     evaluation = planned(plates, *CHEAP, "spline-gains")
     # Workers of ray find what the package holds, and not what lies beside the tests.
-    dataset, kept = evaluation.dataset, tmp_path / "features"
+    dataset, kept = evaluation.inputs.dataset, tmp_path / "features"
     evaluation = replace(evaluation, inputs=ObjectInputs(dataset, kept))
-    objects = evaluation.dataset.objects()
+    objects = dataset.objects()
     run_objects(evaluation, objects, ResultsFolder(tmp_path / "one"))
     many = ResultsFolder(tmp_path / "many")
     listen: Progress = lambda message, done, total: heard.append(done)  # noqa: E731
