@@ -61,13 +61,6 @@ def test_kernels_are_the_written_ones():
         assert torch.allclose(kernels[row], expected, rtol=1e-5, atol=1e-5)
 
 
-def test_kernels_are_sums_of_the_basis():
-    given, others = family(), impacts(10, seed=2)
-    kept = given.take(torch.tensor([3, 0, 100, 215]))
-    expected = torch.einsum("hb,bso->hso", kept.shares, given.basis(others, given.reference))
-    assert torch.allclose(kept.between(others, given.reference), expected, rtol=1e-12, atol=1e-12)
-
-
 def test_a_body_is_of_no_weight_for_what_it_does_not_have():
     """Its share of gains that are affine functions of the place is small; it takes nearly all of its own modes'."""
     sites = impacts(20, seed=1, askew=0.0)

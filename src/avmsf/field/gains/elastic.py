@@ -20,7 +20,7 @@ one or two impacts these tell which shape each mode is.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import lru_cache
 from typing import ClassVar
 
 import torch
@@ -29,7 +29,7 @@ from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import factor_range
-from avmsf.field.gains.kernels import KernelFamily, Sites, scaled, squared_exponential
+from avmsf.field.gains.kernels import MEMORY, KernelFamily, Sites, scaled, squared_exponential
 
 PERTURBATIONS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Relative perturbations tau of stiffness and mass."""
@@ -55,8 +55,6 @@ FREQUENCY_ERRORS = (0.01, 0.03, 0.08, 0.2)
 """Standard deviations of log frequency about the nominal one, equally probable."""
 _EXCEPTIONS = 0.5
 """Share of the modes whose standard deviation is any of these, not that of the other modes."""
-_MEMORY = 4_000_000
-"""Numbers of a basis held at once."""
 _IMPROBABLE = 1e-6
 """Probability of a factor, over the most probable one's, below which it is left out: all of them together change
 probabilities by less than a thousandth."""
@@ -96,13 +94,13 @@ class Elastic(KernelFamily):
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
         self.frequency_weights = torch.exp(self.factor_log_prior)
         """Probability of each pair of `frequency_factors` and `FREQUENCY_ERRORS`, the pairs of one factor in a row."""
-        # Shared by the families that are taken of this one.
-        self._latest: list[tuple[Sites, Float64[Tensor, "sites shapes"]]] = []
+        # Covariances ask for the same impacts several times in a row, and of all families that are taken of this one.
+        self._along = lru_cache(maxsize=3)(lambda sites: self.modes.gains(sites.points, sites.directions))
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
         profiles += [torch.exp(-0.5 * (apart / width).square()) + _FAR for width in WIDTHS]
-        profile, diagonal = torch.stack(profiles), self._known.square().T
+        profile, diagonal = torch.stack(profiles), self._along(reference).square().T
         self._sizes = profile @ diagonal.mean(1)
         elastic = scaled(profile.flatten(0, 1), diagonal)
         share = torch.tensor(RESIDUALS, dtype=torch.float64)[None, :, None]
@@ -119,7 +117,7 @@ class Elastic(KernelFamily):
         return torch.cat([self._along(sites).square().T, torch.ones(1, len(sites), dtype=torch.float64)])
 
     def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
-        """Return the kernels between two sets of impacts."""
+        """Return the kernels between two sets of impacts, without the basis, which may be far larger."""
         one, other = self._along(sites), self.shares[:, :-1][:, None] * self._along(others)
         mixed = (one @ other.flatten(0, 1).T).reshape(len(one), *other.shape[:2]).transpose(0, 1)
         return mixed + self._residual_kernel(sites, others) * self.shares[:, -1, None, None]
@@ -163,7 +161,7 @@ class Elastic(KernelFamily):
         weights = (1.0 - _EXCEPTIONS) * weights + _EXCEPTIONS * weights.mean(1, keepdim=True)
         probable = torch.nonzero(weights.amax(1) > _IMPROBABLE * weights.max()).flatten()
         found = torch.full((len(self.modes), len(log_frequency)), -torch.inf, dtype=torch.float64)
-        for rows in torch.split(probable, max(1, _MEMORY // found.numel())):
+        for rows in torch.split(probable, max(1, MEMORY // found.numel())):
             densities = self._densities(self.frequency_factors[rows], log_frequency, log_frequency)
             for logs, weight in zip(densities, weights[rows].T, strict=True):
                 found = torch.logaddexp(found, torch.logsumexp(logs + weight.log()[:, None, None], dim=0))
@@ -223,21 +221,6 @@ class Elastic(KernelFamily):
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:
         return self.frequency_weights.reshape(-1, len(FACTORS), len(FREQUENCY_ERRORS)).sum(2)
-
-    @cached_property
-    def _known(self) -> Float64[Tensor, "contacts shapes"]:
-        """Components of the shapes along the reference impacts."""
-        return self.modes.gains(self.reference.points, self.reference.directions)
-
-    def _along(self, sites: Sites) -> Float64[Tensor, "sites shapes"]:
-        if sites is self.reference:
-            return self._known
-        # Covariances ask for the same impacts several times in a row.
-        found = next((along for known, along in self._latest if known is sites), None)
-        if found is None:
-            found = self.modes.gains(sites.points, sites.directions)
-            self._latest[:] = [*self._latest[-1:], (sites, found)]
-        return found
 
     def _residual_kernel(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:
         return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)

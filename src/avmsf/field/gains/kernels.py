@@ -27,6 +27,10 @@ FEATURE_LENGTHS = (0.25, 0.5, 1.0)
 """Lengths of the visual kernels over the root mean square distance between the features of points."""
 VISUAL_LENGTHS = (0.2, 0.4, 0.8)
 """Lengths over the object's size of the positions' kernels that multiply the visual ones."""
+MEMORY = 4_000_000
+"""Numbers of a basis held at once."""
+_BLOCK = 32
+"""Impacts whose basis among each other is computed for its diagonal."""
 _ROUNDING = 1e-6
 """Distance over the object's size up to which float32 and a change of scale may move a point."""
 _FLAT = 1e-3
@@ -141,8 +145,9 @@ class KernelFamily(ABC):
         """Return the basis between two sets of impacts."""
 
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
-        """Return the basis of each impact with itself; ones, unless a family says otherwise."""
-        return torch.ones(self.shares.shape[1], len(sites), dtype=torch.float64)
+        """Return the basis of each impact with itself."""
+        parts = (sites.take(rows) for rows in torch.split(torch.arange(len(sites)), _BLOCK))
+        return torch.cat([torch.diagonal(self.basis(part, part), dim1=1, dim2=2) for part in parts], dim=1)
 
     def categories(self) -> Int[Tensor, " kernels"]:
         """Return the category of each kernel, from 0 on; each kernel is one, unless a family says otherwise."""
@@ -170,7 +175,10 @@ class KernelFamily(ABC):
 
     def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
         """Return the kernels between two sets of impacts."""
-        return torch.einsum("hb,bso->hso", self.shares, self.basis(sites, others))
+        size = max(1, MEMORY // max(1, self.shares.shape[1] * len(others)))
+        rows = torch.split(torch.arange(len(sites)), size)
+        parts = [sites] if len(rows) == 1 else [sites.take(each) for each in rows]
+        return torch.cat([torch.einsum("hb,bso->hso", self.shares, self.basis(part, others)) for part in parts], dim=1)
 
     def own(self, sites: Sites) -> Float64[Tensor, "kernels sites"]:
         """Return the kernels of each impact with itself."""
@@ -241,12 +249,6 @@ class Smooth(KernelFamily):
         affine = (1.0 + one @ other.T) / (1.0 + one.shape[1])
         return torch.cat([smooth, affine[None]]) * sites.cosine(others)
 
-    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
-        """Return ones, and the affine kernel's."""
-        along = self._axes.standardized(sites.points)
-        affine = (1.0 + along.square().sum(1)) / (1.0 + along.shape[1])
-        return torch.cat([torch.ones(len(LENGTHS), len(sites), dtype=torch.float64), affine[None]])
-
 
 class ThinPlate(KernelFamily):
     """The thin-plate spline as a Gaussian process: a function of least bending added to an affine one.
@@ -280,14 +282,6 @@ class ThinPlate(KernelFamily):
         left, right = self._drift(one) @ self._inverse, self._drift(other) @ self._inverse
         bent = self._kernel(one, other) - left @ self._kernel(known, other) - self._kernel(one, known) @ right.T
         return torch.stack([bent + left @ self._among @ right.T, left @ right.T]) * sites.cosine(others)
-
-    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
-        """Return both of each impact with itself; the kernel k is zero there."""
-        along = self._axes.along(sites.points)
-        left = self._drift(along) @ self._inverse
-        bent = ((left @ self._among) * left).sum(1)
-        bent = bent - 2.0 * (left * self._kernel(along, self._axes.along(self.reference.points))).sum(1)
-        return torch.stack([bent.clamp_min(0.0), left.square().sum(1)])
 
     def _kernel(
         self, along: Float64[Tensor, "sites dim"], others: Float64[Tensor, "others dim"]

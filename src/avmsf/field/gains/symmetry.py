@@ -62,20 +62,9 @@ class Symmetric(KernelFamily):
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
         """Return the kernels between the impacts and each image of the others, group by group."""
-        return torch.cat(list(self._moved(sites, others)))
-
-    def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
-        """Return the kernels between two sets of impacts, motion by motion: all images at once take much memory."""
-        found = torch.zeros(len(self), len(sites), len(others), dtype=torch.float64)
-        shares = torch.split(self.shares, len(self._bases[0]), dim=1)
-        for share, moved in zip(shares, self._moved(sites, others), strict=True):
-            found += torch.einsum("hb,bso->hso", share, moved)
-        return found
-
-    def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
-        """Return the kernels between each impact and its own images."""
-        each = [self.basis(sites.take(row), sites.take(row))[:, 0] for row in torch.split(torch.arange(len(sites)), 1)]
-        return torch.cat(each, dim=1)
+        pairs = zip(self.groups, self._bases, strict=True)
+        images = ((base, each) for group, base in pairs for each in self._images(group, others))
+        return torch.cat([base.between(sites, image) for base, image in images])
 
     def categories(self) -> Int[Tensor, " kernels"]:
         """Return one category for each group, kernel and remainder: each mode has a character of its own."""
@@ -86,19 +75,13 @@ class Symmetric(KernelFamily):
         count = torch.bincount(self._category)[self._category].double()
         return -count.log()[:, None].expand(-1, len(log_frequency))
 
-    def _moved(self, sites: Sites, others: Sites) -> Iterator[Float64[Tensor, "kernels sites others"]]:
-        for group, base in zip(self.groups, self._bases, strict=True):
-            for image in _images(group, others, directional=self._directional):
-                yield base.between(sites, image)
-
     def _orbit(self, group: Group) -> Sites:
-        images = list(_images(group, self.reference, directional=self._directional))
+        images = list(self._images(group, self.reference))
         return Sites(torch.cat([each.points for each in images]), torch.cat([each.directions for each in images]))
 
-
-def _images(group: Group, sites: Sites, *, directional: bool) -> Iterator[Sites]:
-    """Yield the impacts as each motion leaves them; it turns their directions only where these are known."""
-    for motion in group.motions:
-        linear = motion[:, :3].T
-        directions = sites.directions @ linear if directional else sites.directions
-        yield Sites(sites.points @ linear + motion[:, 3], directions)
+    def _images(self, group: Group, sites: Sites) -> Iterator[Sites]:
+        """Yield the impacts as each motion leaves them; it turns their directions only where these are known."""
+        for motion in group.motions:
+            linear = motion[:, :3].T
+            directions = sites.directions @ linear if self._directional else sites.directions
+            yield Sites(sites.points @ linear + motion[:, 3], directions)
