@@ -59,7 +59,7 @@ def run(options: Options) -> int:
     from avmsf.cli.report import levels, mode_rows, mode_table
     from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.modal.extraction.extract import extract_modes
-    from avmsf.modal.extraction.finders import finder_named
+    from avmsf.modal.extraction.finders import FINDERS
     from avmsf.modal.extraction.quality import measure_quality
 
     config = options.pipeline
@@ -67,7 +67,7 @@ def run(options: Options) -> int:
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
     doing(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
-    extraction = extract_modes(impacts, finder_named(config.extraction, config.modes))
+    extraction = extract_modes(impacts, FINDERS[config.extraction](modes=config.modes))
     level = levels(extraction.gains.abs())
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
     modes, supporting = mode_rows(extraction.bank, level, quality.is_mode, quality)

@@ -46,7 +46,7 @@ from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction, extract_sounds
-from avmsf.modal.extraction.finders import finder_named, lowest_frequency
+from avmsf.modal.extraction.finders import FINDERS, lowest_frequency
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.config import PRESETS, PipelineConfig
@@ -312,7 +312,7 @@ class FieldMethod:
         """Fit the field, whose report has what was chosen. Raises AvmsfError where a stage cannot be made."""
         features, config, report = task.features(self.visual_input), self.pipeline.fit, dict[str, Any]()
         if self.published:
-            finder = finder_named(self.pipeline.extraction, self.pipeline.modes)
+            finder = FINDERS[self.pipeline.extraction](modes=self.pipeline.modes)
             modes = extract_sounds(task.train.sounds, sample_rate=task.train.sample_rate, method=finder)
         else:
             modes = task.modes()

@@ -19,7 +19,7 @@ from avmsf.evaluation.results import SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import shared_cdpam
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.features.descriptors import ImageDescriptors
-from avmsf.modal.extraction.finders import HighResolution, ModeFinder, finder_named
+from avmsf.modal.extraction.finders import FINDERS, HighResolution, ModeFinder
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder
 
@@ -105,7 +105,7 @@ def plan_evaluation(
     """
     if device is not None:
         usable_device(device, raising=EvaluationError, kinds=TRAINABLE)
-    finder, edits, edit = finder_named(settings.extraction, settings.modes), None, {}
+    finder, edits, edit = FINDERS[settings.extraction](modes=settings.modes), None, {}
     if protocol.scoring == "edits":
         edits, edit = Edits(dataset, settings.edit, finder, cache, seed), {"edit": asdict(settings.edit)}
         # Where a model cannot be loaded nothing else is worth its time. Workers load their own.

@@ -105,8 +105,7 @@ def suggest(
             kept = torch.nonzero(allowed).flatten()
             kept = kept[farthest_points(pool[kept], min(most, len(kept)))].sort().values
         sites = gains.sites(pool[kept], None if directions is None else directions[kept])
-        error = _ExpectedError(field, gains, points, sites)
-        before, (rows, after) = error.total(), error.choose(allowed[kept], count, same=same)
+        rows, (before, *after) = _choose(field, gains, points, sites, allowed[kept], count, same=same)
     return Suggestions(
         sites.points[rows],
         sites.directions[rows] if gains.directional else None,
@@ -130,57 +129,45 @@ def _mixture_of(field: SoundField, unseen: bool) -> MixtureGains:
     return gains
 
 
-class _ExpectedError:
-    """Posterior variances and covariances, mode by mode, while contacts are added that have not been measured."""
+def _choose(
+    field: SoundField,
+    gains: MixtureGains,
+    points: Float64[Tensor, "points 3"],
+    candidates: Sites,
+    allowed: Bool[Tensor, " candidates"],
+    count: int,
+    *,
+    same: float,
+) -> tuple[list[int], list[float]]:
+    """Return the rows of `count` allowed candidates that lower the expected error at points most in turn, taken as
+    measured, and the error before and after each; fewer where fewer lie farther apart than `same`.
+    """
+    places = torch.cat([points, candidates.points])
+    directions = torch.cat([gains.sites(points).directions, candidates.directions])
+    weights, size = (1.0 / (4.0 * field.bank.damping)).tolist(), len(points)
+    # At the points, all modes together; and each mode's covariances between all places and candidates, and its noise.
+    variance, modes = torch.zeros(size, dtype=torch.float64), []
+    for mode, covariance, noise in gains.covariances(places, directions):
+        variance += weights[mode] * torch.diagonal(covariance)[:size].clamp_min(0.0)
+        modes.append((weights[mode] * covariance[:, size:], weights[mode] * noise))
+    energy = float(energy_of(field, gains.predict(points.float()).parts).mean() + variance.mean())
 
-    def __init__(
-        self, field: SoundField, gains: MixtureGains, points: Float64[Tensor, "points 3"], candidates: Sites
-    ) -> None:
-        self.points, self.candidates = len(points), candidates.points
-        self.modes: list[tuple[Float64[Tensor, "places candidates"], float]] = []
-        """Of each mode the covariances between all places and the candidates, the last of these, and the noise."""
-        self.variance = torch.zeros(len(points), dtype=torch.float64)
-        """At the points, all modes together."""
-        places = torch.cat([points, candidates.points])
-        directions = torch.cat([gains.sites(points).directions, candidates.directions])
-        weights = (1.0 / (4.0 * field.bank.damping)).tolist()
-        for mode, covariance, noise in gains.covariances(places, directions):
-            weight = weights[mode]
-            self.variance += weight * torch.diagonal(covariance)[: self.points].clamp_min(0.0)
-            self.modes.append((weight * covariance[:, self.points :], weight * noise))
-        self.energy = float(energy_of(field, gains.predict(points.float()).parts).mean() + self.variance.mean())
-
-    def total(self) -> float:
-        """Return the expected relative error over all points."""
-        return math.sqrt(float(self.variance.mean()) / self.energy)
-
-    def choose(self, allowed: Bool[Tensor, " candidates"], count: int, *, same: float) -> tuple[list[int], list[float]]:
-        """Return the rows of `count` allowed candidates that lower the error most in turn, and the error after each.
-
-        They are taken as measured; fewer where fewer lie farther apart than `same`.
-        """
-        rows, after = list[int](), list[float]()
-        while len(rows) < count and bool(allowed.any()):
-            reduced = [
-                known[: self.points].square().sum(0) / self._measured(known, noise) for known, noise in self.modes
-            ]
-            rows.append(int(torch.where(allowed, torch.stack(reduced).sum(0), -math.inf).argmax()))
-            self._measure(rows[-1])
-            allowed = allowed & ((self.candidates - self.candidates[rows[-1]]).norm(dim=1) > same)
-            after.append(self.total())
-        return rows, after
-
-    def _measure(self, row: int) -> None:
-        for shared, noise in self.modes:
-            column = shared[:, row].clone()
-            measured = self._measured(shared, noise)[row]
-            self.variance = (self.variance - column[: self.points].square() / measured).clamp_min(0.0)
-            shared -= torch.outer(column, column[self.points :]) / measured
-
-    def _measured(self, shared: Tensor, noise: float) -> Float64[Tensor, " candidates"]:
+    def measured(shared: Float64[Tensor, "places candidates"], noise: float) -> Float64[Tensor, " candidates"]:
         """Return the variance of a measured gain at each candidate."""
-        own = torch.diagonal(shared[self.points :]).clamp_min(0.0)
+        own = torch.diagonal(shared[size:]).clamp_min(0.0)
         return (own + noise).clamp_min(torch.finfo(torch.float64).tiny)
+
+    rows, errors = list[int](), [math.sqrt(float(variance.mean()) / energy)]
+    while len(rows) < count and bool(allowed.any()):
+        reduced = [shared[:size].square().sum(0) / measured(shared, noise) for shared, noise in modes]
+        rows.append(row := int(torch.where(allowed, torch.stack(reduced).sum(0), -math.inf).argmax()))
+        for shared, noise in modes:
+            column, scale = shared[:, row].clone(), measured(shared, noise)[row]
+            variance = (variance - column[:size].square() / scale).clamp_min(0.0)
+            shared -= torch.outer(column, column[size:]) / scale
+        allowed = allowed & ((candidates.points - candidates.points[row]).norm(dim=1) > same)
+        errors.append(math.sqrt(float(variance.mean()) / energy))
+    return rows, errors
 
 
 def _reachable(

@@ -29,7 +29,7 @@ from avmsf.field.training import Progress
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import Extraction, extract_once
-from avmsf.modal.extraction.finders import finder_named
+from avmsf.modal.extraction.finders import FINDERS
 from avmsf.pipeline.bodies import candidate_bodies, expect_no_recordings, guess_field
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE, PipelineConfig
 from avmsf.pipeline.record import modes_words, supporting_poles, with_record
@@ -178,7 +178,7 @@ def fit_in_stages(
 def _fit_shape(
     capture: Capture, train: Impacts, shape: FitShape, config: PipelineConfig, pipeline: Pipeline
 ) -> StagedFit:
-    method, listener = finder_named(config.extraction, config.modes), pipeline.listener
+    method, listener = FINDERS[config.extraction](modes=config.modes), pipeline.listener
     recorded = {"impacts": train.digest(), "method": repr(method)}
 
     def bodies() -> CandidateBodies:

@@ -25,12 +25,14 @@ GROUPS = torch.tensor([0, 0, 1, 2, 1, 3, 1])
 
 
 @cache
-def posterior(given: Hypotheses, values: torch.Tensor, floor: torch.Tensor) -> tuple[KernelMixture, torch.Tensor]:
+def posterior(
+    given: Hypotheses, kernels: torch.Tensor, values: torch.Tensor, floor: torch.Tensor
+) -> tuple[KernelMixture, torch.Tensor]:
     """Weigh hypotheses, their prior learned from all series that have any energy."""
-    evidence = log_evidence(given.kernels, values, floor)
+    evidence = log_evidence(kernels, values, floor)
     weights = posterior_weights(evidence, given, active_series(values))
     kept = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
-    return KernelMixture(given.kernels[kept], values, floor, weights[kept]), kept
+    return KernelMixture(kernels[kept], values, floor, weights[kept]), kept
 
 
 def joint_kernels() -> np.ndarray:
@@ -93,10 +95,9 @@ def mixture() -> KernelMixture:
 
 
 def hypotheses(**changes) -> Hypotheses:
-    kernels = torch.from_numpy(among().copy())
     log_prior = torch.from_numpy(drawn()[2][:, 0].copy())
     prior = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
-    return replace(Hypotheses(kernels, torch.tensor([0, 1, 1, 2]), prior, log_prior), **changes)
+    return replace(Hypotheses(torch.tensor([0, 1, 1, 2]), prior, log_prior), **changes)
 
 
 def test_evidence_is_the_textbook_one():
@@ -201,9 +202,8 @@ def test_a_lone_group_is_predicted_as_silence():
 
 
 def test_weights_sum_to_one_and_none_is_negligible():
-    given = hypotheses()
-    found, kept = posterior(given, mixture().values, mixture().floor)
-    assert torch.equal(found.kernels, given.kernels[kept])
+    found, kept = posterior(hypotheses(), mixture().kernels, mixture().values, mixture().floor)
+    assert torch.equal(found.kernels, mixture().kernels[kept])
     assert torch.allclose(found.weights.sum((0, 1)), torch.ones(SERIES, dtype=torch.float64))
     assert bool((found.weights >= 0.01 * found.weights.amax((0, 1)))[found.weights > 0].all())
     assert bool((found.weights == 0).any())
@@ -253,8 +253,8 @@ def test_rounding_is_no_energy():
 def test_thousands_of_equally_probable_kernels_keep_their_weights():
     kernels = torch.eye(2, dtype=torch.float64).expand(3000, -1, -1)
     category, prior = torch.zeros(3000, dtype=torch.int64), torch.ones(1, dtype=torch.float64)
-    given = Hypotheses(kernels, category, prior, torch.zeros(3000, 1, dtype=torch.float64))
+    given = Hypotheses(category, prior, torch.zeros(3000, 1, dtype=torch.float64))
     values = torch.tensor([[1.0], [-0.5]], dtype=torch.float64)
-    found, kept = posterior(given, values, torch.zeros(1, dtype=torch.float64))
+    found, kept = posterior(given, kernels, values, torch.zeros(1, dtype=torch.float64))
     assert len(kept) == 3000
     assert float(found.weights.sum()) == pytest.approx(1.0)

@@ -140,17 +140,18 @@ def fit_mixture(
     values, floor = series_of(measured.values), measured.floor
     weighed = [WeighedFamily.of(family, measured, noise_shares) for family in families]
     weigh_factors(weighed, measured)
-    hypotheses, evidence = hypotheses_of(weighed, measured), torch.cat([each.evidence for each in weighed])
-    weights = posterior_weights(evidence, hypotheses, measured.informative)
+    evidence = torch.cat([each.evidence for each in weighed])
+    weights = posterior_weights(evidence, hypotheses_of(weighed, measured), measured.informative)
     used = weights.sum((1, 2)) > 0
-    mixture = KernelMixture(hypotheses.kernels[used], values, floor, weights[used], noise_shares)
+    kernels = torch.cat([each.kernels for each in weighed])[used]
+    mixture = KernelMixture(kernels, values, floor, weights[used], noise_shares)
     rows = torch.split(used, [len(family) for family in families])
     kept = tuple(family.take(torch.nonzero(each).flatten()) for family, each in zip(families, rows, strict=True))
     return MixtureGains(points, families[0].reference, tuple(filter(len, kept)), mixture, directional)
 
 
 def hypotheses_of(families: Sequence[WeighedFamily], measured: MeasuredGains) -> Hypotheses:
-    """Return the kernels of all families and how probable each is beforehand."""
+    """Return how probable the kernels of all families are beforehand."""
     kinds = [each.family.kind for each in families]
     category, prior, first = [], [], 0
     for each in families:
@@ -160,7 +161,7 @@ def hypotheses_of(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
         first += len(within)
     log_frequency = torch.log(measured.frequency)
     log_prior = torch.cat([each.family.log_prior(log_frequency) for each in families]).repeat(1, 2)
-    return Hypotheses(torch.cat([each.kernels for each in families]), torch.cat(category), torch.cat(prior), log_prior)
+    return Hypotheses(torch.cat(category), torch.cat(prior), log_prior)
 
 
 def total_evidence(families: Sequence[WeighedFamily], measured: MeasuredGains) -> float:

@@ -61,10 +61,8 @@ Statistic = Callable[[Float64[Tensor, "some pairs places"], Float64[Tensor, "som
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Kernels and how probable each is before any gain is known."""
+    """How probable each kernel is before any gain is known."""
 
-    kernels: Float64[Tensor, "kernels contacts contacts"]
-    """Symmetric and positive semidefinite, mean diagonal one."""
     category: Int[Tensor, " kernels"]
     """Row of `category_prior`; kernels of one category share a probability that is learned."""
     category_prior: Float64[Tensor, " categories"]
@@ -111,6 +109,7 @@ class KernelMixture:
     """The posterior of all series: kernels with their weights."""
 
     kernels: Float64[Tensor, "kernels contacts contacts"]
+    """Symmetric and positive semidefinite, mean diagonal one."""
     values: Float64[Tensor, "contacts series"]
     floor: Float64[Tensor, " series"]
     """Known variance of the values over their mean square, added to every noise share."""

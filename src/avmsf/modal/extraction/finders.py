@@ -168,11 +168,6 @@ FINDERS: dict[ExtractionMethod, type[ModeFinder]] = {"high-resolution": HighReso
 """By the names that `avmsf modes --extraction` and `PipelineConfig.extraction` take."""
 
 
-def finder_named(method: ExtractionMethod, modes: int) -> ModeFinder:
-    """Return the finder of that name, of at most so many modes."""
-    return FINDERS[method](modes=modes)
-
-
 def lowest_frequency(samples: int, sample_rate: float) -> float:
     """Return the lowest frequency (Hz) at which sounds of this length let a mode be told from rumble."""
     return _MIN_PERIODS * sample_rate / samples
