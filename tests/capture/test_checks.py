@@ -16,8 +16,8 @@ from avmsf.capture.audio import clipped_samples, constant_offset
 from avmsf.capture.checks import expect_held
 from avmsf.capture.issues import shared_problems
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.surface import Surface
 from factories.capture_folder import RATE, ROWS, fill, ring
+from factories.looked_at import surface_of
 from factories.raising import raises
 
 NAMES = ("a.wav", "b.wav", "c.wav")
@@ -218,8 +218,7 @@ def test_rows_in_the_order_of_text_and_not_of_numbers_are_remarked_on(tmp_path: 
 
 
 def test_a_point_far_from_the_object_does_not_hold_it() -> None:
-    cube = trimesh.creation.box((0.1, 0.1, 0.1))
-    surface = Surface(torch.from_numpy(cube.vertices), torch.from_numpy(cube.faces))
+    surface = surface_of(trimesh.creation.box((0.1, 0.1, 0.1)))
     expect_held([(0.0, 0.0, 0.05), (0.05, 0.0, 0.06)], surface)
     with raises(CaptureError, name="held", value=pytest.approx(0.95)):
         expect_held([(0.0, 0.0, 0.05), (0.0, 0.0, 1.0)], surface)

@@ -14,6 +14,7 @@ from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface, read_surface
 from avmsf.mesh.surface import contacted_part, surface_points
+from factories.looked_at import surface_of
 from factories.raising import raises
 
 Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
@@ -189,7 +190,7 @@ def test_of_a_scan_with_its_table_the_part_that_the_contacts_lie_on_is_kept() ->
     cup, table = trimesh.creation.icosphere(3, radius=0.05), trimesh.creation.box((0.5, 0.5, 0.02))
     table.apply_translation((0, 0, -0.07))
     both = trimesh.util.concatenate([table, cup])
-    scan = Surface(torch.tensor(both.vertices).float(), torch.tensor(both.faces))
+    scan = surface_of(both)
     contacts = torch.from_numpy(np.array(trimesh.sample.sample_surface(cup, 12, seed=0)[0]))
     kept, areas = contacted_part(scan, contacts)
     assert len(kept.faces) == len(cup.faces)

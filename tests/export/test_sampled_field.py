@@ -27,6 +27,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.clouds import random_cloud
+from factories.looked_at import surface_of
 from factories.made_fields import BANK, FIELDS, elastic, places, plate, positional
 from factories.raising import raises
 from factories.struck_table import RATE, struck_table
@@ -185,9 +186,8 @@ def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
         assert np.array_equal(sound, sounds[row].numpy())
 
 
-def ball_surface(radius: float = 0.1, divisions: int = 2) -> Surface:
-    mesh = trimesh.creation.icosphere(subdivisions=divisions, radius=radius)
-    return Surface(torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces).long())
+def ball_surface(divisions: int = 2) -> Surface:
+    return surface_of(trimesh.creation.icosphere(subdivisions=divisions, radius=0.1))
 
 
 def ball_points(count: int = 300) -> torch.Tensor:

@@ -14,7 +14,7 @@ from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.level_set import enclose
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import GRAY, TexturedMesh, read_textured_mesh
-from factories.looked_at import surface_of
+from factories.looked_at import mesh_of, surface_of
 from factories.raising import raises, warns
 
 
@@ -100,10 +100,6 @@ def ball(faces: int | None = None) -> Surface:
     depth = RADIUS - np.linalg.norm(places() - MIDDLE, axis=-1)
     values = np.clip(0.5 + 0.5 * depth / (2 * SPACING), 0, 1).astype(np.float32)
     return enclose(values, 0.5, lowest=LOWEST, spacing=SPACING, faces=faces)
-
-
-def mesh_of(surface: Surface) -> trimesh.Trimesh:
-    return trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
 
 
 def off(surface: Surface) -> np.ndarray:

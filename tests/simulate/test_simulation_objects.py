@@ -22,6 +22,7 @@ from avmsf.simulate.recipe import Imperfections, ObjectRecipe, named_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
 from avmsf.simulate.strikes import MIN_NORMAL_HEIGHT, draw_strikes, nearest_on
+from factories.looked_at import surface_of
 from factories.made_tile import tile
 from factories.raising import raises
 
@@ -97,7 +98,7 @@ def test_a_perfect_recorder_writes_what_was_struck_and_how_hard(recipe: ObjectRe
 def test_jitter_has_the_asked_size() -> None:
     # On a ball of 10 cm, where the surface's curvature hides nothing of 2 mm.
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
-    surface = Surface(torch.tensor(ball.vertices).float(), torch.tensor(ball.faces))
+    surface = surface_of(ball)
     spread = Imperfections(contact=0.002, direction=4.0, force=0.03, speed=0.2, contact_time=0.08)
     strikes = draw_strikes(surface, 800, up=UP, imperfections=spread, seed=1)
     off = (strikes.places - strikes.written_places).norm(dim=1).square().mean().sqrt()
@@ -119,7 +120,7 @@ def test_a_hammer_reaches_neither_the_inside_of_a_cup_nor_what_looks_down() -> N
         [0, 0, -0.0475]
     ))  # fmt: skip
     joined = trimesh.util.concatenate([cup, floor])
-    surface = Surface(torch.tensor(joined.vertices).float(), torch.tensor(joined.faces))
+    surface = surface_of(joined)
     strikes = draw_strikes(surface, 60, up=UP, imperfections=Imperfections.none(), seed=0)
     outward = -strikes.directions
     assert float((outward @ UP).min()) >= MIN_NORMAL_HEIGHT
@@ -133,7 +134,7 @@ def test_a_hammer_reaches_neither_the_inside_of_a_cup_nor_what_looks_down() -> N
 
 def test_switching_one_imperfection_off_changes_none_of_the_others() -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
-    surface = Surface(torch.tensor(ball.vertices).float(), torch.tensor(ball.faces))
+    surface = surface_of(ball)
     full, surely, hard = (
         draw_strikes(surface, 20, up=UP, imperfections=each, seed=5)
         for each in (Imperfections(), Imperfections(contact=0.0), Imperfections(force=0.0))

@@ -18,6 +18,7 @@ from avmsf.symmetry.motions import Motions, reflections, rotations
 from avmsf.symmetry.point_group import generate
 from avmsf.symmetry.search import find_group
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
+from factories.looked_at import mesh_of
 from factories.raising import raises
 
 THIRD = RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.tensor([1.0, 0.0, 0.5]).double(), 3, 0.04)
@@ -176,8 +177,7 @@ def test_a_bowl_that_is_part_of_a_ball_has_one_axis_only():
 @pytest.mark.slow
 def test_a_scanned_bowl_is_round(shared: Path):
     surface = read_surface(shared / "meshes" / "bowl" / "textured.obj")
-    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
-    found = find(draw(mesh, count=6000))
+    found = find(draw(mesh_of(surface), count=6000))
     assert [each.order for each in found.rotations] == [None]
     assert found.mirrors == ()
     # The scan stands upright to half a degree.
