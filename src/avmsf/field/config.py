@@ -23,26 +23,19 @@ _POSITIVE = ("feature_scale", "warmup_rate", "learning_rate")
 
 @dataclass(frozen=True)
 class AttentionShape:
-    """The network's sizes."""
+    """The network's sizes: settings of `FitConfig`, whether dampings depend on the contact too, and whether gains are
+    positive.
+    """
 
     clusters: int
-    """Regions K that the network attends to."""
     bands: int
-    """Octaves of sines and cosines in the encoding of offsets."""
     width: int
-    """Size d of queries, keys and values."""
     hidden: int
-    """Neurons in each hidden layer of the head."""
     layers: int
-    """Hidden layers of the head."""
     feature_scale: float
-    """Factor on the features as the network reads them."""
     spatial_damping: bool = False
-    """Let the dampings depend on the contact too."""
     projection: bool = False
-    """Project what attention reads before it is joined with the contact's feature."""
     positive: bool = False
-    """Let gains be positive."""
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,6 @@ from avmsf.capture.placement import TOLERANCE
 from avmsf.errors import PositionError
 from avmsf.field.gains.model import GainModel
 
-_FEW = 16
-"""Positions up to which all distances take less time than a tree of the points."""
-
 
 def expect_near(
     positions: Float[Tensor, "contacts 3"],
@@ -51,11 +48,10 @@ def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainModel) -> lis
     if body is not None:
         distances = gains.length * body.distances(places / gains.length)
     else:
-        few = len(places) <= _FEW
-        found = torch.cdist(places, known).amin(1).numpy() if few else cKDTree(known.numpy()).query(places.numpy())[0]
-        distances = torch.from_numpy(found)
+        tree = cKDTree(known.numpy())
+        distances = torch.from_numpy(tree.query(places.numpy())[0])
         if bool((distances > limit).any()):
-            limit = max(limit, 2.0 * float(cKDTree(known.numpy()).query(known.numpy(), k=2)[0][:, -1].max()))
+            limit = max(limit, 2.0 * float(tree.query(known.numpy(), k=2)[0][:, -1].max()))
     return [(row, float(distances[row])) for row in torch.nonzero(distances > limit).flatten().tolist()]
 
 

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import Seed, generator_of
 from avmsf.errors import FitError
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains
@@ -19,7 +18,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.modal.residual_noise import interpolated
 
 LEVEL = 0.9
-"""Default probability of credible intervals."""
+"""Probability of credible intervals."""
 _MAX_MAPPED_POINTS = 1000
 """Points that the mean over the surface is taken over, at most."""
 _DRAWS = 200
@@ -30,7 +29,7 @@ _MAX_BANDS = 400
 
 @dataclass(frozen=True, eq=False)
 class SpectrumBand:
-    """Credible intervals of the spectrum of the sound of one impact."""
+    """Credible intervals, of the probability `LEVEL` each, of the spectrum of the sound of one impact."""
 
     frequencies: Float64[Tensor, " bands"]
     """Middles of the bands, Hz."""
@@ -40,8 +39,6 @@ class SpectrumBand:
     """Median level."""
     upper_db: Float64[Tensor, " bands"]
     """Upper end of the interval."""
-    level: float
-    """Probability of the interval of each band."""
 
 
 def has_posterior(field: SoundField) -> bool:
@@ -103,32 +100,21 @@ def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> F
     return (variance / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
 
-def spectrum_band(
-    field: SoundField,
-    contact: Float[Tensor, " 3"],
-    *,
-    direction: Float[Tensor, " 3"] | None = None,
-    level: float = LEVEL,
-    seed: Seed = None,
-) -> SpectrumBand:
-    """Return the interval of probability `level` of each band of the spectrum of an impact's sound.
+def spectrum_band(field: SoundField, contact: Float[Tensor, " 3"]) -> SpectrumBand:
+    """Return the interval of each band of the spectrum of an impact's sound at a contact, meters.
 
-    By drawing sounds: gains from their posterior, and the noise's mean energy added. `contact` in meters, `direction`
-    as in `SoundField.render`, `seed` for the draws, by default 0. Raises as `fitted_mixture`, and FitError for a level
-    that is not between 0 and 1.
+    By drawing sounds: gains from their posterior, and the noise's mean energy added. Raises as `fitted_mixture`.
     """
-    if not 0.0 < level < 1.0:
-        raise FitError.expected("a probability between 0 and 1, such as 0.9", level, name="level")
-    mean, spread = (each[0] for each in posterior(field, contact[None], None if direction is None else direction[None]))
-    generator = generator_of(seed)
+    mean, spread = (each[0] for each in posterior(field, contact[None]))
+    generator = torch.Generator().manual_seed(0)
     drawn = mean + spread * torch.randn(_DRAWS, *mean.shape, generator=generator, dtype=torch.float64)
     power = torch.fft.rfft(field.modal_sounds(Gains(torch.view_as_complex(drawn)), field.samples)).abs().square()
     power += field.samples * interpolated(field.residual.magnitude, power.shape[1]).double().square()
     edges = torch.linspace(0, power.shape[1], min(_MAX_BANDS, power.shape[1]) + 1).round().long()
     bands = torch.stack([power[:, first:last].mean(1) for first, last in pairwise(edges.tolist())], dim=1)
-    tail = (1.0 - level) / 2.0
+    tail = (1.0 - LEVEL) / 2.0
     ordered = torch.quantile(bands, torch.tensor([tail, 0.5, 1.0 - tail], dtype=torch.float64), dim=0)
     tiny = torch.finfo(torch.float64).tiny
     lower, middle, upper = 10.0 * torch.log10((ordered / ordered[1].max().clamp_min(tiny)).clamp_min(tiny))
     middles = (edges[:-1] + edges[1:] - 1).double() / 2.0 * field.sample_rate / field.samples
-    return SpectrumBand(middles, lower, middle, upper, level)
+    return SpectrumBand(middles, lower, middle, upper)

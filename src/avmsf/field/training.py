@@ -374,12 +374,5 @@ class GainEstimator(ABC):
         """Return what distinguishes this estimator from others of its name."""
 
     @abstractmethod
-    def start(self, data: GainData) -> tuple[TrainableGains, Int[Tensor, " contacts"]]:
-        """Return gains before they are trained end to end, and what they read for each contact; -1 for one left out.
-
-        Raises AvmsfError where they cannot be had.
-        """
-
-    @abstractmethod
     def fit(self, data: GainData, trainer: Trainer) -> FittedGains:
-        """Return the fitted gain model. Raises as `start` and `Trainer.run`."""
+        """Return the fitted gain model. Raises as `Trainer.run`, and AvmsfError where the model cannot be had."""

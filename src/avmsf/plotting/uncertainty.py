@@ -7,7 +7,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from avmsf.field.posterior import SpectrumBand
+from avmsf.field.posterior import LEVEL, SpectrumBand
 from avmsf.plotting.clouds import ALL_SIDES, in_front, name_axes, plane_of, view_from
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, scatter_surface, styled, titled_figure
 
@@ -65,7 +65,7 @@ def draw_band(band: SpectrumBand, *, title: str) -> Figure:
     axes = figure.subplots()
     frequencies = band.frequencies.numpy()
     lower, middle, upper = (each.numpy() for each in (band.lower_db, band.middle_db, band.upper_db))
-    inside = f"{100 * band.level:g} % credible band"
+    inside = f"{100 * LEVEL:g} % credible band"
     axes.fill_between(frequencies, lower, upper, color=FIRST, alpha=0.3, linewidth=0, label=inside)
     axes.plot(frequencies, middle, color=FIRST, linewidth=1, label="median")
     lowest = max(upper.max() - _RANGE_DB, lower.min() - 3.0)

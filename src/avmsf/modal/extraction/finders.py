@@ -20,6 +20,8 @@ from avmsf.modal.residual_noise import noise_bins, noise_power
 _EMPTY = ModalBank(torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 _MIN_NOISE_POWER = 1e-12
 """Least power of the noise, of sounds of mean power one: rounding of what is recorded without any."""
+_MIN_QUALITY = 1.0
+"""Least quality factor of a mode, pi f / d."""
 _MIN_FALL_NEPERS = 0.3
 """A mode that falls by fewer nepers over the whole sound is not told from hum."""
 _MIN_TURN_RADIANS = 0.5
@@ -68,10 +70,6 @@ class HighResolution(ModeFinder):
     """Energy that a mode has to explain, over the maximum that noise alone would yield anywhere."""
     range_db: float = 60.0
     """Modes this far below the strongest are left out, decibels of energy."""
-    least_quality: float = 1.0
-    """Minimum quality factor, pi f / d."""
-    lowest_hertz: float = 0.0
-    """Lowest frequency, Hz; zero for what the length of the sounds allows (about fifty periods)."""
 
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
         """Return the modes of `sounds`, at most `modes` of them."""
@@ -81,14 +79,14 @@ class HighResolution(ModeFinder):
         samples = sounds.shape[1]
         if samples < SHORTEST or len(sounds) == 0:
             return _EMPTY
-        lowest = max(self.lowest_hertz, lowest_frequency(samples, sample_rate))
+        lowest = lowest_frequency(samples, sample_rate)
         chance = chance_ratio(len(sounds), trials=samples)
         noise = noise_power(sounds, bins=noise_bins(samples)).clamp_min(_MIN_NOISE_POWER)
         found = candidates(sounds, noise, sample_rate=sample_rate, lowest=lowest, significance=chance)
         selection = Selection(sounds.double(), noise, sample_rate, self.significance * chance, self.modes)
         bank = self._select(selection, merge(found, duration=samples / sample_rate), lowest)
         # Hum and thuds are fitted beside the modes, or modes that are not there would stand in for them.
-        toned = math.pi * bank.frequency > self.least_quality * bank.damping
+        toned = math.pi * bank.frequency > _MIN_QUALITY * bank.damping
         turning = math.pi * sample_rate - 2 * math.pi * bank.frequency > _MIN_TURN_RADIANS * bank.damping
         return bank.take(toned & turning & (bank.damping >= _MIN_FALL_NEPERS * sample_rate / samples))
 
