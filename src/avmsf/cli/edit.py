@@ -144,7 +144,7 @@ def run(options: Options) -> int:
     contact = contact_of_sounds(old, options.position)
     new = _edited(options, old)
     save(new, options.output)
-    for ending in ("checkpoint", "preview.wav", "clap") if options.guides else ():
+    for ending in ("checkpoint", "preview.wav") if options.guides else ():
         options.part(ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = ModeLevels.of(old), ModeLevels.of(new)
@@ -216,13 +216,11 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
     from avmsf.cli.render import peak_factor, write_sound
     from avmsf.editing.guided import PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
     from avmsf.editing.reference import Reference
-    from avmsf.evaluation.clap import Clap, ClapCurve
+    from avmsf.evaluation.clap import Clap
 
-    settings, preview, checkpoint = options.all_settings, options.part("preview.wav"), options.part("checkpoint")
-    curve: ClapCurve | None = None
+    settings, preview, score = options.all_settings, options.part("preview.wav"), None
     if settings.prompt.clap is not None and options.prompt is not None:
-        clap, kept = Clap.load(settings.prompt.clap), options.part("clap")
-        curve = ClapCurve(clap, options.prompt, field, kept, resumed=checkpoint.exists())
+        score = Clap.load(settings.prompt.clap).of_previews(options.prompt, field.sample_rate)
     # After CLAP: a wrong name of its network is refused before the large model is loaded.
     guide: Guide
     if options.prompt is not None:
@@ -234,8 +232,6 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
         guide = Reference.read(options.like, sample_rate=field.sample_rate)
 
     def progress(reached: GuidedEditProgress) -> None:
-        if curve is not None:
-            curve.add(reached)
         message = f"loss {format_number(reached.loss)}, pitch x {format_number(reached.pitch, 4)}"
         if reached.preview is not None:
             sound = peak_factor(reached.preview[None]) * reached.preview
@@ -243,11 +239,10 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
             say(f"edit: step {reached.step} of {reached.steps}, {message}; preview in {preview}")
         display.step("edit", reached.step, reached.steps, message)
 
-    edited = edit_towards(
+    return edit_towards(
         field, guide, config=settings.guide, parameters=PARAMETERIZATIONS[settings.parameters], progress=progress,
-        checkpoint=checkpoint,
+        score=score, checkpoint=options.part("checkpoint"),
     )  # fmt: skip
-    return edited if curve is None else curve.recorded_in(edited)
 
 
 def _prompted(prompt: str, options: Options, sample_rate: float) -> Any:

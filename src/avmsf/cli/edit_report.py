@@ -13,8 +13,8 @@ from avmsf.cli.contacts import check_given_contacts, given_contacts
 from avmsf.cli.output import decimals, say, table
 from avmsf.cli.render import peak_factor, write_sound
 from avmsf.cli.report import MAX_LISTED_MODES
+from avmsf.editing.guided import CLAP
 from avmsf.editing.modal_edit import remarks
-from avmsf.evaluation.clap import CLAP
 from avmsf.field.sound_field import SoundField
 from avmsf.plotting.edits import ModeLevels, draw_clap_curves, draw_edit
 from avmsf.plotting.pictures import save_picture

@@ -126,8 +126,22 @@ class GuidedEditProgress:
     """Present factor on all decay times."""
     preview: Float[Tensor, " samples"] | None
     """The edited field's sound at one contact, at the field's rate, every `preview_every` steps and at the end."""
-    place: Float[Tensor, " 3"] | None = None
-    """The contact of the preview, object frame, meters."""
+
+
+CLAP = "clap"
+"""The key of the previews' scores in an edit's report: `model`, `steps`, of which 0 is before it, and `scores`."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreviewScore:
+    """A network's score of the previews of an edit."""
+
+    of: Callable[[Float[Tensor, " samples"]], float]
+    """Returns that of a sound at the field's rate."""
+    network: str
+    """Its name in the report."""
+    digest: str
+    """Of its weights: scores by others are not mixed."""
 
 
 def edit_towards(
@@ -137,19 +151,21 @@ def edit_towards(
     config: GuidedEditConfig | None = None,
     parameters: Parameterization = HIERARCHICAL,
     progress: Callable[[GuidedEditProgress], None] | None = None,
+    score: PreviewScore | None = None,
     checkpoint: str | Path | None = None,
 ) -> SoundField:
     """Return the field with its modes optimized towards the targets of `guide`; gain ratios between contacts stay.
 
     Each step renders random contacts, compares the sounds with the guide's targets by the multi-scale spectral loss of
     fitting, and updates the free `parameters`. The level is not edited: the sounds compared, and the field returned,
-    have the level of the given one. With `checkpoint`, the state is stored there while the edit runs, on interruption
-    and at the end, and an edit with the same arguments continues from it to the same result. Raises `EditError` for a
-    field that is silent, for a guide at another rate, for a checkpoint of another edit, and where the guide's targets
-    or the loss are not finite.
+    have the level of the given one. The `score` of the field before and of all previews, but for silence, goes to the
+    edit's report. With `checkpoint`, the state is stored there while the edit runs, on interruption and at the end, and
+    an edit with the same arguments continues from it to the same result. Raises `EditError` for a field that is silent,
+    for a guide at another rate, for a checkpoint of another edit, and where the guide's targets or the loss are not
+    finite.
     """
     config = GuidedEditConfig() if config is None else config
-    return _Optimization(field, guide, config, parameters, checkpoint).finish(progress)
+    return _Optimization(field, guide, config, parameters, score, checkpoint).finish(progress)
 
 
 class _Optimization:
@@ -161,11 +177,12 @@ class _Optimization:
         guide: Guide,
         config: GuidedEditConfig,
         parameters: Parameterization,
+        score: PreviewScore | None,
         checkpoint: str | Path | None,
     ) -> None:
         if guide.sample_rate != field.sample_rate:
             raise EditError.expected(f"the field's {field.sample_rate:g} Hz", guide.sample_rate, name="sample_rate")
-        self.field, self.guide, self.config, self.parameters = field, guide, config, parameters
+        self.field, self.guide, self.config, self.parameters, self.score = field, guide, config, parameters, score
         points = field.gain_field.points
         self.points = points if len(points) <= _MAX_POINTS else points[farthest_points(points, _MAX_POINTS)]
         probes = self.points[farthest_points(self.points, min(len(self.points), _MAX_PROBES))]
@@ -185,8 +202,10 @@ class _Optimization:
         # The interval of previews does not change the result.
         del settings["preview_every"]
         identity = checkpoint_identity(field, probes, guide.describe(), settings)
+        identity |= {} if score is None else {"network": score.digest}
         self.checkpoint = Checkpoint(checkpoint, identity, what="the edit", raising=EditError)
         state = self.checkpoint.read()
+        self.scores: dict[int, float] = {} if state is None else state["scores"]
         searching = state is None and parameters.searches
         start = guide.start(self.probes) if searching else ModalEdit.none(self.field.bank)
         self.edited = self.probes.loudest(config.free_modes)
@@ -218,12 +237,15 @@ class _Optimization:
         try:
             while self.step < self.config.steps:
                 loss = self._take_step()
+                edit, every, preview = ModalEdit(**self.values), self.config.preview_every, None
+                watched = every > 0 and (progress is not None or self.score is not None)
+                if watched and (self.step % every == 0 or self.step == self.config.steps):
+                    preview = self._preview(self._normalized_edit().of(self.field))
+                    if self.score is not None:
+                        self._add_score(self.score, preview)
                 if progress is not None:
-                    edit, every = ModalEdit(**self.values), self.config.preview_every
-                    due = every > 0 and (self.step % every == 0 or self.step == self.config.steps)
-                    preview = self._preview() if due else None
-                    factors, place = (edit.pitch_factor, edit.decay_factor), self.loudest_point if due else None
-                    progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview, place))
+                    factors = edit.pitch_factor, edit.decay_factor
+                    progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview))
                 if self.checkpoint.due:
                     self._save()
         except KeyboardInterrupt:
@@ -232,7 +254,15 @@ class _Optimization:
                 self._save()
             raise
         self._save()
+        if self.score is not None:
+            record = {"model": self.score.network, "steps": [*self.scores], "scores": [*self.scores.values()]}
+            self.settings[CLAP] = record
         return self._normalized_edit().of(self.field, settings=self.settings)
+
+    def _add_score(self, score: PreviewScore, preview: Float[Tensor, " samples"]) -> None:
+        """Score a preview, and the field before the edit with the first one."""
+        before = {} if self.scores else {0: self._preview(self.field)}
+        self.scores |= {step: score.of(sound) for step, sound in {**before, self.step: preview}.items() if sound.any()}
 
     def _take_step(self) -> float:
         """Take one step and return the loss before it."""
@@ -283,9 +313,9 @@ class _Optimization:
         parts = [(own[name] / deviation).square().mean() for name, deviation in _DEVIATIONS.items()]
         return 0.5 * self.parameters.stiffness * torch.stack(parts).sum()
 
-    def _preview(self) -> Float[Tensor, " samples"]:
-        """Return the edited field's sound, noise and all, where the unedited one is loudest."""
-        return self._normalized_edit().of(self.field).render(self.loudest_point[None])[0]
+    def _preview(self, field: SoundField) -> Float[Tensor, " samples"]:
+        """Return a field's sound, noise and all, where the unedited one is loudest."""
+        return field.render(self.loudest_point[None])[0]
 
     def _normalized_edit(self) -> ModalEdit:
         """Return the edit as it stands, as loud at the probes as the field was."""
@@ -305,7 +335,7 @@ class _Optimization:
     def _save(self) -> None:
         values = {name: value.detach() for name, value in self.values.items()}
         variables = {"values": values, "optimizer": self.optimizer.state_dict()}
-        self.checkpoint.save({"variables": variables, "step": self.step, "failed": self.failed})
+        self.checkpoint.save({"variables": variables, "step": self.step, "failed": self.failed, "scores": self.scores})
 
 
 def checkpoint_identity(

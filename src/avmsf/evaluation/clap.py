@@ -11,7 +11,7 @@ long. Shorter sounds are repeated as the extractor's own settings have it, which
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,19 +20,14 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.files import model_folder
-from avmsf.editing.guided import GuidedEditProgress
-from avmsf.editing.modal_edit import EDITS
-from avmsf.errors import EditError, EvaluationError, download_failure, from_extra
+from avmsf.editing.guided import PreviewScore
+from avmsf.errors import EvaluationError, download_failure, from_extra
 from avmsf.evaluation.metrics import PerContact, validate_sounds
-from avmsf.field.sound_field import SoundField
 from avmsf.modal.clips import resampled
 
 DEFAULT: Final = "laion/clap-htsat-unfused"
 """The hub's name of the network that scores are taken with unless another is named."""
-CLAP = "clap"
-"""The key of the scores in the last edit of a field's report."""
 _BATCH = 8
 """Sounds embedded at a time: bounds the memory."""
 
@@ -95,6 +90,14 @@ class Clap:
             raise EvaluationError.expected(f"one, or one for each of {len(audio)} sounds", len(text), name="prompts")
         return (audio * text).sum(dim=1).clamp(-1.0, 1.0)
 
+    def of_previews(self, prompt: str, sample_rate: float) -> PreviewScore:
+        """Return what scores the previews of an edit, at a rate in Hz, by their fit to a prompt."""
+
+        def score(sound: Float[Tensor, " samples"]) -> float:
+            return float(self.score(sound[None], [prompt], sample_rate=sample_rate))
+
+        return PreviewScore(score, self.name, self.digest)
+
     def embed(self, sounds: Float[Tensor, "..."], *, sample_rate: float) -> Float64[Tensor, "contacts dim"]:
         """Return the sounds' embeddings, of length one."""
         validate_sounds(sounds, sample_rate=sample_rate, wanted=self.sample_rate)
@@ -145,39 +148,3 @@ def _digest_of(model: Any, processor: Any) -> str:
     for name, tensor in sorted(model.state_dict().items()):
         digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-class ClapCurve:
-    """The CLAP score of a field's sound at one contact over the steps of an edit; step 0 is the unedited field."""
-
-    def __init__(
-        self, clap: Clap, prompt: str, field: SoundField, kept: Path | None = None, *, resumed: bool = False
-    ) -> None:
-        """Start a curve, which the file `kept` stores, or with `resumed` continue that of the file.
-
-        Raises EditError for a file that is damaged or has scores of another network.
-        """
-        self.clap, self.prompt, self.field = clap, prompt, field
-        self.kept = Checkpoint(kept, {"network": clap.digest}, what="the CLAP scores", raising=EditError)
-        state = self.kept.read() if resumed else None
-        self.scores: dict[int, float] = {} if state is None else state["scores"]
-
-    def add(self, progress: GuidedEditProgress) -> None:
-        """Score a preview, and the unedited field before the first one. Silent sounds have no score."""
-        if progress.preview is None or progress.place is None:
-            return
-        if not self.scores:
-            self._score(0, self.field.render(progress.place[None])[0])
-        self._score(progress.step, progress.preview)
-        self.kept.save({"scores": self.scores})
-
-    def recorded_in(self, edited: SoundField) -> SoundField:
-        """Return the edited field with the steps and scores in the record of its last edit."""
-        *others, last = edited.origin.report[EDITS]
-        record = {"model": self.clap.name, "steps": [*self.scores], "scores": [*self.scores.values()]}
-        report = {**edited.origin.report, EDITS: [*others, {**last, CLAP: record}]}
-        return replace(edited, origin=replace(edited.origin, report=report))
-
-    def _score(self, step: int, sound: Float[Tensor, " samples"]) -> None:
-        if bool(sound.any()):
-            self.scores[step] = float(self.clap.score(sound[None], [self.prompt], sample_rate=self.field.sample_rate))

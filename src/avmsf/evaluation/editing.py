@@ -27,12 +27,13 @@ from avmsf.datasets.dataset import Dataset
 from avmsf.datasets.numbering import REALIMPACT_NAMES, material_in, number_of
 from avmsf.datasets.realimpact import SELF_INTERSECTING
 from avmsf.editing.distillation import DecoderDistillation
-from avmsf.editing.guided import PARAMETERIZATIONS, Guide, edit_towards
+from avmsf.editing.guided import CLAP, PARAMETERIZATIONS, Guide, edit_towards
 from avmsf.editing.material import change_material
+from avmsf.editing.modal_edit import EDITS
 from avmsf.editing.reference import Reference
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.clap import Clap, ClapCurve
+from avmsf.evaluation.clap import Clap
 from avmsf.evaluation.methods import FieldMethod, method_named
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
@@ -211,8 +212,6 @@ class Edited:
     """A renderer of an edited field."""
 
     field: SoundField
-    clap: tuple[tuple[int, float], ...] = ()
-    """Steps of the edit and the CLAP scores of the sounds after them, all at one contact; 0 is the unedited field."""
 
     @property
     def sample_rate(self) -> float:
@@ -263,13 +262,11 @@ def guided(task: EditTask, *, parameters: str) -> Edited:
     if edits.model is not None and prompt is not None:
         guide = DecoderDistillation(edits.model, prompt, sample_rate=field.sample_rate)
     assert guide is not None
-    config = replace(edits.settings.guide, seed=edits.seed)
-    if edits.clap is None or prompt is None:
-        config = replace(config, preview_every=0)
-        return Edited(edit_towards(field, guide, config=config, parameters=PARAMETERIZATIONS[parameters]))
-    curve = ClapCurve(edits.clap, prompt, field)
-    edited = edit_towards(field, guide, config=config, parameters=PARAMETERIZATIONS[parameters], progress=curve.add)
-    return Edited(edited, tuple(curve.scores.items()))
+    config, score = replace(edits.settings.guide, seed=edits.seed, preview_every=0), None
+    if edits.clap is not None and prompt is not None:
+        config = replace(config, preview_every=edits.settings.guide.preview_every)
+        score = edits.clap.of_previews(prompt, field.sample_rate)
+    return Edited(edit_towards(field, guide, config=config, parameters=PARAMETERIZATIONS[parameters], score=score))
 
 
 def generation(task: EditTask) -> Generated:
@@ -317,8 +314,9 @@ def score_edit(
         values["spectral"] = tuple(distance.tolist())
     if clap is not None and task.prompt is not None:
         values["clap"] = tuple(clap.score(sounds, [task.prompt], sample_rate=edited.sample_rate).tolist())
-        if isinstance(edited, Edited) and edited.clap:
-            report["clap"] = list(edited.clap)
+        record = edited.field.origin.report.get(EDITS, [{}])[-1] if isinstance(edited, Edited) else {}
+        if CLAP in record:
+            report[CLAP] = list(zip(record[CLAP]["steps"], record[CLAP]["scores"], strict=True))
     return values, figures, report
 
 
