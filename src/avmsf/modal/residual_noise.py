@@ -42,6 +42,8 @@ def white_sequence() -> Float[Tensor, " samples"]:
 
 _REFERENCE = 1 << 17
 """Least number of samples of the white noise that the search for the quietest segments is calibrated on."""
+_QUIETEST = 0.1
+"""Part of the segments of each bin that are its quietest."""
 _FINENESS = 8
 """Frequencies that each band of the residual is measured at."""
 _WEAKEST = 0.25
@@ -117,20 +119,17 @@ def interpolated(magnitude: Float[Tensor, " bins"], frequencies: int) -> Float[T
     return torch.lerp(magnitude[left], magnitude[left + 1], (place - left).to(magnitude.dtype))
 
 
-def noise_power(
-    sounds: Float[Tensor, "contacts samples"], *, bins: int, quietest: float = 0.1
-) -> Float[Tensor, "contacts bins"]:
+def noise_power(sounds: Float[Tensor, "contacts samples"], *, bins: int) -> Float[Tensor, "contacts bins"]:
     """Return the power of the background noise in each band of each sound: white noise of variance v gives v.
 
-    Paper, section 3.4: the mean over the lowest-energy segments of each bin, here the part `quietest` of them, each
+    Paper, section 3.4: the mean over the lowest-energy segments of each bin, here the tenth of them, each
     a run of half-overlapping frames, twenty runs where the sound is long enough. The quietest of anything that
     scatters lie below its mean; the result is divided by what the same search finds in white noise, of the same
     length, of variance one.
     """
     rows = max(1, _REFERENCE // sounds.shape[1])
     white = torch.randn(rows, sounds.shape[1], generator=torch.Generator().manual_seed(0)).to(sounds)
-    found = _quietest_power(sounds, bins=bins, quietest=quietest)
-    return found / _quietest_power(white, bins=bins, quietest=quietest).mean()
+    return _quietest_power(sounds, bins=bins) / _quietest_power(white, bins=bins).mean()
 
 
 def noise_bins(samples: int) -> int:
@@ -155,15 +154,13 @@ def background_power(
     return noise_at(noise_power(sounds, bins=noise_bins(sounds.shape[1])), bank, sample_rate)
 
 
-def _quietest_power(
-    sounds: Float[Tensor, "contacts samples"], *, bins: int, quietest: float
-) -> Float[Tensor, "contacts bins"]:
+def _quietest_power(sounds: Float[Tensor, "contacts samples"], *, bins: int) -> Float[Tensor, "contacts bins"]:
     power = _frame_power(sounds, 2 * (bins - 1))
     count = max(1, power.shape[1] // 20)
     runs = power.shape[1] // count
     # Whole runs up to the end: the end is where a sound that dies away is quietest.
     segments = power[:, power.shape[1] - runs * count :].reshape(len(power), runs, count, -1).mean(2)
-    kept = max(1, round(quietest * runs))
+    kept = max(1, round(_QUIETEST * runs))
     power = torch.sort(segments, dim=1).values[:, :kept].mean(1)
     # At 0 Hz and half the rate the spectrum is real and scatters twice as widely: its quietest lie too low.
     power[:, 0] = torch.maximum(power[:, 0], power[:, 1])

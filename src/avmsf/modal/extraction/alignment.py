@@ -31,7 +31,6 @@ from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.prepare import margin_length
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.phase_likelihood import FIRST_SPREAD, DelayPrior, MeasuredPhases, occam_factor
 from avmsf.modal.modes import ModalBank
@@ -120,7 +119,7 @@ class Alignment:
         delays = torch.tensor([known.get(key, 0.0) for key in keys], dtype=torch.float64)
         others = torch.tensor([row for row, key in enumerate(keys) if key not in known], dtype=torch.long)
         if len(others) and bool((self.delays != 0).any()):
-            new, reach = impacts.take(others.tolist()), _reach(impacts)
+            new, reach = impacts.take(others.tolist()), float(impacts.before.shape[1])
             delays[others] = _delays_alone(new, self.phases, usual=self.phases.start, reach=reach)
             # Once more, from sounds that start where the first estimate says.
             moved = new.delayed(delays[others])
@@ -163,21 +162,20 @@ class Alignment:
 
 
 def align(impacts: Impacts) -> Alignment | None:
-    """Return the alignment of recordings with one another; None for fewer than two, or where no mode is found.
+    """Return the alignment of recordings with one another; None for one, for final ones, or where no mode is found.
 
     A delay common to all recordings cannot be known by phases: the common start is where the aligned sounds together
     leave the noise. Where every file begins within the impact it is that of the latest, so that no sound begins with
     silence of its file's making.
     """
-    if len(impacts) < 2:
+    if impacts.before is None or len(impacts) < 2 or len(bank := strongest_modes(impacts)) == 0:
         return None
-    bank = strongest_modes(impacts)
-    if len(bank) == 0:
-        return None
-    reach, background = _reach(impacts), background_power(impacts.sounds, bank, impacts.sample_rate)
+    # Nothing is before the sounds where all files start with their impacts.
+    reach, has_lead = float(impacts.before.shape[1]), bool(torch.isfinite(impacts.before).any())
+    background = background_power(impacts.sounds, bank, impacts.sample_rate)
     measured = MeasuredPhases(impacts, bank, reach=reach, background=background)
     before = after = coherence(measured.amplitude, bank.damping)
-    delays, agreement, phases = _estimate(measured, exact=0.0 if _has_lead(impacts) else _STILL_LOG_ODDS)
+    delays, agreement, phases = _estimate(measured, exact=0.0 if has_lead else _STILL_LOG_ODDS)
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
         for reached, vague in ((reach, _USUAL_RECORDINGS), (_LAST_REACH_SAMPLES, 0.0)):
@@ -185,7 +183,7 @@ def align(impacts: Impacts) -> Alignment | None:
             further, agreement, phases = _estimate(measured, earlier=delays, vague=vague)
             delays = delays + further
         # The phases are those at the recordings' common start, which moves with the offset.
-        offset = _offset(delays, agreement, impacts)
+        offset = _common_onset(impacts, delays, agreement) if has_lead else -float(delays.min())
         delays = delays + offset
         phases = replace(
             phases,
@@ -221,13 +219,6 @@ def coherence(amplitude: Complex128[Tensor, "contacts modes"], damping: Float64[
     return float(summed / energy.sum().clamp_min(torch.finfo(torch.float64).tiny))
 
 
-def _offset(delays: Float64[Tensor, " contacts"], agreement: Float64[Tensor, " contacts"], impacts: Impacts) -> float:
-    """Return what is added to all delays: the common start is a matter of choice."""
-    if impacts.before is None:
-        return -_weighted_median(delays, agreement)
-    return _common_onset(impacts, delays, agreement) if _has_lead(impacts) else -float(delays.min())
-
-
 def _weighted_median(values: Float64[Tensor, " contacts"], weights: Float64[Tensor, " contacts"]) -> float:
     order = torch.argsort(values)
     total = weights[order].cumsum(0)
@@ -255,16 +246,6 @@ def _common_onset(
     # Noise within 10 dB of the sounds hides all but their loudest.
     threshold = min(max(0.01 * highest, 10 * float(mean[: _ONSET_FRACTIONS * lead // 2].median())), highest)
     return float((mean >= threshold).nonzero()[0, 0]) / _ONSET_FRACTIONS - lead
-
-
-def _has_lead(impacts: Impacts) -> bool:
-    """Return whether any file holds something before its sound: it does not where all start with the impact."""
-    return impacts.before is None or bool(torch.isfinite(impacts.before).any())
-
-
-def _reach(impacts: Impacts) -> float:
-    """Return the longest delay to search, samples: as much as files keep before an onset."""
-    return float(margin_length(impacts.sample_rate) if impacts.before is None else impacts.before.shape[1])
 
 
 def _delays_alone(impacts: Impacts, phases: Phases, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:

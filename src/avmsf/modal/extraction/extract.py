@@ -92,7 +92,7 @@ def extract_modes(recordings: Capture | Impacts, method: ModeFinder | None = Non
             name="recordings",
             advice="read a folder by avmsf.read(folder)",
         )
-    alignment = None if impacts.before is None or len(impacts) < 2 else align(impacts)
+    alignment = align(impacts)
     final = impacts if alignment is None else alignment.apply(impacts)
     found = extract_sounds(final.sounds, sample_rate=impacts.sample_rate, method=method)
     return replace(found, alignment=alignment)
