@@ -156,12 +156,12 @@ def test_modes_are_those_of_the_whole_spectrum(bracket, modes):
 def test_shapes_are_mass_normalized_and_free_of_rigid_motion(bracket):
     mesh, forces, weights = matrices(bracket, STEEL)
     rigid = rigid_motions(mesh.nodes, weights)
-    found = lowest_vibrations(forces, weights, rigid, count=10, shift=1e4, supported=False)
+    squares, shapes = lowest_vibrations(forces, weights, rigid, count=10, shift=1e4, supported=False)
     heavy = scipy.sparse.kron(weights, np.eye(3))
-    np.testing.assert_allclose(found.shapes.T @ heavy @ found.shapes, np.eye(10), atol=1e-9)
-    np.testing.assert_allclose(found.shapes.T @ heavy @ rigid, 0.0, atol=1e-9)
-    stored = found.shapes.T @ forces @ found.shapes
-    np.testing.assert_allclose(stored, np.diag(found.squares), atol=1e-8 * found.squares[-1])
+    np.testing.assert_allclose(shapes.T @ heavy @ shapes, np.eye(10), atol=1e-9)
+    np.testing.assert_allclose(shapes.T @ heavy @ rigid, 0.0, atol=1e-9)
+    stored = shapes.T @ forces @ shapes
+    np.testing.assert_allclose(stored, np.diag(squares), atol=1e-8 * squares[-1])
 
 
 def test_size_stiffness_and_density_obey_the_scaling_laws(bracket, modes):
@@ -180,7 +180,7 @@ def test_size_stiffness_and_density_obey_the_scaling_laws(bracket, modes):
 def test_soft_springs_raise_each_mode_by_its_motion_there(bracket, modes):
     places = torch.tensor([[0.01, 0.012, 0.0], [0.06, 0.01, 0.0], [0.035, 0.045, 0.0]], dtype=torch.float64)
     stiff = 1e4
-    held = elastic_modes(bracket, STEEL, count=8, springs=[(place, stiff) for place in places])
+    held = elastic_modes(bracket, STEEL, count=8, springs=(places, stiff))
     assert len(held) == 8
     raised = (2 * math.pi) ** 2 * (held.frequency**2 - modes.frequency**2)
     # Rayleigh: a spring's energy in a mode that moves its foot by one unit.
@@ -205,19 +205,10 @@ def test_interpolation_is_exact_for_second_degree_and_takes_the_nearest_place(mo
     assert torch.allclose(field.gains(above, along)[:, 0], (expected * along).sum(dim=1), atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("settings", "name", "row", "value"),
-    [
-        ({"count": 0}, "count", None, 0),
-        ({"count": 310}, "nodes", None, 105),
-        ({"stiffness_factor": torch.ones(3)}, "stiffness_factor", None, 3),
-        ({"density_factor": -torch.ones(36)}, "density_factor", 0, -1.0),
-        ({"springs": [(torch.zeros(3), 0.0)]}, "springs", 0, 0.0),
-    ],
-)
-def test_settings_that_cannot_be(bracket, settings, name, row, value):
-    with raises(SimulationError, name=name, row=row, value=value):
-        elastic_modes(bracket, STEEL, **settings)
+@pytest.mark.parametrize(("count", "name", "value"), [(0, "count", 0), (310, "nodes", 105)])
+def test_as_many_modes_as_there_cannot_be_are_refused(bracket, count, name, value):
+    with raises(SimulationError, name=name, value=value):
+        elastic_modes(bracket, STEEL, count=count)
 
 
 def test_bodies_in_parts_and_positions_that_are_no_numbers_are_refused(bracket, modes):

@@ -19,6 +19,7 @@ from types import MappingProxyType
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from avmsf._utils.caching import key_of, once, source_digest
 from avmsf._utils.compiled import lane_count
@@ -293,7 +294,7 @@ class SurfaceBodies(CandidateBodies):
         possible = [each for each in wanted if each not in errors]
         make = partial(attempt, partial(self._body, fine=len(possible) == 1))
         # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
-        with ThreadPoolExecutor(lane_count()) as pool:
+        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
             bodies = [body for body in pool.map(make, possible) if body is not None]
         refused = {each: errors[each] for each in wanted if each in errors}
         reasons = _grouped(refused)

@@ -8,10 +8,7 @@ motions become slow vibrations, which are computed like the others and told apar
 their kinetic energy is a rigid motion's.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from threading import Lock
+from collections.abc import Callable
 
 import numpy as np
 import scipy.linalg
@@ -33,16 +30,6 @@ PENDULUM = 1e-9
 """Squared frequency over the largest, below which a body turns about the place that it is held at: rounding alone."""
 
 
-@dataclass(frozen=True, eq=False)
-class Vibrations:
-    """Lowest elastic eigenpairs by ascending frequency."""
-
-    squares: Float64[np.ndarray, " modes"]
-    """Squared angular frequencies, 1/s2."""
-    shapes: Float64[np.ndarray, "dofs modes"]
-    """Mass-normalized displacements, 1 / sqrt(kg)."""
-
-
 def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_array) -> np.ndarray:
     """Return three shifts and three turns of the nodes, mass-normalized and orthogonal, [3 nodes, 6]."""
     total = mass.sum()
@@ -58,37 +45,6 @@ def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_
     return scipy.linalg.solve_triangular(lower, flat.T, lower=True).T
 
 
-class _OneThread:
-    """Limits BLAS to one thread for as long as any thread of the process is within: the limit is the whole process's.
-
-    A limit that each thread set and took back for itself would stay where they end in another order.
-    """
-
-    def __init__(self) -> None:
-        self._lock, self._within = Lock(), 0
-        self._limits: threadpool_limits | None = None
-
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
-        with self._lock:
-            self._within += 1
-            if self._within == 1:
-                self._limits = threadpool_limits(limits=1, user_api="blas")
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._within -= 1
-                if self._within == 0 and self._limits is not None:
-                    self._limits.restore_original_limits()
-
-
-one_blas_thread = _OneThread()
-
-
-# The factors' blocks are so small that BLAS threads wait for each other: on two busy cores 80 modes of 20,000 degrees
-# of freedom took 12 s with two threads and 7 s with one, of 64,000 61 s and 35 s.
-@one_blas_thread()
 def lowest_vibrations(
     stiffness: scipy.sparse.sparray,
     mass: scipy.sparse.csr_array,
@@ -97,31 +53,38 @@ def lowest_vibrations(
     count: int,
     shift: float,
     supported: bool,
-) -> Vibrations:
-    """Return the `count` lowest vibrations that are no rigid motions.
+) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, "dofs modes"]]:
+    """Return the `count` lowest vibrations that are no rigid motions: squared angular frequencies, 1/s2, and shapes.
 
-    `mass` is over nodes, `stiffness` over their three components; `shift`, 1/s2, is far below the lowest squared
-    angular frequency. `supported` bodies are held by springs, others are free. Raises SimulationError where the body
-    has fewer vibrations, or cells of such bad form that none are found.
+    Shapes are mass-normalized, 1 / sqrt(kg). `mass` is over nodes, `stiffness` over their three components; `shift`,
+    1/s2, is far below the lowest squared angular frequency. `supported` bodies are held by springs, others are free.
+    Raises SimulationError for no mode, where the body has fewer vibrations, or cells of such bad form that none are
+    found.
     """
+    if count < 1:
+        raise SimulationError.expected("1 mode or more", count, name="count")
     dofs = stiffness.shape[0]
     wanted = count + (_RIGID if supported else 0)
     if wanted + 2 * _RIGID > dofs:
         least, advice = f"{wanted // 3 + 5} or more for {count} modes", "ask for fewer modes or a finer detail"
         raise SimulationError.expected(least, dofs // 3, name="nodes", advice=advice)
-    solve = factorize(stiffness, mass, shift=shift)
     weighted = times(mass, rigid)
+    # The factors' blocks are so small that BLAS threads wait for each other: on two busy cores 80 modes of 20,000
+    # degrees of freedom took 12 s with two threads and 7 s with one. The limit is the whole process's: what computes
+    # bodies in several threads sets it around them all, or it would stay where they end in another order.
+    with threadpool_limits(limits=1, user_api="blas"):
+        solve = factorize(stiffness, mass, shift=shift)
 
-    def respond(forces: np.ndarray) -> np.ndarray:
-        moved = solve(forces)
-        return moved if supported else moved - rigid @ (weighted.T @ moved)
+        def respond(forces: np.ndarray) -> np.ndarray:
+            moved = solve(forces)
+            return moved if supported else moved - rigid @ (weighted.T @ moved)
 
-    responses, shapes = _largest_responses(respond, mass, wanted)
+        responses, shapes = _largest_responses(respond, mass, wanted)
     squares = 1.0 / responses - shift
     if supported:
         elastic = (((weighted.T @ shapes) ** 2).sum(axis=0) < 0.5) & (squares > PENDULUM * squares[-1])
         squares, shapes = squares[elastic][:count], shapes[:, elastic][:, :count]
-    return Vibrations(squares, shapes * _signs(shapes))
+    return squares, shapes * _signs(shapes)
 
 
 def factorize(

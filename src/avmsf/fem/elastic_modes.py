@@ -1,28 +1,36 @@
-"""The vibrations of an elastic body: natural frequencies, and how far each place moves in each."""
+"""The vibrations of an elastic body: natural frequencies, and how far each place moves in each.
+
+Held at few patches, a body vibrates in combinations of its free modes, its rigid motions and its static responses to
+the patches' loads, the attachment modes of component mode synthesis (Craig and Chang, AIAA Journal 14, 1976). On this
+basis every support is a dense eigenproblem of 100 to 400 unknowns.
+"""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
-from avmsf.fem.eigen import lowest_vibrations, rigid_motions
+from avmsf.fem.eigen import PENDULUM, factorize, lowest_vibrations, orthonormal, rigid_motions
 from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
 from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.fem.solid import Solid
-from avmsf.fem.supports import Patch, Support, SupportBasis, patches_of
+from avmsf.fem.supports import Patch, Support, patches_of
 from avmsf.mesh.closest_point import Closest, ClosestPoints
 from avmsf.mesh.surface import Surface, surface_points
 
 RELATIVE_SHIFT = 1e-5
 """Shift of the eigenvalues over E / (density size^2), which is a tenth of the squared angular frequency of a bar."""
+_INDEPENDENT = 1e-5
+"""Part of an attachment mode that the others and the free modes do not have, below which it is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +110,7 @@ class ElasticModes:
     ) -> tuple[Int[Tensor, "contacts 6"], Float64[Tensor, "contacts 6"]]:
         """Return the nodes of the nearest triangle, and the second-order shape functions in the nearest point of it."""
         found = self._nearest(places)
-        corner = torch.from_numpy(found.weights)
-        weights = torch.cat([corner * (2.0 * corner - 1.0), 4.0 * corner * corner.roll(-1, dims=1)], dim=1)
-        return self.triangles[torch.from_numpy(found.rows)], weights
+        return self.triangles[torch.from_numpy(found.rows)], torch.from_numpy(_quadratic(found))
 
     @cached_property
     def points(self) -> Float64[Tensor, "points 3"]:
@@ -123,48 +129,41 @@ def elastic_modes(
     count: int = 64,
     stiffness_factor: Float[Tensor, " cells"] | None = None,
     density_factor: Float[Tensor, " cells"] | None = None,
-    springs: Sequence[tuple[Float[Tensor, " 3"], float]] | None = None,
+    springs: tuple[Float[Tensor, "springs 3"], float] | None = None,
     support: Support | None = None,
     perturbed: bool = False,
 ) -> ElasticModes:
     """Return the lowest `count` elastic modes of a body by second-order finite elements.
 
     The factors multiply Young's modulus and the density in each cell. The body is free, or held by `springs`: places
-    on its surface and their stiffness in newtons per meter, the same in all directions. A free body's six rigid
+    on its surface and the stiffness of each, newtons per meter, the same in all directions. A free body's six rigid
     motions are no modes of it. On soft springs they are slow modes, and every mode that has more than half of its
     kinetic energy in a rigid motion is left out. Springs so stiff that the body bends before it moves as a whole
     leave no such mode, and then none is left out. On a `support` they are modes like all others, but for turns about a
     patch that no spring opposes. With `perturbed` the
     modes come with the first-order changes of their matrices, for a body without factors.
 
-    Raises SimulationError for a body of several parts or too few nodes, and factors and springs that are not positive.
+    Raises SimulationError for a body of several parts or too few nodes, and for no mode.
     """
-    if count < 1:
-        raise SimulationError.expected("1 mode or more", count, name="count")
-    if perturbed and (stiffness_factor is not None or density_factor is not None):
-        raise SimulationError.expected(
-            "no stiffness or density factors", True, got="some", name="perturbed", advice="leave them out"
-        )
-    light = _factor(solid, density_factor, "density_factor")
-    mesh, forces, weights, shift = _matrices(
-        solid, material, light, _factor(solid, stiffness_factor, "stiffness_factor")
-    )
-    if springs:
-        forces = forces + _support(mesh, springs)
+    assert not perturbed or (stiffness_factor is None and density_factor is None)
+    light = solid.volumes.new_ones(len(solid.cells)) if density_factor is None else density_factor.double()
+    mesh, forces, weights, shift = _matrices(solid, material, light, stiffness_factor)
+    if springs is not None:
+        forces = forces + _springs(mesh, *springs)
     if support is not None:
         forces = forces + support.springs(mesh)
     rigid = rigid_motions(mesh.nodes, weights)
-    found = lowest_vibrations(
+    squares, shapes = lowest_vibrations(
         forces, weights, rigid if support is None else np.zeros_like(rigid), count=count, shift=shift,
-        supported=bool(springs) or support is not None,
+        supported=springs is not None or support is not None,
     )  # fmt: skip
     total = float((solid.volumes * light).sum()) * material.density
-    changes = perturbations(mesh, found.shapes.reshape(len(mesh.nodes), 3, -1), material) if perturbed else None
-    return replace(_modes(mesh, found.squares, _at_surface(mesh, found.shapes), material, total), perturbations=changes)
+    changes = perturbations(mesh, shapes.reshape(len(mesh.nodes), 3, -1), material) if perturbed else None
+    return replace(_modes(mesh, material, total, squares, _at_surface(mesh, shapes)), perturbations=changes)
 
 
 class HeldModes:
-    """The modes of a body on any support, of one computation of its free ones."""
+    """The modes of a body on any support of some patches, of one computation of its free ones."""
 
     def __init__(
         self, solid: Solid, material: Material, *, count: int = 64, patches: Sequence[Patch] | None = None
@@ -173,22 +172,47 @@ class HeldModes:
 
         Raises SimulationError as `elastic_modes`, and for a body without a small part that it could be held at.
         """
-        even = torch.ones(len(solid.cells), dtype=torch.float64)
-        mesh, forces, weights, shift = _matrices(solid, material, even, even)
+        mesh, forces, weights, shift = _matrices(solid, material, solid.volumes.new_ones(len(solid.cells)), None)
         rigid = rigid_motions(mesh.nodes, weights)
-        free = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=False)
-        self._mesh, self._material, self._mass = mesh, material, float(solid.volumes.sum()) * material.density
-        self.free = _modes(mesh, free.squares, _at_surface(mesh, free.shapes), material, self._mass)
-        self.basis = SupportBasis(mesh, forces, weights, free, rigid, patches_of(mesh) if patches is None else patches)
+        squares, shapes = lowest_vibrations(forces, weights, rigid, count=count, shift=shift, supported=False)
+        self._count, self._modes = count, partial(_modes, mesh, material, float(solid.volumes.sum()) * material.density)
+        self.free = self._modes(squares, _at_surface(mesh, shapes))
+        self.patches = tuple(patches_of(mesh) if patches is None else patches)
+        if not self.patches:
+            raise SimulationError.expected("a part of the surface to hold it at", 0, got="none", name="patches")
+        loads = [patch.loads(mesh) for patch in self.patches]
+        stacked = scipy.sparse.hstack(loads, format="csc")
+        # About the static response: the mass takes away what a free body does as a whole.
+        responses = factorize(forces, weights, shift=0.5 * float(squares[0]))(stacked.toarray())
+        known = np.concatenate([rigid, shapes], axis=1)
+        basis = np.concatenate([known, orthonormal(responses, weights, known, least=_INDEPENDENT)[0]], axis=1)
+        self._surface = _at_surface(mesh, basis)
+        self._stiffness = basis.T @ (forces @ basis)
+        # A rigid motion takes no force: what is there is rounding.
+        still = rigid.shape[1]
+        self._stiffness[:still] = self._stiffness[:, :still] = 0.0
+        self._loads = np.split(stacked.T @ basis, np.cumsum([each.shape[1] for each in loads])[:-1])
+        self.stiffness_scale = float(weights.sum()) * math.exp(float(np.log(squares).mean()))
+        """The body's mass times the geometric mean of its squared angular frequencies, N/m."""
 
     def on(self, support: Support) -> ElasticModes:
-        """Return the lowest modes on a support of some of the basis' patches."""
-        found = self.basis.held(support)
-        return _modes(self._mesh, found.squares, found.shapes, self._material, self._mass)
+        """Return the lowest modes on a support of some of the `patches`, as many as the free body has.
+
+        Raises SimulationError for another patch.
+        """
+        total = self._stiffness.copy()
+        for patch in support.patches:
+            if patch not in self.patches:
+                raise SimulationError.expected("a patch of the basis", patch.name, name="patches")
+            loads = self._loads[self.patches.index(patch)]
+            total += support.stiffness * loads.T @ loads
+        squares, vectors = scipy.linalg.eigh(total, subset_by_index=(0, min(self._count + 5, len(total) - 1)))
+        moving = np.flatnonzero(squares > PENDULUM * squares[-1])[: self._count]
+        return self._modes(squares[moving], self._surface @ vectors[:, moving])
 
 
 def _matrices(
-    solid: Solid, material: Material, light: Float64[Tensor, " cells"], stiff: Float64[Tensor, " cells"]
+    solid: Solid, material: Material, light: Float64[Tensor, " cells"], stiff: Float[Tensor, " cells"] | None
 ) -> tuple[SecondOrder, scipy.sparse.sparray, scipy.sparse.csr_array, float]:
     """Return the elements, their stiffness and mass, and the shift of the eigenvalues, 1/s2."""
     solid.expect_connected()
@@ -205,10 +229,10 @@ def _at_surface(
 
 def _modes(
     mesh: SecondOrder,
-    squares: Float64[np.ndarray, " modes"],
-    shapes: Float64[np.ndarray, "outer_dofs modes"],
     material: Material,
     total: float,
+    squares: Float64[np.ndarray, " modes"],
+    shapes: Float64[np.ndarray, "outer_dofs modes"],
 ) -> ElasticModes:
     """Return modes of squared angular frequencies and of shapes at the surface's nodes; `total` is the mass, kg."""
     outer, triangles = mesh.surface
@@ -222,28 +246,18 @@ def _modes(
     )
 
 
-def _support(mesh: SecondOrder, springs: Sequence[tuple[Tensor, float]]) -> scipy.sparse.csr_array:
+def _springs(mesh: SecondOrder, places: Float[Tensor, "springs 3"], strength: float) -> scipy.sparse.csr_array:
     """Return the stiffness that springs at the nearest points of the surface add, spread over a triangle's nodes."""
     triangles = mesh.boundary
-    found = ClosestPoints(mesh.nodes[triangles[:, :3]])(np.stack([place.double().numpy() for place, _ in springs]))
-    total = scipy.sparse.csr_array((3 * len(mesh.nodes),) * 2)
-    for spring, (_, strength) in enumerate(springs):
-        if not 0 < strength < math.inf:
-            raise SimulationError.expected("a stiffness above 0 N/m", strength, row=spring, name="springs")
-        corner = found.weights[spring]
-        weights = np.concatenate([corner * (2.0 * corner - 1.0), 4.0 * corner * np.roll(corner, -1)])
-        row = scipy.sparse.csr_array((weights, triangles[found.rows[spring]], [0, 6]), shape=(1, len(mesh.nodes)))
-        total = total + scipy.sparse.kron(strength * (row.T @ row), scipy.sparse.eye_array(3), format="csr")
-    return total
+    found = ClosestPoints(mesh.nodes[triangles[:, :3]])(places.double().numpy())
+    begins = 6 * np.arange(len(places) + 1)
+    held = scipy.sparse.csr_array(
+        (_quadratic(found).ravel(), triangles[found.rows].ravel(), begins), shape=(len(places), len(mesh.nodes))
+    )
+    return scipy.sparse.kron(strength * (held.T @ held), scipy.sparse.eye_array(3), format="csr")
 
 
-def _factor(solid: Solid, factor: Float[Tensor, " cells"] | None, name: str) -> Float64[Tensor, " cells"]:
-    if factor is None:
-        return torch.ones(len(solid.cells), dtype=torch.float64)
-    if len(factor) != len(solid.cells):
-        raise SimulationError.expected(f"{len(solid.cells)} numbers, one per cell", len(factor), name=name)
-    unfit = torch.nonzero(~((factor > 0) & torch.isfinite(factor))).flatten()
-    if len(unfit):
-        row = int(unfit[0])
-        raise SimulationError.expected("more than 0", float(factor[row]), row=row, name=name)
-    return factor.double()
+def _quadratic(found: Closest) -> Float64[np.ndarray, "places 6"]:
+    """Return the second-order shape functions of the nearest triangles in the nearest points of them."""
+    corner = found.weights
+    return np.concatenate([corner * (2.0 * corner - 1.0), 4.0 * corner * np.roll(corner, -1, axis=1)], axis=1)

@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 import scipy.sparse
-from jaxtyping import Float64, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.fem.material import Material
@@ -90,13 +90,13 @@ class SecondOrder:
 
 
 def stiffness(
-    mesh: SecondOrder, material: Material, factor: Float64[Tensor, " cells"] | None = None
+    mesh: SecondOrder, material: Material, factor: Float[Tensor, " cells"] | None = None
 ) -> scipy.sparse.bsr_array:
     """Return the stiffness matrix over the components of the nodes' displacements, newtons per meter.
 
     `factor` multiplies Young's modulus, a number a cell. Row 3 n + i is the force along axis i on node n.
     """
-    young = material.young * (np.ones(len(mesh.cells)) if factor is None else factor.numpy())
+    young = material.young * (np.ones(len(mesh.cells)) if factor is None else factor.double().numpy())
     shear = young / (2.0 * (1.0 + material.poisson))
     squeeze = shear * 2.0 * material.poisson / (1.0 - 2.0 * material.poisson)
     slopes = shape_gradients(mesh)

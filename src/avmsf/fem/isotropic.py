@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from avmsf.errors import SimulationError
 from avmsf.fem.eigen import lowest_vibrations, rigid_motions
 from avmsf.fem.elastic_modes import RELATIVE_SHIFT, ElasticModes
 from avmsf.fem.elements import SecondOrder, mass, stiffness
@@ -83,8 +82,6 @@ def isotropic_modes(solid: Solid, *, count: int) -> IsotropicModes:
 
     Raises SimulationError for a body of several parts, and one whose modes cannot be computed.
     """
-    if count < 1:
-        raise SimulationError.expected("1 mode or more", count, name="count")
     solid.expect_connected()
     mesh = SecondOrder.of(solid)
     weights = mass(mesh, torch.ones(len(solid.cells), dtype=torch.float64))
@@ -94,10 +91,9 @@ def isotropic_modes(solid: Solid, *, count: int) -> IsotropicModes:
     found = []
     for poisson in SAMPLED_POISSON:
         forces = shear / (2.0 * (1.0 + poisson)) + squeeze * (poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson)))
-        vibrations = lowest_vibrations(
-            forces, weights, rigid, count=count + _SPARE, shift=RELATIVE_SHIFT / solid.size**2, supported=False
-        )
-        found.append(vibrations.shapes)
+        shift = RELATIVE_SHIFT / solid.size**2
+        _, shapes = lowest_vibrations(forces, weights, rigid, count=count + _SPARE, shift=shift, supported=False)
+        found.append(shapes)
     spread = np.concatenate(found, axis=1)
     heavy = (weights @ spread.reshape(len(mesh.nodes), -1)).reshape(spread.shape)
     squares, turned = np.linalg.eigh(spread.T @ heavy)

@@ -1,12 +1,9 @@
-"""Bodies that are held: elastic foundations under patches of their surface, on the basis of the free body's modes.
+"""Where bodies are held: elastic foundations under patches of their surface.
 
 A hand, a clamp or a table holds a patch by springs that are spread evenly over its nodes. They act on the rigid motions
 of each of its cells alone: on every node for itself they would stiffen the patch too. The load vectors F are these
 motions, orthonormal over the nodes of a cell and divided by the root of the number of nodes of the patch, so that k is
-the stiffness of the whole patch against a shift, and a body's stiffness matrix becomes K + sum k F F'. Held at few
-patches, it vibrates in combinations of its free modes, its rigid motions and its static responses to the loads, the
-attachment modes of component mode synthesis (Craig and Chang, AIAA Journal 14, 1976). On this basis every support is a
-dense eigenproblem of 100 to 400 unknowns.
+the stiffness of the whole patch against a shift, and a body's stiffness matrix becomes K + sum k F F'.
 """
 
 import math
@@ -15,14 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 import torch
 from jaxtyping import Float64, Int
 from scipy.spatial import cKDTree
 
-from avmsf.errors import SimulationError
-from avmsf.fem.eigen import PENDULUM, Vibrations, factorize, orthonormal
 from avmsf.fem.elements import SecondOrder
 from avmsf.mesh.points import farthest_points
 
@@ -31,7 +25,7 @@ FREE = "free"
 FREE_PRIOR = 0.7
 """Probability that an object is free; recordings are meant to be made so. The supports share the rest."""
 STIFFNESS_RATIOS = (0.03, 0.003, 0.3, 1000.0)
-"""Stiffness of a patch over `SupportBasis.stiffness_scale`: about that of the clamps of a measured strip (strip30), at
+"""Stiffness of a patch over `HeldModes.stiffness_scale`: about that of the clamps of a measured strip (strip30), at
 which supports are compared first, a softer one, a stiffer one, and one that is rigid."""
 
 
@@ -45,7 +39,6 @@ class Tolerances:
     cell_extent: float = 0.08  # of a cell: a long patch moves as several rigid ones
     max_cells: int = 8  # of a patch
     rank: float = 1e-3  # singular value of a cell's motions over the largest: nodes on a line cannot tell one
-    independent: float = 1e-5  # part of an attachment mode that the others and the free modes do not have
 
 
 TOLERANCES = Tolerances()
@@ -157,57 +150,6 @@ def patches_about(points: Sequence[Place]) -> list[Patch]:
     """Return the patches about points on or near the surface, meters."""
     names = ("({:.0f}, {:.0f}, {:.0f}) mm".format(*(1000.0 * each + 0.0 for each in point)) for point in points)
     return [PointPatch(name, point) for name, point in zip(names, points, strict=True)]
-
-
-class SupportBasis:
-    """A body's free modes, rigid motions and attachment modes, on which its supports are small eigenproblems."""
-
-    def __init__(
-        self,
-        mesh: SecondOrder,
-        stiffness: scipy.sparse.sparray,
-        mass: scipy.sparse.csr_array,
-        free: Vibrations,
-        rigid: Float64[np.ndarray, "dofs 6"],
-        patches: Sequence[Patch],
-    ) -> None:
-        """Compute the attachment modes of patches; `free` are the body's lowest modes. Raises as `factorize`."""
-        if not patches:
-            raise SimulationError.expected("a part of the surface to hold it at", 0, got="none", name="patches")
-        self.patches = tuple(patches)
-        loads = [patch.loads(mesh) for patch in patches]
-        self._ends = np.cumsum([0, *(each.shape[1] for each in loads)])
-        forces = scipy.sparse.hstack(loads, format="csc")
-        # About the static response: the mass takes away what a free body does as a whole.
-        solve = factorize(stiffness, mass, shift=0.5 * float(free.squares[0]))
-        known = np.concatenate([rigid, free.shapes], axis=1)
-        attached, _ = orthonormal(solve(forces.toarray()), mass, known, least=TOLERANCES.independent)
-        basis = np.concatenate([known, attached], axis=1)
-        self._surface = basis.reshape(len(mesh.nodes), 3, -1)[mesh.surface[0]].reshape(-1, basis.shape[1])
-        self._stiffness = basis.T @ (stiffness @ basis)
-        # A rigid motion takes no force: what is there is rounding.
-        still = rigid.shape[1]
-        self._stiffness[:still] = self._stiffness[:, :still] = 0.0
-        self._loads = forces.T @ basis
-        self._count = free.shapes.shape[1]
-        self.stiffness_scale = float(mass.sum()) * math.exp(float(np.log(free.squares).mean()))
-        """The body's mass times the geometric mean of its squared angular frequencies, N/m."""
-
-    def held(self, support: Support) -> Vibrations:
-        """Return the lowest vibrations of the held body, as many as the free one had, at the surface's nodes alone.
-
-        Raises SimulationError for a patch that is not of the basis.
-        """
-        total = self._stiffness.copy()
-        for patch in support.patches:
-            if patch not in self.patches:
-                raise SimulationError.expected("a patch of the basis", patch.name, name="patches")
-            row = self.patches.index(patch)
-            loads = self._loads[self._ends[row] : self._ends[row + 1]]
-            total += support.stiffness * loads.T @ loads
-        squares, vectors = scipy.linalg.eigh(total, subset_by_index=(0, min(self._count + 5, len(total) - 1)))
-        moving = np.flatnonzero(squares > PENDULUM * squares[-1])[: self._count]
-        return Vibrations(squares[moving], self._surface @ vectors[:, moving])
 
 
 def _cells(places: Float64[np.ndarray, "nodes 3"], size: float) -> list[Int[np.ndarray, " some"]]:

@@ -107,7 +107,7 @@ def _elastic(recipe: ObjectRecipe, solid: Solid, legs: Float64[Tensor, "legs 3"]
         count=recipe.elastic_modes,
         stiffness_factor=stiffness,
         density_factor=density,
-        springs=[(leg, strength) for leg in legs] if strength > 0.0 else None,
+        springs=(legs, strength) if strength > 0.0 else None,
     )
 
 

@@ -130,7 +130,7 @@ class Regression:
 
     def held_on_all(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody:
         """Return a body that all patches hold, at the most probable stiffness by the evidence of all modes."""
-        return self._most_probable(rows, body, modes, [modes.basis.patches], *STIFFNESS_RATIOS)[2]
+        return self._most_probable(rows, body, modes, [modes.patches], *STIFFNESS_RATIOS)[2]
 
     def held(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody | None:
         """Return a body on its most probable support, by the evidence of all modes; None where it is free.
@@ -139,7 +139,7 @@ class Regression:
         that is more probable, then other stiffnesses. Where both bodies are far from the object, evidence between them
         means little: the held one also has to predict contacts left out better.
         """
-        patches, most_probable = modes.basis.patches, partial(self._most_probable, rows, body, modes)
+        patches, most_probable = modes.patches, partial(self._most_probable, rows, body, modes)
         typical, *others = STIFFNESS_RATIOS
         best = most_probable([each for count in (1, 2) for each in combinations(patches, count)], typical)
         while len(best[1].patches) < len(patches):
@@ -164,7 +164,7 @@ class Regression:
         *ratios: float,
     ) -> tuple[float, Support, CandidateBody]:
         """Return the most probable of choices of patches at ratios of stiffness: log probability, support, body."""
-        patches, scale = modes.basis.patches, modes.basis.stiffness_scale
+        patches, scale = modes.patches, modes.stiffness_scale
         supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
         bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
         # Numbers of patches share the probability of being held alike, and so do stiffnesses.
