@@ -31,6 +31,16 @@ def test_where_nothing_can_be_kept_the_work_goes_on_and_the_cause_is_told_once(t
         caching.keep_if_possible(refuse, tmp_path / "kept")
 
 
+def test_a_digest_is_of_values_types_and_shapes_and_not_of_how_they_lie_in_memory() -> None:
+    given = torch.tensor([[1.0 + 2j, 3.0], [0.0, -1j]])
+    same = (given, given.conj().conj(), given.T.contiguous().T, given.numpy(), given.conj().resolve_conj().conj())
+    assert len({caching.content_digest(("a", 1), each) for each in same}) == 1
+    others = (given.conj(), given.T, given.reshape(4), given.to(torch.complex128), given.real, None, "a")
+    assert len({caching.content_digest(("a", 1), each) for each in (given, *others)}) == 1 + len(others)
+    parts = (("a", "b"), ("b", "a"), ("ab",), (("a", "b"),), (given, "a"), ("a", given), ("1",), (1,))
+    assert len({caching.content_digest(*each) for each in parts}) == len(parts)
+
+
 def test_a_digest_knows_the_modules_that_a_module_imports_and_no_others(tmp_path: Path) -> None:
     sources = {
         "shop/__init__.py": "",

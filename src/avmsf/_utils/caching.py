@@ -106,6 +106,16 @@ def _warn_once(folder: Path, reason: str) -> None:
     warnings.warn(AvmsfWarning.expected(wanted, reason, file=folder, advice=advice), stacklevel=3)
 
 
+def content_digest(*parts: Any) -> str:
+    """Return a digest of plain values, and of arrays and tensors with their types and shapes."""
+    digest = hashlib.sha256()
+    for part in parts:
+        array = part.detach().cpu().resolve_conj().resolve_neg().numpy() if hasattr(part, "detach") else part
+        plain = not hasattr(array, "tobytes")
+        digest.update(f"{array!r}\0".encode() if plain else f"{array.dtype} {array.shape}\0".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
 def key_of(values: dict[str, Any]) -> str:
     """Return a short digest of plain values."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]

@@ -1,7 +1,5 @@
 """The recordings of one object, with their contact positions."""
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, no_type_check
@@ -13,6 +11,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_numbers, as_rate, as_rows, as_vectors
+from avmsf._utils.caching import content_digest
 from avmsf._utils.compiled import compiled
 from avmsf.errors import ArrayError
 
@@ -102,10 +101,8 @@ class Impacts:
 
     def digest(self) -> str:
         """Return a digest of the recordings and of their names, contacts, directions and forces."""
-        digest = hashlib.sha256(json.dumps([self.names, self.sample_rate]).encode())
-        for tensor in (self.contacts, self.sounds, self.directions, self.forces, self.before, self.after):
-            digest.update(b"none" if tensor is None else tensor.contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        known = (self.contacts, self.sounds, self.directions, self.forces, self.before, self.after)
+        return content_digest(self.names, self.sample_rate, *known)
 
     def take(self, rows: Sequence[int]) -> "Impacts":
         """Return the given rows alone, in the given order."""

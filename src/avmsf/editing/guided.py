@@ -1,6 +1,5 @@
 """Guided editing: a field's modes are optimized towards a guide's target sounds, with one edit for all contacts."""
 
-import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -10,10 +9,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64
-from safetensors.torch import save
 from torch import Tensor
 
-from avmsf._utils.caching import key_of, source_digest
+from avmsf._utils.caching import content_digest, key_of, source_digest
 from avmsf._utils.checkpoint import Checkpoint
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
@@ -346,11 +344,8 @@ def checkpoint_identity(
     `contacts` are places at which the field's gains are looked at; `guide` and `settings` plain values.
     """
     tensors = {f"bank.{name}": each for name, each in vars(field.bank).items()} | vars(field.known(contacts))
-    tensors |= {"phase": field.phase, "points": field.gain_field.points}
-    content = save(
-        {name: each.detach().cpu().clone().contiguous() for name, each in tensors.items() if each is not None}
-    )
-    field_values = [field.sample_rate, field.samples, hashlib.sha256(content).hexdigest()]
+    content = content_digest(*tensors, *tensors.values(), field.phase, field.gain_field.points)
+    field_values = [field.sample_rate, field.samples, content]
     made_by = [version("avmsf"), source_digest("avmsf.editing.guided")]
     values = {"field": field_values, "guide": guide, "settings": settings, "version of avmsf": made_by}
     return {name: key_of({name: each}) for name, each in values.items()}

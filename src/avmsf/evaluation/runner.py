@@ -3,7 +3,6 @@
 Each result is stored at once; what has results already is not computed again.
 """
 
-import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -14,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.caching import Given, Result, once
+from avmsf._utils.caching import Given, Result, content_digest, once
 from avmsf._utils.device import one_thread
 from avmsf._utils.parallel import run_tasks, workers_at
 from avmsf.capture.impacts import Impacts
@@ -67,10 +66,8 @@ class ObjectData:
         not of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the
         signs of the gains, and which the truth of all does not have."""
         truth = None if evaluation.time_zero == "peak" else truth_of(dataset, identifier)
-        digest = hashlib.sha256(self.impacts.digest().encode())
-        for tensor in () if truth is None else (truth.frequency, truth.damping, truth.gains.real, truth.gains.imag):
-            digest.update(tensor.contiguous().numpy().tobytes())
-        self.digest = digest.hexdigest()
+        known = () if truth is None else (truth.frequency, truth.damping, truth.gains)
+        self.digest = content_digest(self.impacts.digest(), *known)
         """Of all that values depend on of the object's recordings and truth."""
         if truth is not None:
             truth = truth_from_first_sample(truth_at(truth, self.impacts.names), self.impacts)

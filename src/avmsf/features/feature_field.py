@@ -1,6 +1,5 @@
 """What is known of every point of an object's surface, as a gain field wants it: few numbers of about unit size."""
 
-import hashlib
 import math
 from dataclasses import dataclass, replace
 
@@ -9,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.arrays import Seed, short_repr
+from avmsf._utils.caching import content_digest
 from avmsf.errors import FitError, SceneError
 from avmsf.mesh.points import cluster, lattice, nearest_points
 from avmsf.mesh.surface import Surface, sample_surface
@@ -63,11 +63,7 @@ class FeatureField:
 
     def digest(self) -> str:
         """Return a digest of the points, their features and who made them."""
-        digest = hashlib.sha256(self.encoder.encode())
-        for tensor in (self.points, self.features):
-            digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
-            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return content_digest(self.encoder, self.points, self.features)
 
     def nearest(self, contacts: Float[Tensor, "contacts 3"]) -> Int[Tensor, " contacts"]:
         """Return the row of the point nearest to each contact (paper: i*, section 3.5)."""

@@ -7,12 +7,12 @@ chosen support are calls of one function, `SurfaceBodies.modes`, whose results a
 folder. Supports are compared on a basis of few elements (`HeldModes`), which is not kept.
 """
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
@@ -21,7 +21,7 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avmsf._utils.caching import key_of, once, source_digest
+from avmsf._utils.caching import content_digest, key_of, once, source_digest
 from avmsf._utils.compiled import lane_count
 from avmsf.errors import SimulationError
 from avmsf.fem.body_meshes import (
@@ -129,13 +129,9 @@ class CandidateBodies:
 
     def digest(self) -> str:
         """Return a digest of the bodies."""
-        digest = hashlib.sha256(f"{self.searches_thickness} {self.supports} {self.held_at} {self.dofs}".encode())
-        digest.update(str(dict(self.unit_ratios)).encode())
-        for body in self.bodies:
-            digest.update(body.name.encode())
-            for tensor in (body.elastic.frequency, body.elastic.nodes, body.elastic.shapes):
-                digest.update(tensor.contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        settings = self.searches_thickness, self.supports, self.held_at, self.dofs, dict(self.unit_ratios)
+        found = [(each.name, each.elastic.frequency, each.elastic.nodes, each.elastic.shapes) for each in self.bodies]
+        return content_digest(settings, *chain.from_iterable(found))
 
 
 class SurfaceBodies(CandidateBodies):

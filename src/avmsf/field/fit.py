@@ -1,7 +1,5 @@
 """From recordings, features and modes to a sound field."""
 
-import hashlib
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -10,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from avmsf._utils.caching import source_digest
+from avmsf._utils.caching import content_digest, source_digest
 from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
@@ -102,13 +100,8 @@ def fingerprint(data: GainData, estimator: GainEstimator) -> str:
     train, modes = data.train, data.modes
     words = [version("avmsf"), source_digest("avmsf.field.fit"), asdict(data.config), estimator.name]
     words += [estimator.digest(), train.digest(), data.features.digest()]
-    digest = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
-    tensors = [modes.bank.frequency, modes.bank.damping, modes.residual.magnitude]
     # Phases, and without a warm-up how strong the modes are, are those of the extraction.
-    for tensor in (*tensors, modes.gains.real, modes.gains.imag):
-        digest.update(f"{tensor.dtype} {tuple(tensor.shape)}".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    return content_digest(words, modes.bank.frequency, modes.bank.damping, modes.residual.magnitude, modes.gains)
 
 
 def _with_noise(field: SoundField, train: Impacts) -> SoundField:

@@ -1,11 +1,11 @@
 """From views to Gaussians: 3D Gaussian Splatting (Kerbl et al. 2023), in steps that a processor can afford."""
 
-import hashlib
 import importlib.util
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from avmsf._utils.caching import content_digest
 from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.device import steps_between_losses
 from avmsf.errors import SceneError
@@ -114,15 +115,8 @@ def splat(
 
 def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfig) -> str:
     """Return a digest of a fit's views, start and settings."""
-    digest = hashlib.sha256(repr((_CHECKPOINT_VERSION, asdict(config))).encode())
-    for view in views:
-        camera = view.camera
-        digest.update(repr((view.name, camera.focal, camera.principal, camera.width, camera.height)).encode())
-        for each in (camera.world_to_camera, view.image, view.mask):
-            digest.update(b"none" if each is None else each.contiguous().numpy().tobytes())
-    for values in vars(cloud).values():
-        digest.update(values.contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    seen = [(view.name, *vars(view.camera).values(), view.image, view.mask) for view in views]
+    return content_digest(_CHECKPOINT_VERSION, asdict(config), *chain.from_iterable(seen), *vars(cloud).values())
 
 
 def _device(device: torch.device | str | None, rasterizer: Rasterizer | None) -> torch.device:

@@ -1,6 +1,5 @@
 """The object's shape, as triangles or as points; points all over it, and the part that contacts lie on."""
 
-import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, Seed, as_vectors, generator_of
+from avmsf._utils.caching import content_digest
 from avmsf.errors import ArrayError, CaptureError
 
 SurfaceKind = Literal["ply", "obj", "glb"]
@@ -58,9 +58,7 @@ class Surface:
 
     def digest(self) -> str:
         """Return a digest of the vertices and triangles."""
-        vertices, faces = self.vertices.double().cpu().numpy(), self.faces.long().cpu().numpy()
-        content = f"{vertices.shape} {faces.shape}".encode() + vertices.tobytes() + faces.tobytes()
-        return hashlib.sha256(content).hexdigest()
+        return content_digest(self.vertices.double(), self.faces.long())
 
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in (self.vertices.amax(0) - self.vertices.amin(0)).tolist())

@@ -224,7 +224,8 @@ def _fit_shape(
         save(with_record(fitted, config, shape.report), path)
 
     def recipe() -> dict[str, Any]:
-        values: dict[str, Any] = {"gain_model": config.gain_model, "name": capture.name, "features": shape.digest}
+        features = [shape.points.digest(), shape.features.digest()]
+        values: dict[str, Any] = {"gain_model": config.gain_model, "name": capture.name, "features": features}
         values |= {"body": asdict(config.body), "fit": asdict(config.fit), "settings": asdict(capture.settings)}
         return {**recorded, **values, "surface": shape.surface_digest}
 

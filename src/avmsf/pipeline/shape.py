@@ -1,6 +1,5 @@
 """The object's shape as a fit reads it: from a mesh, from views, or from positions alone."""
 
-import hashlib
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -58,16 +57,6 @@ class FitShape:
     """How the features were made."""
     known: bool = True
     """Whether anything shows the shape."""
-
-    @property
-    def digest(self) -> str:
-        """Of the points and the features."""
-        digest = hashlib.sha256()
-        for each in (self.points, self.features):
-            digest.update(each.encoder.encode())
-            for tensor in (each.points, each.features):
-                digest.update(tensor.contiguous().numpy().tobytes())
-        return digest.hexdigest()
 
 
 def pipeline_of(

@@ -1,6 +1,5 @@
 """An object's shape on a grid: its outer side, its cavities, and the bodies that it may be."""
 
-import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int
 from scipy import ndimage
 
+from avmsf._utils.caching import content_digest
 from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.level_set import difference, enclose
 from avmsf.mesh.surface import Surface
@@ -202,10 +202,7 @@ class ObjectShape:
 
     def digest(self) -> str:
         """Return a digest of all that decides the surfaces."""
-        content = hashlib.sha256(f"{self.grid} {self.supposed} {self.diagonal}".encode())
-        for values in (self.outer, self.seen, self.hollow):
-            content.update(np.ascontiguousarray(values).tobytes())
-        return content.hexdigest()
+        return content_digest(self.grid, self.supposed, self.diagonal, self.outer, self.seen, self.hollow)
 
 
 def closed_surface(values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int | None = None) -> Surface:

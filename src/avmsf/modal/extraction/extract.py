@@ -4,8 +4,6 @@ Linear algebra rounds differently from one run to the next, so modes that are fo
 work that goes on after an interruption needs the very ones it began with.
 """
 
-import hashlib
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +15,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
-from avmsf._utils.caching import keep_if_possible, source_digest
+from avmsf._utils.caching import content_digest, keep_if_possible, source_digest
 from avmsf._utils.headers import FileKind
 from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf.capture.folder import Capture
@@ -211,7 +209,4 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
 
 def _digest(train: Impacts, method: ModeFinder) -> str:
     words = [version("avmsf"), source_digest(__name__), repr(method), train.names, train.sample_rate]
-    digest = hashlib.sha256(json.dumps(words).encode())
-    for sounds in (train.sounds, train.before, train.after):
-        digest.update(b"none" if sounds is None else sounds.contiguous().numpy().tobytes())
-    return digest.hexdigest()
+    return content_digest(words, train.sounds, train.before, train.after)
