@@ -14,9 +14,9 @@ from safetensors.torch import save as to_bytes
 from avmsf.errors import FieldFileError
 from avmsf.evaluation.task import Renderer
 from avmsf.field.gains.attention import AttentionGains
+from avmsf.field.gains.estimator import RefinedGains
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel, Gains
-from avmsf.field.gains.refinement import RefinedGains
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save

@@ -16,7 +16,7 @@ from avmsf.cli.options import Unit
 from avmsf.cli.output import note
 from avmsf.cli.paths import OutputError
 from avmsf.errors import PositionError
-from avmsf.field.positions import expect_near, off_surface, off_surface_gains
+from avmsf.field.gains.model import expect_near, off_surface, off_surface_gains
 from avmsf.field.sound_field import SoundField
 
 _Vectors = Sequence[tuple[float, float, float]]

@@ -303,7 +303,7 @@ def _at_gaussians(field: "SoundField", path: Path, limit: int) -> "tuple[Sampled
     """Return the field at Gaussians of a file, and these, at most `limit`. Raises `ExportError` for another file."""
     from avmsf.export.geometry import read_gaussians
     from avmsf.export.sampled_field import SampledField, spread_rows
-    from avmsf.field.positions import points_on_object
+    from avmsf.field.gains.model import points_on_object
 
     cloud = read_gaussians(path, points_on_object(field.gain_field))
     if cloud is None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import fibonacci_sphere
 from avmsf.errors import ExportError
-from avmsf.field.positions import points_on_object
+from avmsf.field.gains.model import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.neighborhoods import read_neighborhoods
 from avmsf.mesh.points import farthest_points, nearest_points

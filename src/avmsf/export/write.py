@@ -9,7 +9,7 @@ from avmsf.errors import ExportError
 from avmsf.export import write_demo, write_faust, write_gltf, write_grid, write_universal, write_webpage
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Format, Written
-from avmsf.field.positions import points_on_object
+from avmsf.field.gains.model import points_on_object
 from avmsf.field.sound_field import SoundField
 
 _OF_SUFFIX: dict[str, Format] = {suffix: name for name, each in FORMATS.items() for suffix in each.suffixes}

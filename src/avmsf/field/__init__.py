@@ -22,8 +22,7 @@ a kernel K with a noise share q, the scale s^2 integrated out:
 
 Types: `SoundField` (`sound_field`); `GainModel` with `AttentionGains` (the paper's network), `MixtureGains`,
 `BodyGains` (a guess without recordings) and `ScaledGains` (edits); `FitConfig` (`config`). `store` has the file,
-`header` its record. `positions`: whether contacts lie on the object; `hammer_access`: which can be struck;
-`probable_body`: the body of most evidence.
+`header` its record. `hammer_access`: which places can be struck; `probable_body`: the body of most evidence.
 """
 
 import lazy_loader

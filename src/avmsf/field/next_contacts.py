@@ -13,9 +13,9 @@ from avmsf._utils.progress import ProgressDisplay
 from avmsf.errors import FitError
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import off_surface
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
-from avmsf.field.positions import off_surface
 from avmsf.field.posterior import energy_of, fitted_mixture
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.points import farthest_points

@@ -15,9 +15,8 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
-from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.model import GainModel, Gains, expect_near, off_surface, off_surface_gains
 from avmsf.field.header import SUPPORTING
-from avmsf.field.positions import expect_near, off_surface, off_surface_gains
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
 from avmsf.modal.extraction.alignment import Alignment

@@ -20,7 +20,7 @@ from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField, outward_normals, supporting_columns
 from avmsf.export.writing import MAX_POINTS
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.positions import points_on_object
+from avmsf.field.gains.model import points_on_object
 from avmsf.field.posterior import scale_of
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.ply import holds_gaussians, read_splats

@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 import torch
 
-from avmsf.field.gains.refinement import RefinedGains
+from avmsf.field.gains.estimator import RefinedGains
 from avmsf.modal.modes import ModalBank
 from factories.made_fields import draw, model
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from avmsf._utils.text import RecordError
+from avmsf.field.gains.model import off_surface, off_surface_gains, points_on_object
 from avmsf.field.gains.scaled import BodyGains, ScaledGains
-from avmsf.field.positions import off_surface, off_surface_gains, points_on_object
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.residual_noise import Residual

@@ -6,9 +6,8 @@
 - `fitting`: measured gains, the prior of kernels learned from all modes, and which shape of a body a mode is.
 - `mixture_gains`, `attention`, `scaled`: the final classes, and their form in a file.
 - `outliers`, `labels`: log predictive ratios, by which labels are wrong and whether a body is credible.
-- `refinement`: the gains at the contacts, refined end to end on the recordings' spectra.
 - `regression`: the model of some contacts and bodies, with what gains say of supports and of changed stiffness.
-- `estimator`: the order of all this in a fit.
+- `estimator`: the order of all this in a fit, and the gains at the contacts, refined end to end on spectra.
 
 A new family of kernels of the position is a subclass of `kernels.KernelFamily` in `kernels.POSITIONAL`: fits, reports
 and files take it from there.

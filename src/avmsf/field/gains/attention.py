@@ -146,9 +146,8 @@ class AttentionGains(TrainableGains, GainModel):
         points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
         encoder = like(record["encoder"], "", "encoder")
         shape = record_of(_EXAMPLE, record["shape"], "shape", added=ADDED_SETTINGS)
-        if shape.layers > _MAX_LAYERS or shape.bands > _MAX_LAYERS:
-            most = max(shape.layers, shape.bands)
-            raise RecordError(f"layers, bands: expected at most {_MAX_LAYERS}, got {most}", name="layers", value=most)
+        if (most := max(shape.layers, shape.bands)) > _MAX_LAYERS:
+            raise RecordError.expected(f"at most {_MAX_LAYERS}", most, name="layers")
         with torch.device("meta"):
             return cls(
                 FeatureField(torch.empty(points, 3), torch.empty(points, dim), encoder),

@@ -255,8 +255,7 @@ class MixtureGains(GainModel):
         for kind, name in _OF_OBJECT.items():
             given = len(like(record[name], [], name))
             if given != families.count(kind) or (kind != Elastic.kind and given > 1):
-                wanted = families.count(kind)
-                raise RecordError(f"{name}: expected {wanted} as in families, got {given}", name=name, value=given)
+                raise RecordError.expected(f"{families.count(kind)} as in families", given, name=name)
         like(record["directional"], True, "directional")
         if not 0.0 <= like(record.get("spread_share", 0.0), 0.0, "spread_share") <= 1.0:
             raise RecordError.expected("0 to 1", record["spread_share"], name="spread_share")

@@ -143,9 +143,7 @@ class ScaledGains(GainModel):
             raise RecordError.expected("a number above 0", record["size_factor"], name="size_factor")
         kind = like(record["fitted_kind"], "", "fitted_kind")
         if kind not in FITTED:
-            raise RecordError(
-                f"fitted_kind: expected {', '.join(FITTED)}, got {kind!r}", name="fitted_kind", value=kind
-            )
+            raise RecordError.expected(", ".join(FITTED), kind, name="fitted_kind")
         scale = torch.empty(count_of(record["modes"], "modes"), dtype=torch.float64, device="meta")
         return {"mode_factors": scale, **_named(_FITTED, FITTED[kind].skeleton(record))}
 
