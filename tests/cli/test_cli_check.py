@@ -7,7 +7,6 @@ import pytest
 import soundfile
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.settings import METRES
 from avmsf.cli import main
 from factories.capture_folder import RATE, fill, ring
 from factories.plate_capture import fill_plate
@@ -88,18 +87,6 @@ def test_what_is_wrong_with_the_alignment_or_the_decay_is_a_problem(tmp_path: Pa
     assert "no problem found" not in out
 
 
-def capture_in(folder: Path, unit: str) -> Path:
-    """Fill a folder with contacts in meters and a mesh in a unit that its settings do not name."""
-    fill_plate(folder, surface=False)
-    write_surface_file(folder)
-    lines = [line.split() for line in (folder / "surface.obj").read_text().splitlines()]
-    for line in lines:
-        if line[0] == "v":
-            line[1:] = [f"{float(value) / METRES[unit]:.9g}" for value in line[1:]]
-    (folder / "surface.obj").write_text("\n".join([*map(" ".join, lines), ""]))
-    return folder
-
-
 STAGES = ("gaussians", "features", "surface")
 COMMANDS = ("check", "modes", "fit -o OUT.safetensors", *(f"fit --until {stage}" for stage in STAGES))
 
@@ -108,7 +95,14 @@ COMMANDS = ("check", "modes", "fit -o OUT.safetensors", *(f"fit --until {stage}"
 def test_every_command_names_the_unit_of_the_mesh_and_writes_nothing(
     command: str, tmp_path: Path, capsys: Streams
 ) -> None:
-    folder = capture_in(tmp_path / "plate", "mm")
+    # Contacts in meters, and a mesh in a unit that the settings do not name.
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    write_surface_file(folder)
+    lines = [line.split() for line in (folder / "surface.obj").read_text().splitlines()]
+    for line in lines:
+        if line[0] == "v":
+            line[1:] = [f"{1000 * float(value):.9g}" for value in line[1:]]
+    (folder / "surface.obj").write_text("\n".join([*map(" ".join, lines), ""]))
     before = sorted(folder.rglob("*"))
     verb, *words = command.replace("OUT", str(tmp_path / "out")).split()
     assert main([verb, str(folder), *words]) == 2

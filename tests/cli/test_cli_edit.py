@@ -19,11 +19,10 @@ from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import AvmsfError
 from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.field.gains.kernels import Sites
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
-from factories.made_fields import FIELDS, mixture, places
+from factories.made_fields import FIELDS, mixture, places, sounding
 from factories.raising import raises
 from factories.settings import sets
 from factories.verbs import results_of, run_verb
@@ -37,9 +36,7 @@ FREQUENCY = torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.flo
 def ceramic() -> SoundField:
     """Return a field whose dampings are near to ceramic's."""
     damping = rayleigh_damping(2 * math.pi * FREQUENCY, CERAMIC) * torch.tensor([1.1, 1.0, 0.9, 1.2, 1.0])
-    bank, phase = ModalBank(FREQUENCY, damping), torch.zeros(5, dtype=torch.float64)
-    noise = Residual(torch.full((9,), 1e-6))
-    return SoundField(bank, FIELDS["positional"](), phase, noise, RATE, 2400, Origin("plate"))
+    return sounding(FIELDS["positional"](), bank=ModalBank(FREQUENCY, damping), noise=1e-6, rate=RATE, samples=2400)
 
 
 @pytest.fixture

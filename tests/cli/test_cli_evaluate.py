@@ -1,18 +1,21 @@
-"""`avmsf evaluate`: from a folder of captures to tables, and what can be got wrong on the way."""
+"""Evaluations from the command line, and their figures."""
 
 import json
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from avmsf.cli import main, options_of
 from avmsf.errors import AvmsfError, EvaluationError, FitError
+from avmsf.evaluation import report
 from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.task import Task
 from avmsf.modal.extraction.finders import ShortTime
+from factories.plate_field import RATE
 from factories.plate_set import fill_plates
 from factories.raising import raises
 from factories.settings import sets
@@ -175,3 +178,33 @@ def test_settings_and_the_device_reach_the_evaluation(
     assert (inputs.body.wall, inputs.geometry, asked[0].device) == (0.0, "noisy", "cpu")
     # Figures of another wall are not these.
     assert asked[0].settings["body"]["wall"] == 0.0
+
+
+FEW = ("--methods", "knn3,nearest", "--no-cdpam")
+
+
+def test_stored_results_are_drawn_without_evaluating(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plates, results = fill_plates(tmp_path / "plates", ("a", "b")), tmp_path / "results"
+    words = ["farthest", str(plates), *FEW, "--output", str(results)]
+    assert run_verb("evaluate", *words) == 0
+    assert not (results / "figures").exists()
+    drawn: dict[str, Figure] = {}
+    save = report.save_picture
+
+    def keep(figure: Figure, path: Path) -> None:
+        drawn[path.name] = figure
+        save(figure, path)
+
+    monkeypatch.setattr(report, "save_picture", keep)
+    monkeypatch.setattr(
+        "avmsf.evaluation.runner.CaseRun.outcome", lambda *_, **__: pytest.fail("a method was run again")
+    )
+    assert run_verb("evaluate", *words, "--figures") == 0
+    assert list(drawn) == ["a.png", "b.png"]
+    for name, figure in drawn.items():
+        assert (results / "figures" / name).read_bytes().startswith(b"\x89PNG")
+        record = ResultsFolder(results).read(name.removesuffix(".png"))
+        assert record is not None
+        panels = [axes for axes in figure.axes if axes.get_yscale() == "log"]
+        assert len(panels) == 3 * len(record.cases[0].sounds)
+        assert panels[0].get_ylim() == pytest.approx((20.0, 0.5 * RATE))

@@ -18,22 +18,21 @@ from avmsf.errors import AvmsfError
 from avmsf.export.sampled_field import SampledField
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import BodyGains
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import Origin
 from avmsf.field.store import load, save
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
 from factories.believing_field import ELASTIC, bar, bar_points
 from factories.capture_folder import fill
 from factories.clouds import random_cloud
 from factories.demo_layout import read_arrays
-from factories.made_fields import BANK, SIDES, directional, positional, saved
+from factories.made_fields import BANK, SIDES, directional, positional, saved, sounding
 from factories.raising import raises
 from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
-RATE, SAMPLES = 8000.0, 1200
+SAMPLES = 1200
 # Meshes here have no colors.
 pytestmark = pytest.mark.filterwarnings("ignore::avmsf.errors.CaptureWarning")
 
@@ -41,9 +40,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::avmsf.errors.CaptureWarning")
 @pytest.fixture(scope="module")
 def field_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("field") / "plate.safetensors"
-    phase = torch.linspace(0, 0.5, len(BANK), dtype=torch.float64)
-    noise = Residual(torch.full((9,), 1e-3))
-    save(SoundField(BANK, positional(), phase, noise, RATE, SAMPLES, Origin("plate", config=FitConfig(seed=1))), path)
+    phase, origin = torch.linspace(0, 0.5, len(BANK)), Origin("plate", config=FitConfig(seed=1))
+    save(sounding(positional(), phase=phase, noise=1e-3, samples=SAMPLES, origin=origin), path)
     return path
 
 
@@ -237,8 +235,8 @@ def test_the_body_of_the_gains_is_shown_before_a_reconstruction(to: str, name: s
     # Points on a closed lid above the body, as a reconstruction from outside has it.
     points = torch.cat([bar_points(), bar_points() + torch.tensor([0.0, 0.0, 0.05])]).float()
     bank = ModalBank(ELASTIC, torch.ones(6, dtype=torch.float64))
-    noise, phase = Residual(torch.full((9,), 1e-3)), torch.zeros(6, dtype=torch.float64)
-    save(SoundField(bank, BodyGains(points, bar()), phase, noise, RATE, SAMPLES, Origin()), tmp_path / "b.safetensors")
+    field = sounding(BodyGains(points, bar()), bank=bank, noise=1e-3, samples=SAMPLES)
+    save(field, tmp_path / "b.safetensors")
     fill(tmp_path / "capture", rows=["a.wav,0,0,0"])
     box(tmp_path / "capture" / ".avmsf" / "surface.ply")
     output = export(tmp_path / "b.safetensors", to, tmp_path / name, "--capture", tmp_path / "capture")

@@ -17,14 +17,13 @@ from avmsf.cli import main
 from avmsf.cli.contacts import Contacts, rows_of
 from avmsf.cli.paths import OutputError
 from avmsf.errors import AvmsfError, CaptureError
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import Origin
 from avmsf.field.store import save
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
-from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from factories.made_fields import BANK, positional
+from factories.made_fields import BANK, positional, sounding
 from factories.raising import raises
 from factories.verbs import results_of, run_verb
 
@@ -61,9 +60,8 @@ class Place:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
-    folder, zero = tmp_path_factory.mktemp("place"), torch.zeros(len(BANK), dtype=torch.float64)
-    noise, origin = Residual(torch.full((9,), 1e-3)), Origin("plate", trained_on=("fitted.wav",))
-    field = SoundField(BANK, positional(), zero, noise, float(RATE), SAMPLES, origin)
+    folder, origin = tmp_path_factory.mktemp("place"), Origin("plate", trained_on=("fitted.wav",))
+    field = sounding(positional(), noise=1e-3, samples=SAMPLES, origin=origin)
     save(field, folder / "plate.safetensors")
     locator = Locator.of(field)
     return Place(folder, str(folder / "plate.safetensors"), locator.points, locator.gains)

@@ -1,15 +1,28 @@
-"""The demo runs the commands that it prints, to the end, and again from what they have made."""
+"""The demo, suggestions, reports and interruptions."""
 
+import csv
 import json
 import shlex
 from pathlib import Path
 
 import pytest
 import soundfile
+import torch
 
+from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import demo, main
-from avmsf.field.store import load
+from avmsf.cli.output import display
+from avmsf.cli.paths import OutputError
+from avmsf.cli.report import field_lines, outlier_words, quality_words
+from avmsf.errors import FitError
+from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
+from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
+from factories.made_fields import positional, sounding
+from factories.plate_capture import TINY, fill_plate
+from factories.raising import raises
+from factories.verbs import results_of, run_verb
 
 SMALL = "--set views.count=6 --set splat.steps=30 --set start_points=400 --set fit.steps=2 --gain-model thin-plate"
 
@@ -54,3 +67,118 @@ def test_the_demo_goes_all_the_way(
     monkeypatch.setattr(demo, "COMMANDS", [check, fit])
     assert main(["demo", str(folder)]) == 2
     assert "$ avmsf fit" not in capsys.readouterr().out
+
+
+Streams = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    contacts = bar_contacts(6)
+    path = tmp_path_factory.mktemp("fields") / "bar.safetensors"
+    save(sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1))), path)
+    return path
+
+
+def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, capsys: Streams) -> None:
+    printed, _ = results_of(capsys, "suggest", field, "--count", "3", "--plots", tmp_path / "next")
+    with open(tmp_path / "next" / "suggested.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["order"] for row in rows] == ["1", "2", "3"]
+    for row, known in zip(rows, printed["suggestions"], strict=True):
+        for name in ("x", "y", "z", "nx", "ny", "nz", "error_after"):
+            assert float(row[name]) == pytest.approx(known[name], rel=1e-5, abs=1e-9)
+    errors = [printed["error_before"], *(each["error_after"] for each in printed["suggestions"])]
+    assert errors == sorted(errors, reverse=True)
+    assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
+    with raises(FitError, name="count", value=0):
+        run_verb("suggest", str(field), "--count", "0")
+    settings = tmp_path / "capture.toml"
+    settings.write_text("")
+    with raises(FitError, name="--settings"):
+        run_verb("suggest", str(field), "--settings", str(settings))
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with raises(OutputError, file=blocked, value="file"):
+        run_verb("suggest", str(field), "--output", str(blocked))
+    with raises(FitError, name="--unseen"):
+        run_verb("suggest", str(field), "--unseen", "--candidates", str(tmp_path))
+
+
+FOUND = {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
+
+
+def field_with(report: dict[str, object]) -> SoundField:
+    return sounding(positional(), noise=1e-3, samples=400, origin=Origin(report=report))
+
+
+def test_a_field_without_a_verdict_gets_no_words_and_one_with_advice_names_the_command() -> None:
+    for report in ({}, {"quality": FOUND, "edits": [{"edit": "x"}]}):
+        assert quality_words(field_with(report), Path("f")) == []
+    assert "avmsf suggest f" in quality_words(field_with({"quality": FOUND}), Path("f"))[0]
+
+
+def test_the_body_is_named_with_the_ratio_of_stiffness_to_density_and_what_it_explains() -> None:
+    # Frequencies are half of aluminum's: a quarter of its 26 MJ/kg.
+    body = {"body": "shape", "wall_thickness": None, "frequency_factor": 0.5, "support": "free"}
+    report = {"bodies": [body], "credibility": {"credible": True, "with_body": 2.5, "without_body": 0.75}}
+    lines = field_lines(field_with(report), Path("f"), settings=False)
+    (line,) = [each for each in lines if each.split()[0] == "body"]
+    assert "6.5 MJ/kg" in line
+    assert "1.8 per mode" in line
+
+
+def test_an_outlier_says_what_was_done_and_has_figures_only_for_verbose(monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = {"place": [0.046, -0.003, 0.1], "ratio": -1.9, "place_ratio": 1.6, "distance": 0.0086, "reversed": False}
+    report: dict[str, object] = {
+        "outliers": {"a.wav": "a.wav contradicts", "b.wav": "b.wav contradicts"},
+        "outlier_figures": {"a.wav": figures},
+        "excluded": ["a.wav"],
+    }
+    left_out, used = outlier_words(field_with(report))
+    assert (left_out.split()[0], used.split()[0], "1.9" in left_out) == ("left", "used", False)
+    monkeypatch.setattr(display, "verbose", True)
+    left_out, used = outlier_words(field_with(report))
+    assert "-1.9" in left_out
+    assert "(0.046, -0.003, 0.1) m" in left_out
+    assert used.endswith("contradicts")
+
+
+NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
+
+
+def test_the_same_command_goes_on_to_the_same_field(
+    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, cache = fill_plate(tmp_path / "plate"), tmp_path / "plate" / ".avmsf"
+    whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
+    assert main(["fit", str(folder), "--output", str(whole), "--cache", str(tmp_path / "other"), *NETWORK]) == 0
+    capsys.readouterr()
+    shown: list[int] = []
+
+    def show(self: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
+        shown.append(done)
+        if len(shown) == 14:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(ProgressDisplay, "step", show)
+    words = ["fit", str(folder), "--output", str(broken), *NETWORK]
+    assert main(words) == 130
+    assert (cache / "field.safetensors.checkpoint").exists()
+    assert (cache / "modes.safetensors").exists()
+    assert not broken.exists()
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines()[-1] == "avmsf fit: interrupted; repeat the command to continue"
+    del shown[:]
+    assert main(words) == 0
+    # Of the six steps end to end, those after the second.
+    assert shown == [3, 4, 5, 6]
+    assert not (cache / "field.safetensors.checkpoint").exists()
+    contacts = torch.tensor([[0.05, 0.06, 0.0], [0.1, 0.02, 0.0]])
+    one, other = load(whole).render(contacts), load(broken).render(contacts)
+    # The modes of two runs differ in their last digits, by up to 3e-7 of a damping; frequencies move phases by less.
+    assert (one - other).abs().max() < 1e-4 * one.abs().max()

@@ -1,8 +1,13 @@
-"""What `--help` prints of every verb, and settings by name."""
+"""Help and errors: one screen, one line."""
 
+import json
+import math
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,11 +16,15 @@ from avmsf.cli.edit import Options as EditOptions
 from avmsf.cli.evaluate import Options as EvaluateOptions
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.options import Configured
+from avmsf.cli.paths import Existing, InputError
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
 from avmsf.evaluation.registry import METHODS, PROTOCOLS
+from avmsf.pipeline.config import CACHE, CACHED_FIELD
 from avmsf.simulate.recipe import named_recipe
+from factories.plate_capture import TINY, fill_plate
 from factories.raising import raises
+from factories.verbs import run_verb
 
 Streams = pytest.CaptureFixture[str]
 MOST_LINES = 50
@@ -113,3 +122,158 @@ def test_values_are_numbers_words_truth_values_and_lists_of_these() -> None:
     made = FitOptions.parse(["mug", *(each for word in words for each in ("--set", word))]).all_settings
     assert (made.fit.fft_sizes, made.scene.splat.background) == ((512, 256), (1.0, 0.0, 0.5))
     assert (made.scene.lift.symmetry, made.body.wall, made.scene.views.source) == (False, 0.0, "mesh")
+
+
+STORED = Path(__file__).parents[1] / "field" / "data" / "format-8" / "mixture.safetensors"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with captures, a field, and tables of contacts that cannot be used."""
+    folder = tmp_path_factory.mktemp("place")
+    fill_plate(folder / "plate")
+    fill_plate(folder / "fast", rate=9000.0)
+    words = ["fit", str(folder / "plate"), "--output", str(folder / "field.safetensors"), *TINY]
+    assert main([*words, "--gain-model", "smooth", "--set", "fit.steps=1"]) == 0
+    (folder / "empty").mkdir()
+    for name, cell in (("one", "0.1"), ("cells", "left")):
+        (folder / name).mkdir()
+        (folder / name / "impacts.csv").write_text(f"file,x,y,z\n001.wav,0,0,0\n002.wav,{cell},0,0\n")
+    (folder / "one" / "001.wav").touch()
+    newer = STORED.read_bytes().replace(b'\\"format\\": 8', b'\\"format\\": 9', 1)
+    (folder / "newer.safetensors").write_bytes(newer)
+    (folder / "not-ours.safetensors").write_bytes(b"RIFF and so on")
+    (folder / "no-z.csv").write_text("file,x,y\na.wav,0,0\n")
+    (folder / "far.csv").write_text("file,x,y,z\na.wav,0.1,0.05,0\n\nb.wav,50,60,0\n")
+    (folder / "empty.csv").write_text("x,y,z\n")
+    (folder / "words.csv").write_text("x,y,z\n0,0,0\n0.1,left,0\n")
+    (folder / "short.csv").write_text("x,y,z\n0,0\n")
+    (folder / "twice.csv").write_text("file,x,y,z\na.wav,0,0,0\na,0.1,0,0\n")
+    (folder / "outside.csv").write_text("file,x,y,z\n../a.wav,0,0,0\n")
+    (folder / "wrong.toml").write_text('unit = "miles"\n')
+    (folder / "miles").mkdir()
+    (folder / "miles" / "capture.toml").write_text('unit = "miles"\n')
+    return folder
+
+
+LONG, TOO_LONG = 300 * "x", "File name too long"
+AT = "--position 0.1 0.05 0"
+TABLE = "render field.safetensors --output s --contact-table"
+EARLY: dict[str, dict[str, Any]] = {
+    "check plate --settings wrong.toml": {"file": "wrong.toml", "name": "unit", "value": "miles"},
+    # What is wrong with the capture is said before what is wrong with the name of the output.
+    "fit miles -o f": {"file": "miles/capture.toml", "name": "unit", "value": "miles"},
+    "modes nowhere": {"file": "nowhere"},
+    "modes plate --settings nowhere.toml": {"file": "nowhere.toml"},
+    "modes plate --modes 0": {"name": "modes", "value": 0},
+    "fit nowhere -o f.safetensors": {"file": "nowhere"},
+    "fit plate --output plate": {"file": "plate", "value": "folder"},
+    "fit plate --output words.csv/f.safetensors": {"file": "words.csv", "value": "file"},
+    "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": {"name": "--train-count"},
+    "fit plate --output f.safetensors --set validation=2": {"name": "validation", "value": 2.0},
+    "fit plate --output f.safetensors --material glass --train-count 4": {"name": "--train-count", "value": "glass"},
+    "fit plate --material glass --start 2": {"name": "--start", "value": "glass"},
+    "fit plate --until gaussians --without-shape": {"name": "--without-shape", "value": "gaussians"},
+    "fit plate --start 5": {"name": "--start"},
+    "fit plate --output f.safetensors --material wodo": {"name": "--material", "value": "wodo"},
+    "fit plate/surface.ply --output f.safetensors": {"file": "surface.ply", "name": "--material"},
+    "fit plate --until gaussians --output f.obj": {"file": "f.obj", "name": "suffix", "value": ".obj"},
+    f"render field.safetensors {AT} --output s.mp3": {"file": "s.mp3", "name": "suffix", "value": ".mp3"},
+    "fit field.safetensors -o f.safetensors": {"file": "field.safetensors", "value": "a sound field"},
+    f"render plate/001.wav {AT} --output s": {"file": "001.wav", "value": "a recording"},
+    "info plate": {"file": "plate", "value": "a folder"},
+    f"render not-ours.safetensors {AT} --output s": {"file": "not-ours.safetensors"},
+    "render field.safetensors --output s": {"name": "--position", "value": 0},
+    f"{TABLE} far.csv {AT}": {"name": "--position", "value": 1},
+    f"render field.safetensors {AT} {AT} --direction 0 0 1 -o s": {"name": "--direction", "value": 1},
+    f"render field.safetensors {AT} --output words.csv": {"file": "words.csv", "value": ".csv"},
+    f"render field.safetensors {AT} --output s --contact-time 2": {"name": "--contact-time", "value": 2.0},
+    f"render field.safetensors {AT} --output s --force -1": {"name": "--force", "value": -1.0},
+    f"render field.safetensors {AT} --output s --force inf": {"name": "--force", "value": math.inf},
+    f"render field.safetensors {AT} --output {LONG}": {"file": LONG, "value": TOO_LONG},
+    f"edit field.safetensors --pitch 2 -o {LONG[:240]}.safetensors": {"value": TOO_LONG},
+    f"demo {LONG}": {"file": LONG, "value": TOO_LONG},
+    "demo plate": {"file": "plate"},
+    "fit cells -o f.safetensors": {"file": "impacts.csv", "row": 3, "name": "x", "value": "left"},
+    "fit one": {"file": "002.wav"},
+    "fit empty -o f.safetensors": {"file": "empty/impacts.csv"},
+    "check empty": {"file": "empty"},
+    "fit empty --until gaussians": {"file": "empty"},
+    "fit empty --material glass": {"file": "empty"},
+    "fit plate -o f.safetensors --set modes=0": {"name": "modes", "value": 0},
+    f"{TABLE} no-z.csv": {"file": "no-z.csv", "row": 1, "name": "z"},
+    f"{TABLE} empty.csv": {"file": "empty.csv", "name": None},
+    f"{TABLE} short.csv": {"file": "short.csv", "row": 2, "name": "z", "value": 2},
+    "info newer.safetensors": {"file": "newer.safetensors"},
+    "locate field.safetensors": {"name": "recordings", "value": 0},
+    "suggest field.safetensors --unseen --candidates plate": {"name": "--unseen"},
+    "export field.safetensors --to wavs -o plate --overwrite": {"file": "plate", "name": "--overwrite"},
+    "edit field.safetensors -o new.safetensors": {"name": "options"},
+    "evaluate nope plate": {"name": "protocol", "value": "nope"},
+    "evaluate farthest empty": {"file": "empty"},
+    "simulate": {"name": "output"},
+    "studio": {"name": "target"},
+}
+"""What is refused before torch, which takes seconds, is loaded."""
+LATE: dict[str, dict[str, Any]] = {
+    "fit plate -o f.safetensors --device tpu": {"name": "device", "value": "tpu"},
+    "fit plate --output f.safetensors --train-count 4 --start 8": {"name": "start", "value": 8},
+    "fit plate --output f.safetensors --train-count 8": {"name": "count", "value": 8},
+    "fit plate --output f.safetensors --train-fraction 1.5": {"name": "train_size", "value": 1.5},
+    "render field.safetensors --position 50 60 0 -o s": {"name": "--position", "row": 0, "value": [50.0, 60.0, 0.0]},
+    f"render field.safetensors {AT} --position 50 60 0 --output s": {"name": "--position", "row": 1},
+    f"{TABLE} far.csv": {"file": "far.csv", "row": 4, "name": "b.wav", "value": [50.0, 60.0, 0.0]},
+    f"render field.safetensors {AT} --output s --direction nan 0 1": {"name": "directions", "row": 0},
+    "render field.safetensors --position nan 0 0 --output s": {"name": "--position", "row": 0},
+    f"render field.safetensors {AT} {AT} --output two.wav": {"file": "two.wav", "value": 2},
+    f"render field.safetensors {AT} --output s --seconds 0": {"name": "--seconds", "value": 0.0},
+    f"render field.safetensors {AT} --output s --seconds nan": {"name": "--seconds"},
+    f"render field.safetensors {AT} --output s --seconds 1e9": {"name": "--seconds", "value": 1e9},
+    f"render field.safetensors {AT} --output s --level-db nan": {"name": "finite"},
+    f"{TABLE} words.csv": {"file": "words.csv", "row": 3, "name": "y", "value": "left"},
+    f"{TABLE} twice.csv": {"file": "twice.csv", "row": 3, "name": "file", "value": "a.wav"},
+    f"{TABLE} outside.csv": {"file": "outside.csv", "row": 2, "name": "file", "value": "../a.wav"},
+    "info field.safetensors --capture fast": {"name": "sample_rate"},
+}
+WRONG = EARLY | LATE
+CODE = """
+import contextlib, io, json, sys
+from avmsf.cli import main
+from avmsf.cli.paths import Existing, InputError
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        code = main(words.split())
+    assert (code, len(said.getvalue().splitlines()), "torch" in sys.modules) == (2, 1, False), (words, said.getvalue())
+"""
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_one_line_says_what_is_wrong(words: str, place: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    before = {path.name for path in place.iterdir()}
+    verb, *arguments = words.split()
+    with raises(AvmsfError, **WRONG[words]) as caught:
+        run_verb(verb, *arguments)
+    capsys.readouterr()
+    assert main(words.split()) == 2
+    err = capsys.readouterr().err
+    # Progress may come before.
+    assert err.splitlines()[-1] == f"avmsf {verb}: {' '.join(str(caught.value).split())}"
+    assert "Traceback" not in err
+    assert {path.name for path in place.iterdir()} == before
+
+
+def test_no_early_refusal_loads_torch(place: Path) -> None:
+    command = [sys.executable, "-c", CODE, json.dumps([*EARLY])]
+    ran = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=120, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_the_field_that_a_folder_keeps_is_named(tmp_path: Path) -> None:
+    kept = tmp_path / CACHE / CACHED_FIELD
+    kept.parent.mkdir(parents=True)
+    for there in (False, True):
+        with raises(InputError, file=tmp_path, value="a folder") as caught:
+            Existing("a field", ("a sound field",)).check(tmp_path)
+        assert (str(kept) in str(caught.value)) == there
+        kept.touch()

@@ -1,16 +1,37 @@
-"""Training and test never mix, whatever the protocol; contacts are counted and chosen with all their recordings."""
+"""Plans, registries and splits of evaluations."""
 
+import json
+import pickle
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
 
+from avmsf.capture import read_capture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError
-from avmsf.evaluation.registry import BASELINE, METHODS, PROTOCOLS, protocol_named
+from avmsf.datasets import CaptureCollection
+from avmsf.errors import EvaluationError, SceneError
+from avmsf.evaluation.methods import method_named
+from avmsf.evaluation.plan import Evaluation, available_encoders, visual_inputs
+from avmsf.evaluation.registry import (
+    BASELINE,
+    METHODS,
+    METRICS,
+    PROTOCOLS,
+    MetricEntry,
+    MetricSettings,
+    protocol_named,
+    resolve,
+)
+from avmsf.evaluation.results import ResultsFolder
+from avmsf.evaluation.scores import score
+from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import (
     Choosing,
     Closest,
@@ -20,11 +41,17 @@ from avmsf.evaluation.splits import (
     LeaveOneOut,
     Predefined,
     Shots,
+    align_split,
     evenly_spaced,
     split,
 )
+from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.encoder import Encoder
 from avmsf.mesh.points import farthest_points
+from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
+from avmsf.pipeline.features import DinoEncoder
 from factories.plate_field import plate_impacts
+from factories.plate_set import PlateInputs, fill_plates
 from factories.raising import raises
 
 COUNT = 20
@@ -210,3 +237,116 @@ def test_all_methods_of_all_protocols_are_known_and_the_baseline_takes_part() ->
         assert set(protocol.methods) <= set(METHODS)
         # A mean waveform does not locate anything.
         assert (BASELINE in protocol.methods) != (protocol.scoring != "sounds")
+
+
+@pytest.mark.parametrize(
+    ("name", "damping"),
+    [("av-msf", "validated"), ("paper", "shared"), ("paper-grid", "shared"), ("paper-per-contact", "per-contact")],
+)
+def test_the_papers_method_is_the_preset_with_one_damping(name: str, damping: Any) -> None:
+    field: Any = method_named(name)
+    preset = PRESETS["paper"]
+    assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
+    assert (field.pipeline == preset) == (name == "av-msf")
+    assert (field.visual_input, field.published) == ("paper", True)
+
+
+def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def missing(*_: Any, **__: Any) -> DinoEncoder:
+        raise SceneError("facebook/dinov2-base: no weights", value="facebook/dinov2-base")
+
+    monkeypatch.setattr(DinoEncoder, "load", missing)
+    said = list[str]()
+    with raises(SceneError, value="facebook/dinov2-base"):
+        available_encoders(LiftConfig(), {"visual", "paper"}, log=said.append)
+    usual, paper = available_encoders(LiftConfig(), {"visual"}, log=said.append)
+    assert (usual.encoder, paper.encoder) == (DESCRIPTORS, DINO)
+    assert any("descriptors" in line for line in said)
+    named = available_encoders(LiftConfig(encoder=DESCRIPTORS), {"paper"}, log=said.append)
+    assert [each.encoder for each in named] == [DESCRIPTORS, DESCRIPTORS]
+    assert named[1].onto == "gaussians"
+
+
+def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded, said = [], list[str]()
+
+    def load(name: str, *, device: torch.device, **_: Any) -> Encoder:
+        loaded.append((name, device.type))
+        return ImageDescriptors()
+
+    monkeypatch.setattr(DinoEncoder, "load", load)
+
+    def read_by(protocol: str, *names: str) -> frozenset[Any]:
+        return visual_inputs([method_named(name) for name in names], PROTOCOLS[protocol])
+
+    read = read_by("farthest", "knn3", "white-noise", "diffsound")
+    assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0] == LiftConfig()
+    # Recordings are located at the points that features have.
+    assert read_by("localize", "nearest") == read_by("localize", "field-auto") == {"surface"}
+    assert available_encoders(LiftConfig(), {"surface"}, log=said.append)[0] == LiftConfig()
+    assert loaded == []
+    read = read_by("farthest", "field", "field-auto", "paper-grid")
+    assert read == {"visual", "surface", "paper"}
+    assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0].encoder == DINO
+    assert loaded == [(DINO, "cpu")]
+
+
+def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path) -> None:
+    def begin(name: str, encoder: str | None) -> None:
+        methods, settings = (method_named(name),), MetricSettings(cdpam=False)
+        evaluation = Evaluation(
+            "plates", PROTOCOLS["farthest"], methods, PlateInputs(CaptureCollection(tmp_path), tmp_path), settings,
+            encoder=encoder,
+        )  # fmt: skip
+        evaluation.begin(ResultsFolder(tmp_path / "results"))
+
+    begin("knn3", None)
+    begin("field", DESCRIPTORS)
+    begin("knn3", DESCRIPTORS)
+    with raises(EvaluationError, name="methods.field.encoder", value=DESCRIPTORS):
+        begin("field", DINO)
+
+
+TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorials" / "evaluate.md"
+
+
+def test_a_method_and_a_metric_of_the_tutorial_are_in_the_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill_plates(tmp_path / "objects", ("mug",))
+    monkeypatch.chdir(tmp_path)
+    (block,) = (
+        block for block in re.findall(r"```python\n(.*?)```", TUTORIAL.read_text(), re.DOTALL) if "METHODS[" in block
+    )
+    with patch.dict(METHODS), patch.dict(METRICS):
+        exec(block, {})
+    report = (tmp_path / "mean-of-all" / "report.md").read_text()
+    assert "| peak error, dB |" in report
+    assert "mean-of-all: mean waveform of all training recordings" in report
+    summary = json.loads((tmp_path / "mean-of-all" / "summary.json").read_text())
+    train, test = align_split(*split(read_capture(tmp_path / "objects" / "mug").impacts, 0.2))
+    ratio = MeanWaveform(train, len(train)).render(test.contacts).abs().amax(1) / test.sounds.abs().amax(1)
+    expected = float((20 * ratio.log10().abs()).mean())
+    assert summary["methods"]["mean-of-all"]["peak_error"] == pytest.approx(expected, rel=1e-3)
+    assert summary["ratio_to_knn3"]["mean-of-all"]["peak_error"] > 0
+
+
+def test_a_metric_has_a_value_for_each_contact(tmp_path: Path) -> None:
+    impacts = read_capture(fill_plates(tmp_path, ("mug",)) / "mug").impacts
+    entry = MetricEntry("mean", lambda predicted, truth, *, sample_rate: predicted.mean())
+    with patch.dict(METRICS, mean=entry), raises(EvaluationError, name="mean", value=[]):
+        score(impacts.sounds, impacts)
+
+
+def test_every_import_path_leads_to_a_function() -> None:
+    for name, entry in METHODS.items():
+        assert callable(resolve(entry.make or entry.fit)), name
+        assert entry.path or method_named(name).name == name
+    assert all(callable(resolve(entry.function)) for entry in METRICS.values() if entry.function is not None)
+
+
+def test_every_method_can_be_sent_to_a_worker() -> None:
+    methods = [method_named(name) for name, entry in METHODS.items() if not entry.path]
+    assert [each.name for each in pickle.loads(pickle.dumps(methods))] == [each.name for each in methods]

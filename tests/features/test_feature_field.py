@@ -23,6 +23,14 @@ def box(count: int = 200) -> torch.Tensor:
     return torch.tensor([1.0, -2.0, 0.5]) + fractions * torch.tensor([0.3, 0.2, 0.1])
 
 
+def test_the_nearest_point_is_the_one_at_least_distance():
+    field = FeatureField.from_points(box())
+    contacts = box(300)[200:] + 0.01
+    brute = torch.cdist(contacts.double(), field.points.double()).argmin(1)
+    assert torch.equal(field.nearest(contacts), brute)
+    assert torch.equal(field.at(contacts), field.features[brute])
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_region_is_described_by_the_mean_of_its_points_features(dtype):
     points = box()

@@ -18,10 +18,9 @@ from avmsf.field.gains.estimator import RefinedGains
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.modal.residual_noise import Residual
-from factories.made_fields import BANK, FIELDS, SIDES, blows, places
+from factories.made_fields import BANK, FIELDS, SIDES, blows, places, sounding
 from factories.raising import raises
 
 FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.25, 3.0], dtype=torch.float64)
@@ -47,7 +46,7 @@ REAL = ("attention", "attention with dampings", "scaled attention with dampings"
 
 
 def sound_field(gains: GainModel, *, noise: float = 0.0) -> SoundField:
-    return SoundField(BANK, gains, PHASE, Residual(torch.full((9,), noise)), 8000.0, 600, Origin("plate"))
+    return sounding(gains, phase=PHASE, noise=noise, samples=600)
 
 
 def parts(field: GainModel, contacts: torch.Tensor, directions: torch.Tensor | None = None) -> list[torch.Tensor]:

@@ -1,15 +1,18 @@
-"""Synthesis against the plain sum and finite differences, and what a hammer's contact time does to a sound."""
+"""Modes' spectra and their synthesis against sums of damped sines, and distances by cosines."""
 
 import math
 
 import numpy as np
 import pytest
+import scipy.signal
 import torch
 from scipy.integrate import quad
 from torch import Tensor
 
-from avmsf.errors import SimulationError
+from avmsf.errors import ArrayError, SimulationError
+from avmsf.modal.cosine_distance import LARGEST_DELAY, cosine_distance
 from avmsf.modal.modes import ForcePulse
+from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft
 from avmsf.modal.synthesis import synthesize
 from factories.raising import raises
 
@@ -99,3 +102,108 @@ def test_a_time_that_is_none_is_refused(contact_time):
     with raises(SimulationError, name="contact_time") as caught:
         ForcePulse(contact_time)
     assert caught.value.value is contact_time
+
+
+def noise(rows: int, samples: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(rows, samples, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("samples", [1, 40, 200, 203])
+def test_frames_are_direct_sums_over_centered_windows(samples):
+    fft_size, hop = 64, 16
+    sound = noise(1, samples)
+    magnitudes = magnitude_stft(sound, fft_size=fft_size, hop=hop)
+    assert magnitudes.shape == (1, 33, 1 + samples // hop)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(fft_size) / fft_size)
+    padded = np.pad(sound[0].numpy(), fft_size // 2)
+    for frame in range(magnitudes.shape[2]):
+        direct = np.abs(np.fft.rfft(window * padded[frame * hop : frame * hop + fft_size]))
+        # Rounding of a sum of 64 terms in float64.
+        np.testing.assert_allclose(magnitudes[0, :, frame].numpy(), direct, rtol=0, atol=1e-12)
+
+
+def test_gradients_are_finite_at_silence_and_right_elsewhere():
+    silent = torch.zeros(2, 100, requires_grad=True)
+    filters = htk_filters(8, fft_size=32, sample_rate=8000.0, lowest=0.0, highest=4000.0).float()
+    total = magnitude_stft(silent, fft_size=32, hop=8).sum() + envelope(silent).sum()
+    (total + log_mel(silent, filters, fft_size=32, hop=8, floor=1e-5).sum()).backward()
+    assert silent.grad is not None
+    assert torch.isfinite(silent.grad).all()
+    sound = noise(1, 40).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: magnitude_stft(x, fft_size=16, hop=4), sound)
+    assert torch.autograd.gradcheck(envelope, sound)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 99, 100])
+def test_envelope_is_scipys(samples):
+    sound = noise(3, samples)
+    expected = np.abs(scipy.signal.hilbert(sound.numpy(), axis=1))
+    np.testing.assert_allclose(envelope(sound).numpy(), expected, rtol=0, atol=1e-13)
+
+
+def test_htk_filters_peak_at_even_mels_and_sum_to_one():
+    sample_rate, fft_size = 16000.0, 4096
+    filters = htk_filters(20, fft_size=fft_size, sample_rate=sample_rate, lowest=100.0, highest=7000.0)
+    bins = np.arange(fft_size // 2 + 1) * sample_rate / fft_size
+    mel = 2595 * np.log10(1 + bins[filters.argmax(dim=1).numpy()] / 700)
+    low, high = (2595 * math.log10(1 + f / 700) for f in (100.0, 7000.0))
+    step = (high - low) / 21
+    # A peak is on the bin next to its edge: within half of 3.9 Hz, at most 3 mel at the lowest filter.
+    np.testing.assert_allclose(mel, low + step * np.arange(1, 21), atol=3.0)
+    # Neighboring triangles of height one over common edges add up to one between the first and the last peak.
+    between = (bins > bins[filters[0].argmax()] + 4) & (bins < bins[filters[-1].argmax()] - 4)
+    np.testing.assert_allclose(filters.sum(dim=0).numpy()[between], 1.0, atol=1e-12)
+    assert float(filters[:, bins < 100].abs().sum()) == 0.0
+    assert float(filters[:, bins > 7000].abs().sum()) == 0.0
+
+
+def test_log_mel_is_a_logarithm_above_its_floor():
+    filters = htk_filters(10, fft_size=128, sample_rate=8000.0, lowest=0.0, highest=4000.0)
+    sound = noise(1, 2000)
+    once = log_mel(sound, filters, fft_size=128, hop=32, floor=1e-9)
+    tenfold = log_mel(10 * sound, filters, fft_size=128, hop=32, floor=1e-9)
+    assert torch.allclose(tenfold - once, torch.tensor(math.log(10), dtype=torch.float64), atol=1e-12)
+    silent = log_mel(0 * sound, filters, fft_size=128, hop=32, floor=1e-5)
+    assert torch.allclose(silent, torch.tensor(math.log(1e-5), dtype=torch.float64), atol=1e-12)
+
+
+def test_filters_refuse_a_band_or_a_count_that_the_fft_cannot_give():
+    with raises(ArrayError, name="highest"):
+        htk_filters(10, fft_size=512, sample_rate=8000.0, lowest=0.0, highest=5000.0)
+    with raises(ArrayError, name="count"):
+        htk_filters(80, fft_size=128, sample_rate=44100.0, lowest=0.0, highest=22050.0)
+
+
+FREQUENCY = torch.tensor([310.0, 870.0, 1900.0, 3400.0, 5200.0, 8100.0], dtype=torch.float64)
+GAINS = torch.randn(40, 6, 2, generator=torch.Generator().manual_seed(0))
+
+
+def gains() -> torch.Tensor:
+    return torch.view_as_complex(GAINS)
+
+
+def delayed(values: torch.Tensor, seconds: float) -> torch.Tensor:
+    turns = torch.polar(torch.ones(6, dtype=torch.float64), 2.0 * math.pi * seconds * FREQUENCY)
+    return values.to(torch.complex128) * turns
+
+
+@pytest.mark.parametrize("delay", [0.0, 1e-5, -1.37e-4, 0.98 * LARGEST_DELAY])
+@pytest.mark.parametrize("factor", [1.0, -250.0])
+def test_a_point_has_no_distance_from_its_own_gains_of_any_delay_and_sign(delay: float, factor: float) -> None:
+    found = cosine_distance(gains(), delayed(factor * gains()[7], delay), FREQUENCY)
+    assert int(found.argmin()) == 7
+    assert float(found[7]) < 0.01
+
+
+def test_it_is_the_least_of_a_fine_search_over_delays() -> None:
+    recorded = gains()[3].to(torch.complex128) + 0.7 * gains()[9]
+    delays = torch.linspace(-LARGEST_DELAY, LARGEST_DELAY, 8001, dtype=torch.float64).tolist()
+    turned = torch.stack([delayed(recorded, delay) for delay in delays])
+    own = gains().to(torch.complex128)
+    match = (own.conj() @ turned.T).real.abs().amax(1) / own.norm(dim=1) / recorded.norm()
+    torch.testing.assert_close(cosine_distance(gains(), recorded, FREQUENCY), 1.0 - match, atol=0.01, rtol=0.0)
+
+
+def test_nothing_is_at_the_greatest_distance() -> None:
+    assert bool((cosine_distance(gains(), torch.zeros(6, dtype=torch.complex128), FREQUENCY) == 1.0).all())
+    assert float(cosine_distance(0.0 * gains()[:1], delayed(gains()[0], 0.0), FREQUENCY)) == 1.0

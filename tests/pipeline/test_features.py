@@ -1,16 +1,46 @@
-"""Features as the settings ask for them: what the network reads of what an encoder said."""
+"""Features, outlines and clouds of an object's photographs or mesh."""
 
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 
-from avmsf.errors import SceneError
+from avmsf.capture import CaptureSettings
+from avmsf.capture.settings import METRES
+from avmsf.cli import main
+from avmsf.datasets import CaptureCollection
+from avmsf.errors import CaptureError, SceneError
+from avmsf.evaluation.objects import ObjectInputs
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.lift import Lifted
-from avmsf.pipeline.config import PRESETS, LiftConfig
+from avmsf.field.store import load
+from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
+from avmsf.mesh import Surface, read_surface
+from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.surface import write_surface
+from avmsf.photographs.folder import write_frames
+from avmsf.photographs.mesh_views import MeshTracer
+from avmsf.pipeline.cloud_shape import shape_of_cloud
+from avmsf.pipeline.config import CACHE, PRESETS, SURFACE, LiftConfig
 from avmsf.pipeline.features import finish_features
+from avmsf.pipeline.frame_check import check_outlines, compare_outlines, expect_contacts_in_views
+from avmsf.pipeline.scene import without_far
+from avmsf.pipeline.shape import OFF_MESH, moved_onto
+from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
+from factories.ball_views import MIDDLE, RADIUS
+from factories.clouds import random_cloud
+from factories.plate_capture import fill_plate
 from factories.raising import raises
+from factories.settings import sets
+from factories.small_scene import slab, slab_views
+from factories.sonicgauss_cases import cloud
 
 
 def lifted(features: torch.Tensor) -> Lifted:
@@ -54,3 +84,192 @@ def test_features_that_say_nothing_are_refused() -> None:
     for components in (0, 4):
         with raises(SceneError, name="made", value=300):
             finish_features(lifted(torch.ones(300, 16)), LiftConfig(components=components))
+
+
+VIEWS = slab_views(192)
+
+
+def scaled(factor: float) -> Surface:
+    return Surface(factor * slab().vertices, slab().faces)
+
+
+def test_a_mesh_agrees_with_pictures_of_it_and_a_larger_one_differs_by_its_area() -> None:
+    tracer = MeshTracer(slab())
+    # A mask has the pixels that are more than half covered, an outline those whose middle is.
+    assert compare_outlines(tracer, VIEWS).difference < 0.01
+    # Half the outline's area more; all cameras look from afar at its middle, to which the mesh is moved.
+    middle = (slab().vertices.amax(0) + slab().vertices.amin(0)) / 2
+    grown = Surface(1.5**0.5 * (slab().vertices - middle) + middle, slab().faces)
+    found = compare_outlines(MeshTracer(grown), VIEWS)
+    assert found.difference == pytest.approx(1 / 3, abs=0.04)
+    assert found.size == pytest.approx(1.5**0.5, rel=0.05)
+    assert 0 < found.beyond < found.difference
+
+
+def test_what_the_masks_pixels_or_a_tenth_of_wrong_masks_explain_is_not_spoken_of() -> None:
+    settings = CaptureSettings()
+    wrong = [
+        replace(view, mask=torch.full_like(view.mask, 255)) if row % 10 == 0 else view for row, view in enumerate(VIEWS)
+    ]
+    for surface, views in ((slab(), VIEWS), (scaled(1.01), VIEWS), (slab(), wrong)):
+        assert check_outlines(surface, views, settings) is None
+    assert check_outlines(scaled(2.0), [replace(view, mask=None) for view in VIEWS], settings) is None
+
+
+@pytest.mark.parametrize("surface", [scaled(1.1), scaled(0.9), Surface(slab().vertices + 0.02, slab().faces)])
+def test_a_mesh_of_another_size_or_place_is_told(surface: Surface) -> None:
+    warning = check_outlines(surface, VIEWS, CaptureSettings())
+    assert warning.name == "surface"
+    assert 0.05 < warning.value < 1.0
+
+
+@pytest.mark.parametrize("unit", ["mm", "cm", "in"])
+def test_cameras_or_contacts_in_another_unit_are_refused_with_it(unit: str) -> None:
+    """A mesh and contacts in meters, cameras in another unit that the settings do not name; and the other way round."""
+    settings, factor, contacts = CaptureSettings(), METRES[unit], slab().vertices
+    for each in (factor, 1 / factor):
+        with raises(CaptureError, name="surface_unit", value=pytest.approx(1 / each)):
+            check_outlines(scaled(each), VIEWS, settings)
+    expect_contacts_in_views(contacts, VIEWS, settings)
+    expect_contacts_in_views(contacts / factor, [replace(view, mask=None) for view in VIEWS], settings)
+    with raises(CaptureError, name="unit", value=pytest.approx(factor)):
+        expect_contacts_in_views(contacts / factor, VIEWS, settings)
+
+
+def test_reconstruct_refuses_them_before_it_fits_gaussians(tmp_path: Path) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    write_surface(slab(), folder / "surface.ply")
+    write_frames(slab_views(), folder)
+    with open(folder / "capture.toml", "a") as file:
+        file.write('views_unit = "cm"\n')
+    assert main(["fit", str(folder), "--gain-model", "visual", "--set", "lift.encoder=descriptors"]) == 2
+    assert not (folder / ".avmsf" / "cloud.ply").exists()
+
+
+CELLS = 48
+
+
+def _ball(count: int = 3000, *, opacity: float = 0.95) -> GaussianCloud:
+    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(1))
+    normals = torch.nn.functional.normalize(normals, dim=1)
+    return _discs(torch.tensor(MIDDLE) + RADIUS * normals, normals, opacity=opacity)
+
+
+def _discs(points: torch.Tensor, normals: torch.Tensor, *, opacity: float = 0.95) -> GaussianCloud:
+    start = StartPoints(points, torch.full_like(points, 0.5), normals)
+    return starting_cloud(start, degree=0, scale=1.0, opacity=opacity, flatness=0.1)
+
+
+@pytest.mark.slow
+def test_a_ball_of_gaussians_is_a_closed_ball() -> None:
+    surface = shape_of_cloud(_ball(), cells=CELLS).as_seen()
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    assert mesh.is_watertight
+    off = np.abs(np.linalg.norm(mesh.vertices - np.array(MIDDLE), axis=1) - RADIUS)
+    assert np.median(off) < 0.03 * RADIUS
+
+
+@pytest.mark.slow
+def test_a_slender_bar_is_kept_from_end_to_end() -> None:
+    sides = (0.2, 0.015, 0.003)
+    bar = trimesh.creation.box(sides)
+    points, rows = trimesh.sample.sample_surface(bar, 3000, seed=1)
+    normals = torch.from_numpy(bar.face_normals[rows]).float()
+    surface = shape_of_cloud(_discs(torch.from_numpy(np.asarray(points)).float(), normals), cells=CELLS).as_seen()
+    assert float(surface.vertices[:, 0].max() - surface.vertices[:, 0].min()) == pytest.approx(sides[0], rel=0.05)
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    assert mesh.body_count == 1
+
+
+@pytest.mark.slow
+def test_faint_gaussians_around_the_object_change_nothing() -> None:
+    ball = _ball()
+    haze = replace(ball, centers=torch.tensor(MIDDLE) + 2 * (ball.centers - torch.tensor(MIDDLE)))
+    haze = replace(haze, logit_opacities=torch.full((len(ball),), -4.0))
+    one, other = (shape_of_cloud(each, cells=CELLS).as_seen() for each in (ball, ball.join(haze)))
+    assert torch.equal(one.vertices, other.vertices)
+
+
+def test_gaussians_that_show_no_object_are_refused() -> None:
+    ball = _ball()
+    in_one_place = replace(ball, centers=torch.zeros_like(ball.centers))
+    for wrong, name in ((_ball(opacity=0.01), "opacities"), (_ball(99), "opacities"), (in_one_place, "centers")):
+        with raises(SceneError, name=name):
+            shape_of_cloud(wrong)
+
+
+def test_gaussians_meters_away_are_left_out_and_a_long_thin_object_is_kept_whole() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rod = torch.rand(3000, 3, generator=generator) * torch.tensor([0.4, 0.01, 0.01])
+    far = 3 * torch.randn(90, 3, generator=generator)
+    kept = without_far(random_cloud(torch.cat([rod, far])))
+    assert torch.equal(kept.centers, rod)
+    assert len(without_far(random_cloud(rod))) == 3000
+
+
+SPHERE = trimesh.creation.icosphere(4, 0.1)
+ROUND = Surface(torch.from_numpy(SPHERE.vertices).float(), torch.from_numpy(SPHERE.faces))
+
+
+def gaussians() -> tuple[FeatureField, torch.Tensor]:
+    """Return points about a ball, each with its row as feature, and their distances from the middle."""
+    generator = torch.Generator().manual_seed(0)
+    ways = torch.nn.functional.normalize(torch.randn(600, 3, generator=generator), dim=1)
+    radius = torch.where(torch.arange(600) % 10 == 0, 0.08, 0.1 + 0.002 * torch.randn(600, generator=generator))
+    return FeatureField(radius[:, None] * ways, torch.arange(600.0)[:, None], "rows"), radius
+
+
+def test_points_move_onto_the_mesh_and_those_far_from_it_go() -> None:
+    features, radius = gaussians()
+    moved = moved_onto(features, ROUND)
+    size = 0.2 * 3**0.5
+    kept = torch.nonzero((radius - 0.1).abs() <= OFF_MESH * size).flatten()
+    assert torch.equal(moved.features[:, 0].long(), kept)
+    assert 500 < len(kept) < 560
+    # Triangles of this ball lie up to .2 % of the radius beneath it.
+    assert float((moved.points.norm(dim=1) - 0.1).abs().max()) < 3e-4
+    ways = torch.nn.functional.normalize(features.points[kept], dim=1)
+    assert float((moved.points - 0.1 * ways).norm(dim=1).max()) < 1e-3
+
+
+def test_points_of_another_frame_and_a_cloud_change_nothing() -> None:
+    features, _ = gaussians()
+    far = Surface(ROUND.vertices + 1.0, ROUND.faces)
+    bare = Surface(ROUND.vertices, ROUND.faces[:0])
+    assert moved_onto(features, far) is features
+    assert moved_onto(features, bare) is features
+
+
+def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tmp_path: Path) -> None:
+    for name in ("shown", "hidden"):
+        fill_plate(tmp_path / "set" / name, surface=False)
+    given = cloud(200)
+    write_splats(given, tmp_path / "set" / "shown" / "splats.ply")
+    looks = ObjectInputs(CaptureCollection(tmp_path / "set"), tmp_path / "cache")
+    assert torch.equal(looks.cloud("shown").centers, given.centers)
+    assert torch.equal(looks.cloud("shown", views=12).centers, given.centers)
+    with pytest.raises(SceneError):
+        looks.cloud("hidden")
+
+
+Streams = pytest.CaptureFixture[str]
+
+
+@pytest.mark.slow
+def test_the_thickness_of_a_wall_reaches_the_report(tmp_path: Path, capsys: Streams) -> None:
+    folder = tmp_path / "mug"
+    shutil.copytree(EXAMPLE_FOLDER, folder)
+    words = [*sets("splat.steps=400 splat.start_points=3000 lift.encoder=descriptors")]
+    words += [*sets("lift.symmetry=false fit.steps=2 modes=32"), "--train-count", "12"]
+    bodies = [*sets("body.shapes=16 body.dofs=8000 body.supports=free")]
+    assert main(["fit", str(folder), *words, *bodies, "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    found = made["report"]["thickness"]
+    assert found["low"] < found["median"] < found["high"]
+    assert found["median"] == pytest.approx(EXAMPLE.thickness, rel=0.4)
+    field = load(made["field"])
+    assert field.origin.report["thickness"] == found
+    # Gaussians lie below the surface; the field's points are on it.
+    surface = read_surface(folder / CACHE / SURFACE)
+    nearest = ClosestPoints(surface.vertices.double().numpy()[surface.faces.numpy()])
+    assert nearest(field.gain_field.points.double().numpy()).distances.max() < 1e-6

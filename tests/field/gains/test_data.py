@@ -1,19 +1,36 @@
-"""What gains are fitted to: signs by direction, alignment, and places that are held out."""
+"""What gain models are given, and their fields scaled, refined and held."""
+
+from functools import cache
 
 import pytest
 import torch
 
+from avmsf._utils.text import RecordError
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.features.feature_field import FeatureField
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
+from avmsf.fem.elastic_modes import HeldModes, elastic_modes
+from avmsf.fem.material import NOMINAL, STEEL
+from avmsf.fem.supports import EndPatch, Place, Support, patches_about
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.data import gain_data, orientation_signs
+from avmsf.field.gains.estimator import MixtureEstimator, RefinedGains
 from avmsf.field.gains.mixture_gains import MixtureGains
+from avmsf.field.gains.model import off_surface, off_surface_gains, points_on_object
+from avmsf.field.gains.scaled import BodyGains, ScaledGains
+from avmsf.field.store import load, save
 from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
+from avmsf.modal.modes import ModalBank
+from factories.believing_field import LENGTH, bar, bar_points
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from factories.made_fields import FIELDS, blows, draw, model, places, positional, sounding
 from factories.plate_field import plate_impacts
+from factories.raising import raises
+from oracles.block import block
+from oracles.known_gains import known_gains
 
 
 def _row(count: int) -> torch.Tensor:
@@ -106,3 +123,242 @@ def test_repeats_are_held_out_with_their_places(apart: float) -> None:
     extent = (contacts.amax(0) - contacts.amin(0)).norm()
     again = contacts + apart * extent * torch.tensor([0.0, 0.0, 1.0], dtype=contacts.dtype)
     assert sorted(held_out(torch.cat([contacts, again]), 0.25)) == sorted(once + [row + COUNT for row in once])
+
+
+FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.0, 3.0], dtype=torch.float64)
+PLACES = places(7, seed=8)
+BLOWS = blows(PLACES, seed=9)
+
+
+@pytest.mark.parametrize("name", ["attention with dampings", "positional", "elastic"])
+def test_gains_and_deviations_are_the_inner_fields_times_the_factors(name):
+    inner = FIELDS[name]()
+    scaled = ScaledGains(inner, FACTORS)
+    before, after = (each.predict(PLACES, BLOWS) for each in (inner, scaled))
+    # A float32 number times a factor is rounded once.
+    torch.testing.assert_close(after.parts, before.parts * FACTORS[:, None], rtol=1e-7, atol=0)
+    assert before.damping is None or torch.equal(before.damping, after.damping)
+    assert (before.damping is None) == (after.damping is None)
+    deviations = [each.posterior(PLACES, BLOWS).std for each in (inner, scaled)]
+    assert deviations[0] is None or torch.allclose(
+        deviations[1], deviations[0] * FACTORS.abs().float()[:, None], rtol=1e-6
+    )
+    assert torch.equal(scaled.points, inner.points)
+
+
+@pytest.mark.parametrize("name", ["attention", "positional", "elastic"])
+def test_on_a_larger_object_places_are_where_they_would_be_on_the_small_one(name):
+    inner = FIELDS[name]()
+    large = ScaledGains(inner, torch.ones(5, dtype=torch.float64), 4.0)
+    # Four is a power of two: lengths are not rounded.
+    assert torch.equal(large.points, 4 * inner.points)
+    assert torch.equal(large.predict(4 * PLACES, BLOWS).mean, inner.predict(PLACES, BLOWS).mean)
+    deviations = large.posterior(4 * PLACES, BLOWS).std, inner.posterior(PLACES, BLOWS).std
+    assert deviations == (None, None) or torch.equal(*deviations)
+    assert not torch.equal(large.predict(PLACES, BLOWS).mean, inner.predict(PLACES, BLOWS).mean)
+
+
+def test_of_scaled_gains_the_factors_multiply_and_nothing_nests(tmp_path):
+    inner = FIELDS["positional"]()
+    twice = ScaledGains(ScaledGains(inner, FACTORS, 0.5), 3 * FACTORS, 3.0)
+    assert twice.field is inner
+    assert torch.equal(twice.scale, 3 * FACTORS**2)
+    assert twice.length == 1.5
+    save(sounding(twice), tmp_path / "one")
+    loaded = load(tmp_path / "one").gain_field
+    assert torch.equal(loaded.predict(PLACES).mean, twice.predict(PLACES).mean)
+    assert loaded.length == 1.5
+    assert type(loaded.field) is type(inner)
+
+
+def test_lengths_and_inner_fields_that_cannot_be_are_refused():
+    inner = FIELDS["positional"]()
+    for length in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError):
+            ScaledGains(inner, FACTORS, length)
+    record = ScaledGains(inner, FACTORS).record()
+    with raises(RecordError, name="fitted_kind", value="scaled"):
+        ScaledGains.skeleton(record | {"fitted_kind": "scaled"})
+
+
+HEIGHT = 0.05
+"""Of a false floor above the bar's sheet, meters: an eighth of the length, more than the tolerance."""
+
+
+def closed() -> BodyGains:
+    """Return gains on the bar's sheet whose points lie on the sheet and on a false floor above it."""
+    points = bar_points()
+    return BodyGains(torch.cat([points, points + torch.tensor([0.0, 0.0, HEIGHT])]).float(), bar())
+
+
+def test_a_place_on_a_false_floor_is_off_the_body_by_its_height() -> None:
+    above = torch.tensor([[0.2, 0.05, 0.0], [0.2, 0.05, HEIGHT]])
+    ((row, distance),) = off_surface(above, closed())
+    assert row == 1
+    assert abs(distance - HEIGHT) < 1e-6
+
+
+def test_only_a_body_has_the_gains_of_its_nearest_point() -> None:
+    assert off_surface_gains(closed()) != off_surface_gains(positional())
+    assert off_surface_gains(ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)) == off_surface_gains(
+        closed()
+    )
+
+
+def test_points_of_the_false_floor_are_no_contacts() -> None:
+    assert torch.equal(points_on_object(closed()), bar_points().float())
+    # Gains without a body are known at all of their points.
+    assert torch.equal(points_on_object(positional()), positional().points)
+
+
+def test_an_edited_body_is_scaled() -> None:
+    large = ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)
+    surface = large.surface
+    assert float(surface.vertices[:, 0].max()) == 2.0 * float(torch.tensor(LENGTH))
+    assert len(points_on_object(large)) == len(bar_points())
+    ((_, distance),) = off_surface(torch.tensor([[0.4, 0.1, 2.0 * HEIGHT]]), large)
+    assert abs(distance - 2.0 * HEIGHT) < 1e-6
+    assert positional().surface is None
+
+
+CONTACTS, MODES = 14, 5
+ORDER = torch.tensor([2, 4, 0])
+DAMPING = torch.tensor([12.0, 15.0, 30.0, 22.0, 60.0], dtype=torch.float64)
+
+
+def refined(shift: float = 0.0) -> RefinedGains:
+    bank = ModalBank(torch.linspace(400.0, 3000.0, MODES, dtype=torch.float64), DAMPING)
+    gains = RefinedGains(model(), bank)
+    with torch.no_grad():
+        gains.shift += shift * direction()
+    return gains
+
+
+@cache
+def direction() -> torch.Tensor:
+    return draw(2 * MODES, CONTACTS, 1, seed=4).float()
+
+
+def read(gains: RefinedGains) -> torch.Tensor:
+    found = gains.read(torch.arange(CONTACTS))
+    return found.mean.to(torch.complex128).detach()
+
+
+def mean_at_contacts(gains) -> torch.Tensor:
+    found = gains.predict(gains.contacts, gains.training.directions)
+    return found.mean.to(torch.complex128)
+
+
+def test_gains_start_as_the_models_mean_at_the_contacts():
+    assert torch.allclose(read(refined()), mean_at_contacts(model()), rtol=1e-4, atol=1e-4)
+    assert torch.equal(refined().finished(torch.arange(MODES)).values, model().values)
+    assert float(refined().penalty().detach()) == 0.0
+
+
+def test_a_shift_reads_as_the_model_of_the_moved_values():
+    gains = refined(0.01)
+    finished = gains.finished(torch.arange(MODES))
+    assert float((finished.values - model().values).abs().max()) > 0.1
+    assert torch.allclose(read(gains), mean_at_contacts(finished), rtol=1e-4, atol=1e-3)
+
+
+def test_a_shift_of_one_two_hundredth_moves_a_value_by_its_standard_error():
+    gains = refined()
+    with torch.no_grad():
+        gains.shift[1, 6] = 1.0 / 200.0
+        gains.shift[MODES + 3, 2] = -1.0 / 200.0
+    moved = torch.view_as_real(gains.finished(torch.arange(MODES)).values - model().values)
+    expected = torch.zeros_like(moved)
+    expected[6, 1, 0], expected[2, 3, 1] = model().noise()[1, 0], -model().noise()[3, 1]
+    assert torch.allclose(moved, expected, rtol=1e-5, atol=1e-9)
+
+
+def test_a_shift_costs_its_squares_by_the_modes_energy():
+    """A mode's energy is its mean square over its damping, as it sounds."""
+    share = model().values.abs().square().sum(0) / DAMPING
+    share /= share.sum()
+    gains = refined(0.01)
+    with torch.no_grad():
+        # The second mode has nearly all of the energy.
+        gains.shift[[1, MODES + 1]] = 0.0
+    squares = (200.0 * gains.shift.detach().double()).square().reshape(2, MODES, -1).mean((0, 2))
+    assert float(gains.penalty().detach()) == pytest.approx(float(0.05 * (squares * share).sum()), rel=1e-5)
+
+
+def test_the_finished_model_is_judged_by_the_measured_gains_of_its_recordings():
+    """Turned by the phase, one for each mode, that suits the model best."""
+    gains = refined(0.01)
+    finished = gains.finished(ORDER)
+    turn = torch.exp(1j * torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64))
+    judged = gains.finished(ORDER, finished.values * turn)
+    assert torch.equal(judged.values, finished.values)
+    assert torch.allclose(judged.measured, finished.values, rtol=1e-9)
+
+
+SIDES = (0.24, 0.16, 0.003)
+
+
+class Plate(CandidateBodies):
+    """A coarse plate of nominal material, which may be held."""
+
+    supports = "try"
+
+    def __init__(self, held_at: tuple[Place, ...] = ()) -> None:
+        super().__init__([CandidateBody(None, held_modes(held_at).free)])
+        self.held_at = held_at
+
+    def held(self, body: CandidateBody) -> HeldModes:
+        return held_modes(tuple(self.held_at))
+
+
+@cache
+def held_modes(held_at: tuple[Place, ...]) -> HeldModes:
+    return HeldModes(block(SIDES, (9, 6, 1)), NOMINAL, count=16, patches=patches_about(held_at) or None)
+
+
+LEFT, RIGHT = EndPatch("left", (-1.0, 0.0, 0.0)), EndPatch("right", (1.0, 0.0, 0.0))
+AT = {LEFT: "its end at (0, 80, 2) mm", RIGHT: "its end at (240, 80, 2) mm"}
+
+
+@pytest.mark.parametrize(("sides", "stiffness"), [((), 0.0), ((LEFT,), 2e5), ((LEFT,), 1e10), ((LEFT, RIGHT), 2e6)])
+def test_the_support_of_a_plate_is_found(sides: tuple[EndPatch, ...], stiffness: float):
+    solid = block(SIDES, (13, 8, 1))
+    uneven = 1.0 + 0.5 * solid.points[solid.cells].mean(1)[:, 0]
+    support = Support(sides, stiffness) if sides else None
+    true = elastic_modes(solid, STEEL, count=12, stiffness_factor=uneven, support=support)
+    model, _ = MixtureEstimator(bodies=Plate()).solve(known_gains(true)[0])
+    found = model.report["bodies"][0]
+    assert model.report["supports_tried"]
+    assert set(found["support"].removeprefix("held at ").split(" and ")) == ({AT[each] for each in sides} or {"free"})
+    # In the unit of the nominal material, whose plate is not the true one.
+    assert found["support_stiffness"] is None or found["support_stiffness"] > 0.1 * min(stiffness, 1e6)
+
+
+def test_a_plate_is_held_where_its_user_says():
+    feet = ((0.04, 0.0267, 0.0), (0.2, 0.08, 0.0))
+    support = Support(tuple(patches_about(feet)), 1e10)
+    true = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12, support=support)
+    report = MixtureEstimator(bodies=Plate(feet)).solve(known_gains(true)[0])[0].report
+    assert report["support_evidence"]["held"] > report["support_evidence"]["free"]
+    found = report["bodies"][0]
+    assert found["support"] == "held at (40, 27, 0) mm and (200, 80, 0) mm"
+    assert found["support_stiffness"] > 1e6
+    assert found["frequency_factor"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_free_plate_that_is_said_to_be_held_fits_better_free():
+    free = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12)
+    report = MixtureEstimator(bodies=Plate(((0.12, 0.08, 0.0),))).solve(known_gains(free)[0])[0].report
+    assert report["bodies"][0]["support"] == "held at (120, 80, 0) mm"
+    assert report["support_evidence"]["held"] < report["support_evidence"]["free"]
+
+
+def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(Plate, "held", lambda plate, body: asked.append(body))
+    monkeypatch.setattr(Plate, "supports", "auto")
+    case = known_gains(elastic_modes(block(SIDES, (9, 6, 1)), NOMINAL, count=12))[0]
+    model, _ = MixtureEstimator(bodies=Plate()).solve(case)
+    assert model.report["credibility"]["credible"]
+    assert not model.report["supports_tried"]
+    assert asked == []

@@ -216,16 +216,12 @@ def test_a_plate_bends_if_its_places_are_many_not_its_contacts():
     assert torch.allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
-def object_points() -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a line of points whose features repeat after half of it."""
-    along = torch.linspace(0.0, 1.0, 41)[:-1]
-    angle = 4 * torch.pi * along
-    return along[:, None] * torch.tensor([1.0, 0.0, 0.0]), torch.stack([angle.cos(), angle.sin()], dim=1)
-
-
 def test_visual_kernels_are_the_written_ones():
     """Features by the root mean square distance between those of points, alone and times those of positions."""
-    points, features = object_points()
+    # A line whose features repeat after half of it.
+    along = torch.linspace(0.0, 1.0, 41)[:-1]
+    points = along[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    features = torch.stack([(4 * torch.pi * along).cos(), (4 * torch.pi * along).sin()], dim=1)
     known = alike(points[::7].double())
     squares = torch.cdist(features.double(), features.double()).square()
     similar = [torch.exp(-0.5 * squares / squares.mean() / length**2)[::7, ::7] for length in (0.25, 0.5, 1.0)]

@@ -46,11 +46,6 @@ def recorded(sounds: Tensor) -> tuple[Extraction, Impacts]:
 ONES, TIME = torch.ones(COUNT, dtype=torch.float64), torch.arange(-LEAD, SAMPLES)[:, None] / SAMPLES
 
 
-def gained_automatically(sounds: Tensor) -> Tensor:
-    """Turn the gain down by 26 dB at the impact, and up again within .1 s."""
-    return sounds * torch.where(TIME < 0, 1.0, 1 - 0.95 * torch.exp(-TIME.clamp(min=0) * SAMPLES / RATE / 0.1))
-
-
 def test_right_recordings_have_no_fault() -> None:
     modes, impacts = recorded(files(ONES))
     aligned = modes.aligned(impacts)
@@ -79,7 +74,9 @@ def test_a_fade_out_and_a_noise_gate_are_no_decays() -> None:
 
 
 def test_an_automatic_gain_leaves_less_noise_after_the_impact_than_before() -> None:
-    modes, impacts = recorded(gained_automatically(files(ONES)))
+    # Turned down by 26 dB at the impact, and up again within .1 s.
+    gain = torch.where(TIME < 0, 1.0, 1 - 0.95 * torch.exp(-TIME.clamp(min=0) * SAMPLES / RATE / 0.1))
+    modes, impacts = recorded(gain * files(ONES))
     found = noise_drop(modes, impacts)
     assert found is not None
     assert 3.0 < found < 26.0
