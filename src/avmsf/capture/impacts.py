@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, no_type_check
+from typing import Any
 
 import numpy as np
 import scipy
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_numbers, as_rate, as_rows, as_vectors
 from avmsf._utils.caching import content_digest
-from avmsf._utils.compiled import compiled
 from avmsf.errors import ArrayError
 
 SAME_PLACE = 0.01
@@ -22,8 +21,6 @@ _SINC_HALF_WIDTH = 32
 """Samples on either side that a value between two samples is interpolated from."""
 _WHOLE_SAMPLE = 1e-3
 """Samples below which a fraction is not worth interpolating: it turns a mode at half the rate by .003 rad."""
-_BLOCK = 1024
-"""Samples that are interpolated at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,29 +160,10 @@ def _cut(
     between = torch.sinc(distance) * torch.special.i0(shape) / float(np.i0(8.0))
     kernels = torch.where(offset.abs() < _WHOLE_SAMPLE, (taps == 0).double(), between)
     sounds = signals.new_empty(len(signals), samples)
-    _filter(signals.numpy(), kernels.numpy(), whole.long().numpy() - _SINC_HALF_WIDTH, sounds.numpy())
+    frames = np.arange(-_SINC_HALF_WIDTH, samples + _SINC_HALF_WIDTH)
+    for row, first in enumerate(whole.long().tolist()):
+        held = (first + frames >= 0) & (first + frames < signals.shape[1])
+        padded = np.zeros(len(frames))
+        padded[held] = signals[row].numpy()[first + frames[held]]
+        sounds[row] = torch.from_numpy(np.correlate(padded, kernels[row].numpy(), "valid"))
     return sounds
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
-@no_type_check
-def _filter(signals, kernels, starts, sounds):
-    """Write the sums over taps of kernel times signal, from each start on; a signal is zero outside its frames.
-
-    Block by block, whose sums stay in the processor's fastest memory.
-    """
-    frames, samples = signals.shape[1], sounds.shape[1]
-    total = np.empty(_BLOCK)
-    for row in range(len(signals)):
-        for begin in range(0, samples, _BLOCK):
-            count = min(_BLOCK, samples - begin)
-            total[:] = 0.0
-            for tap in range(kernels.shape[1]):
-                weight, first = kernels[row, tap], starts[row] + begin + tap
-                low, high = max(0, -first), min(count, frames - first)
-                if weight != 0.0 and low < high:
-                    part, inside = total[low:high], signals[row, first + low : first + high]
-                    for step in range(len(part)):
-                        part[step] += weight * inside[step]
-            for step in range(count):
-                sounds[row, begin + step] = total[step]
