@@ -5,7 +5,6 @@ And one of warnings, `AvmsfWarning`: what goes on all the same, and the user sho
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
@@ -70,6 +69,10 @@ class _Located(Exception):  # noqa: N818 - warnings have it too
         """The four attributes by name, for an error that passes this one on."""
         return {"file": self.file, "row": self.row, "name": self.name, "value": self.value}
 
+    def about(self: _Kind, file: Path) -> _Kind:
+        """Return the same about a file, with which the message then begins."""
+        return type(self)(f"{file}: {self}", **{**self.attributes, "file": file})
+
 
 class AvmsfError(_Located):
     """Something the user gave cannot be used; the message says what was expected, what was found and what to do.
@@ -107,19 +110,6 @@ class PositionWarning(AvmsfWarning):
 
 class CaptureWarning(AvmsfWarning):
     """A capture was read, but a recording or a contact in it is probably wrong; the message says what to do."""
-
-
-@dataclass(frozen=True)
-class Note:
-    """What looks wrong in a file, before the file's name is known."""
-
-    message: str
-    name: str | None = None
-    value: Any = None
-
-    def about(self, file: Path) -> CaptureWarning:
-        """Return the warning, whose message begins with the file."""
-        return CaptureWarning(f"{file}: {self.message}", file=file, name=self.name, value=self.value)
 
 
 class CaptureError(AvmsfError):

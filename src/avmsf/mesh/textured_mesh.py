@@ -15,7 +15,7 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from avmsf.errors import CaptureError, Note
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.io import check_area, check_corners, check_finite_vertices, load_parts
 from avmsf.mesh.surface import Surface
 
@@ -157,10 +157,10 @@ class _Paint:
     colors: np.ndarray
     coordinates: np.ndarray
     texture: np.ndarray
-    remark: Note | None = None
+    remark: CaptureWarning | None = None
 
 
-_COLORLESS = Note("has neither texture nor colors; it is rendered gray", name="colors")
+_COLORLESS = CaptureWarning("has neither texture nor colors; it is rendered gray", name="colors")
 
 
 def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
@@ -183,7 +183,7 @@ def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
         try:
             texture = np.array(image.convert("RGB"))
         except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises for images that are cut or corrupt
-            remark = Note(f"its texture cannot be read ({error}); it is rendered gray", name="texture")
+            remark = CaptureWarning(f"its texture cannot be read ({error}); it is rendered gray", name="texture")
             return _Paint(gray, nowhere, white, remark)
         coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
         tint = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
@@ -191,7 +191,7 @@ def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
     name = str(getattr(material, "name", ""))
     if name in lacking:
         message = f"its texture {lacking[name]} is missing; the part is rendered gray"
-        return _Paint(gray, nowhere, white, Note(message, name="texture", value=lacking[name]))
+        return _Paint(gray, nowhere, white, CaptureWarning(message, name="texture", value=lacking[name]))
     if factor is None and "kd" not in getattr(material, "kwargs", {}):
         return _Paint(gray, nowhere, white, _COLORLESS)
     tint = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avmsf._utils.files import new_folder
 from avmsf._utils.text import counted, listed
-from avmsf.errors import CaptureError, Note
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import colmap, nerf_json
 from avmsf.photographs.cameras import MIN_VIEWS, Camera, View, nearest_to_lines
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap
@@ -74,12 +74,12 @@ def read_views(
         wanted, got = "masks with 255 on the object and 0 elsewhere", f"{len(photographs)} without an object"
         raise CaptureError.expected(wanted, 0, got=got, file=cameras.path, name="masks")
     remarks = [
-        Note(f"{counted(len(names), thing)} {message}: {listed(names)}", kind, names)
+        CaptureWarning(f"{counted(len(names), thing)} {message}: {listed(names)}", name=kind, value=names)
         for kind, (thing, message) in KINDS.items()
         if (names := findings[kind])
     ]
     if len(views) < MIN_VIEWS:
-        reasons = "".join(f"; {remark.message}" for remark in remarks)
+        reasons = "".join(f"; {remark}" for remark in remarks)
         place = f" (expected {photographs[0].image} and so on)" if findings["missing images"] else ""
         got = f"{len(views)} of {len(photographs)} that can be used{reasons}{place}"
         raise CaptureError.expected(f"at least {MIN_VIEWS} views", len(views), got=got, file=cameras.path, name="views")
@@ -196,7 +196,7 @@ def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(large[1] / factor - small[1]) <= 1
 
 
-def check_cameras(cameras: Sequence[Camera]) -> list[Note]:
+def check_cameras(cameras: Sequence[Camera]) -> list[CaptureWarning]:
     """Return remarks on the positions and axes of the cameras together."""
     positions = np.array([camera.position.tolist() for camera in cameras])
     axes = np.array([camera.world_to_camera[2, :3].tolist() for camera in cameras])
@@ -204,7 +204,7 @@ def check_cameras(cameras: Sequence[Camera]) -> list[Note]:
     if spread <= 1e-6 * float(np.linalg.norm(positions, axis=1).max()) + 1e-12:
         position = np.round(positions[0], 6).tolist()
         message = f"expected cameras at several positions, got all {len(cameras)} at {position}; check the camera file"
-        return [Note(message, name="positions", value=position)]
+        return [CaptureWarning(message, name="positions", value=position)]
     center = nearest_to_lines(positions, axes)
     if center is None:
         return []
@@ -216,7 +216,7 @@ def check_cameras(cameras: Sequence[Camera]) -> list[Note]:
         f"{np.round(center, 4).tolist()}: the axes are probably OpenCV's where OpenGL's are expected or the other way "
         "round, or the poses are inverted"
     )
-    return [Note(message, name="axes", value=behind)]
+    return [CaptureWarning(message, name="axes", value=behind)]
 
 
 def read_sparse_points(

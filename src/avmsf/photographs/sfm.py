@@ -17,7 +17,7 @@ from avmsf._utils.files import temporary_path, unwritable
 from avmsf._utils.processes import end_child, ending_of, start_child
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
-from avmsf.errors import CaptureError, Note
+from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs.folder import mask_paths
 from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, size_of
 
@@ -172,7 +172,7 @@ def _stage_and_lines(log: Path, count: int = 6) -> tuple[str, str]:
 
 def _check_groups(
     groups: Sequence[Sequence[str]], unreadable: Sequence[str], everything: Sequence[str], images: Path
-) -> list[Note]:
+) -> list[CaptureWarning]:
     """Return remarks on the images without a camera in the first and largest group; raise CaptureError for too many."""
     largest = set(groups[0]) if groups else set()
     if len(largest) < max(MIN_IMAGES, MIN_REGISTERED_RATIO * len(everything)):
@@ -191,8 +191,8 @@ def _check_groups(
     unread = f"{counted(len(unreadable), 'image')} not used, as they cannot be read: {listed(unreadable, most=8)}"
     alone = f"no camera was found for {counted(len(unseen), 'image')}: {listed(unseen, most=8)}"
     remarks = [
-        Note(unread, "unreadable images", unreadable),
-        Note(f"{split} images, is used, without {lost}", "groups", others),
-        Note(alone, "cameras", unseen),
+        CaptureWarning(unread, name="unreadable images", value=unreadable),
+        CaptureWarning(f"{split} images, is used, without {lost}", name="groups", value=others),
+        CaptureWarning(alone, name="cameras", value=unseen),
     ]
     return [remark for remark in remarks if remark.value]

@@ -124,7 +124,7 @@ def expect_contacts_in_views(
             words: _share_inside(contacts, changed) * bool(_hull(changed)) for words, changed in _conventions(chosen)
         }
         likely = max(shares, key=shares.__getitem__)
-        found = [remark.message for remark in check_cameras([view.camera for view in chosen])]
+        found = list(map(str, check_cameras([view.camera for view in chosen])))
         found += [f"they show the contacts once {likely}"] if 2 * shares[likely] > 1 else []
         # Cubes may miss what is thin: by itself that says nothing.
         if found:
