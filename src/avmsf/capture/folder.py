@@ -4,6 +4,7 @@ import json
 import warnings
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -175,41 +176,32 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     then finds the onsets, and keeps this many seconds from each on; without it they are final, and are not aligned when
     they are read. Raises `CaptureError` where the folder exists and is not empty, or cannot be written.
     """
-    folder = Path(folder)
-    with new_folder(folder, raising=CaptureError) as begun:
-        _write_files(capture, begun, onsets_within=onsets_within)
-
-
-def _write_files(capture: Capture, folder: Path, *, onsets_within: float | None) -> None:
-    impacts = capture.impacts
-    names = _file_names(impacts.names)
+    impacts, names = capture.impacts, _file_names(capture.impacts.names)
     rate, speed = _whole_rate(impacts.sample_rate)
-    for name, sound in zip(names, impacts.sounds.numpy(), strict=True):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        # Soundfile's own error of a full disk does not say that it is full.
-        (folder / name).write_bytes(wav_bytes(sound, rate))
-    header, columns = list(REQUIRED), [impacts.contacts]
-    if impacts.directions is not None:
-        header, columns = [*header, *DIRECTION], [*columns, impacts.directions]
-    if impacts.forces is not None:
-        header, columns = [*header, FORCE], [*columns, impacts.forces[:, None]]
+    parts = ((REQUIRED, impacts.contacts), (DIRECTION, impacts.directions), ((FORCE,), impacts.forces))
+    known = {columns: each.reshape(len(impacts), -1) for columns, each in parts if each is not None}
     # Seventeen digits hold a float64 exactly.
-    digits = [[f"{value:.17g}" for value in values] for values in torch.cat(columns, dim=1).tolist()]
-    table = csv_text([header, *([name, *cells] for name, cells in zip(names, digits, strict=True))])
-    (folder / TABLE).write_text(table, encoding="utf-8", newline="")
-    if capture.surface is not None:
-        write_surface(capture.surface, folder / "surface.ply")
+    digits = [[f"{value:.17g}" for value in values] for values in torch.cat([*known.values()], dim=1).tolist()]
+    rows = [[*chain(*known)], *([name, *cells] for name, cells in zip(names, digits, strict=True))]
     # TOML's strings are JSON's, but for the character 127.
-    name = json.dumps(capture.name, ensure_ascii=False).replace("\x7f", "\\u007f")
+    title = json.dumps(capture.name, ensure_ascii=False).replace("\x7f", "\\u007f")
     seconds = impacts.sounds.shape[1] / rate if onsets_within is None else onsets_within
-    (folder / SETTINGS).write_text(
-        f"name = {name}\n"
+    settings = (
+        f"name = {title}\n"
         f"seconds = {seconds!r}\n"
         f"playback_speed = {speed!r}\n"
         f'normalize = "{"none" if impacts.forces is None else "done"}"\n'
-        + ("align = false\n" if onsets_within is None else ""),
-        encoding="utf-8",
+        + ("align = false\n" if onsets_within is None else "")
     )
+    with new_folder(Path(folder), raising=CaptureError) as begun:
+        for name, sound in zip(names, impacts.sounds.numpy(), strict=True):
+            (begun / name).parent.mkdir(parents=True, exist_ok=True)
+            # Soundfile's own error of a full disk does not say that it is full.
+            (begun / name).write_bytes(wav_bytes(sound, rate))
+        (begun / TABLE).write_text(csv_text(rows), encoding="utf-8", newline="")
+        (begun / SETTINGS).write_text(settings, encoding="utf-8")
+        if capture.surface is not None:
+            write_surface(capture.surface, begun / "surface.ply")
 
 
 def _file_names(names: tuple[str, ...]) -> list[str]:
