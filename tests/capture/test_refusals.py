@@ -151,7 +151,7 @@ OTHERS: list[tuple[dict[str, Any], str | None, int | None, str | None, Any]] = [
         {"rows": ("takes/rim.wav,0,0,0", "rim.wav,1,0,0"), "replace": {"takes/rim.wav": ring()}},
         *("rim.wav", None, None, None),
     ),
-    ({"rows": ("a" * 300 + ".wav,0,0,0", *ROWS)}, None, None, None, "a" * 300 + ".wav"),
+    ({"rows": ("a" * 300 + ".wav,0,0,0", *ROWS)}, "a" * 300 + ".wav", None, None, None),
     ({"replace": IN_TAKES}, None, None, "file", ["a.wav", "b.wav", "c.wav"]),
 ]
 """Folders, and the file, row, name and value of the error."""

@@ -2,6 +2,7 @@
 
 import io
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -143,18 +144,13 @@ def read_recording(path: Path, name: str | None = None) -> Recording:
     are not numbers or larger than `MAX_PEAK`.
     """
     name = name or str(path)
-    try:
-        if path.is_dir():
-            raise CaptureError(f"{name}: expected a sound file, got a folder; name a file in it", file=path)
-        if not path.is_file():
-            near = similar_name(path.name, (each.name for each in path.parent.glob("*")))
-            message = (
-                f"{name}: expected a sound file, got none; {f'did you mean {near}?' if near else 'check the path'}"
-            )
-            raise CaptureError(message, file=path, value=near)
-    except OSError as error:
-        message = f"{name[:80]}…: expected the name of a sound file, got {error.strerror!r}; shorten it"
-        raise CaptureError(message, file=path, value=name) from error
+    if os.path.isdir(path):
+        raise CaptureError.expected("a sound file", got="a folder", file=name, advice="name a file in it")
+    # Unlike Path.is_file, this is False for what no file can be called.
+    if not os.path.isfile(path):
+        near = similar_name(path.name, (each.name for each in path.parent.glob("*")))
+        advice = f"did you mean {near}?" if near else "check the path"
+        raise CaptureError.expected("a sound file", near, got="none", file=name, advice=advice)
     if is_lfs_pointer(path):
         raise CaptureError.expected("a sound file", got="a Git LFS pointer", file=name, advice="run git lfs pull")
     return decode_recording(path, name)

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import os
 import re
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -174,7 +175,7 @@ def read_rows(folder: Path) -> tuple[list[Row], list[CaptureWarning]]:
 
 def _as_on_disk(folder: Path, file: str) -> str:
     """Return the name of a file that exists and has the same letters, composed or decomposed; else the name given."""
-    if file.isascii() or not _is_missing(folder / file):
+    if file.isascii() or os.path.exists(folder / file):
         return file
     wanted = unicodedata.normalize("NFC", file.replace("\\", "/"))
     names = (path.relative_to(folder).as_posix() for path in files_in(folder))
@@ -253,7 +254,7 @@ def read_impacts(folder: Path, settings: CaptureSettings, issues: Issues) -> lis
 
 def present_impacts(folder: Path, impacts: Sequence[Impact], issues: Issues) -> list[Impact]:
     """Return the impacts whose recordings exist; `issues` raise or collect the error of the others."""
-    missing = dict.fromkeys(each.file for each in impacts if _is_missing(folder / each.file))
+    missing = dict.fromkeys(each.file for each in impacts if not os.path.exists(folder / each.file))
     if missing:
         with issues.keep(*((each.file, each.line) for each in impacts if each.file in missing)):
             raise _missing_error(folder, {each.file for each in impacts}, list(missing))
@@ -298,14 +299,6 @@ def _missing_error(folder: Path, files: Collection[str], missing: Sequence[str])
     got = f"none for {len(missing)} of {len(files)} ({listed(missing)})"
     advice = advice if near else "copy them there, or correct their names"
     return CaptureError.expected("a file for each row", missing, got=got, file=TABLE, name="file", advice=advice)
-
-
-def _is_missing(path: Path) -> bool:
-    """Return whether nothing is at a path; a name that no file can have is left to the reader of sound files."""
-    try:
-        return not path.exists()
-    except OSError:
-        return False
 
 
 def fitting_units(written: float) -> str:
