@@ -134,9 +134,7 @@ class Gate(BaseHTTPRequestHandler):
 
 
 @pytest.mark.parametrize("code", [401, 404, 503, None])
-def test_why_a_model_cannot_be_had_is_the_servers_code_or_that_there_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int | None
-) -> None:
+def test_why_a_model_cannot_be_had_is_the_servers_code_or_that_there_is_none(tmp_path, monkeypatch, code):
     client = pytest.importorskip("huggingface_hub")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     with HTTPServer(("127.0.0.1", 0), Gate) as server:

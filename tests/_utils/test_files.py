@@ -34,9 +34,7 @@ def test_a_file_in_a_folders_place_and_a_folder_in_a_files_are_told_apart(tmp_pa
     assert len({way_out(OSError(number, "")) for number in numbers}) == len(numbers)
 
 
-def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(tmp_path, monkeypatch):
     changed: list[int] = []
     before = os.umask(0o027)
     try:
@@ -188,8 +186,8 @@ def test_where_nothing_can_be_written_there_is_no_lock_and_no_error(tmp_path: Pa
     ],
 )
 def test_only_where_nobody_can_write_a_lock_that_cannot_be_opened_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, writable: bool, held: bool
-) -> None:
+    tmp_path, monkeypatch, number, writable, held
+):
     def refuse(path: str, *rest: int, **named: int) -> int:
         raise OSError(number, os.strerror(number), path)
 
@@ -200,9 +198,7 @@ def test_only_where_nobody_can_write_a_lock_that_cannot_be_opened_is_none(
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_disk_without_locks_gets_no_file_that_outlives_its_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
+def test_a_disk_without_locks_gets_no_file_that_outlives_its_process(tmp_path, monkeypatch, number):
     def refuse(descriptor: int, operation: int) -> None:
         raise OSError(number, os.strerror(number))
 

@@ -104,9 +104,7 @@ def test_beating_and_room_noise_are_no_second_blow() -> None:
         ("aircraft_response/impacts", 0.0, 0.015, 0.015),
     ],
 )
-def test_measured_single_blows_raise_no_alarm(
-    shared: Path, folder: str, earliest: float, latest: float, spread: float
-) -> None:
+def test_measured_single_blows_raise_no_alarm(shared, folder, earliest, latest, spread):
     onsets = []
     for path in sorted((shared / folder).glob("*.wav")):
         recording = read_recording(path)

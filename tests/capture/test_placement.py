@@ -89,9 +89,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("factor", "axes", "shift", "words", "misplaced"), MISTAKES.values(), ids=MISTAKES)
-def test_what_befell_all_contacts_is_named_with_its_undoing(
-    factor: float, axes: torch.Tensor, shift: tuple[float, ...], words: str, misplaced: bool
-) -> None:
+def test_what_befell_all_contacts_is_named_with_its_undoing(factor, axes, shift, words, misplaced):
     contacts = (CONTACTS - torch.tensor(shift, dtype=torch.float64)) @ axes / factor
     placement = check_placement(contacts, CLOUD)
     mismatch = placement.mismatch

@@ -303,9 +303,7 @@ def test_measured_impulse_responses_are_not_cut(shared: Path, name: str) -> None
         ("aircraft/impacts", CaptureSettings(response_channel=2)),
     ],
 )
-def test_measured_recordings_with_something_before_the_impact_are_cut(
-    shared: Path, name: str, settings: CaptureSettings
-) -> None:
+def test_measured_recordings_with_something_before_the_impact_are_cut(shared, name, settings):
     recordings = [read_recording(path) for path in sorted((shared / name).glob("*.wav"))]
     prepared = [prepare(each, settings) for each in recordings]
     assert not start_with_impact(prepared)

@@ -54,9 +54,7 @@ def rumbling(
     ],
     ids=["rumble", "octave", "sway", "nothing before", "the object's", "below the noise", "soft", "above"],
 )
-def test_a_highpass_is_proposed_for_rumble_before_the_impact(
-    tmp_path: Path, level: float, frequency: float, others: dict[str, float], proposed: float | None
-) -> None:
+def test_a_highpass_is_proposed_for_rumble_before_the_impact(tmp_path, level, frequency, others, proposed):
     assert found(folder_of(tmp_path, rumbling(level, frequency, **others))).get("highpass") == proposed
 
 
@@ -165,9 +163,7 @@ def test_what_cannot_be_read_is_passed_over(tmp_path: Path) -> None:
         ("in", "mm", {"unit": "in", "surface_unit": "mm"}),
     ],
 )
-def test_both_units_are_found_from_the_contacts_and_the_surface(
-    tmp_path: Path, contacts: str, surface: str, proposed: dict[str, object]
-) -> None:
+def test_both_units_are_found_from_the_contacts_and_the_surface(tmp_path, contacts, surface, proposed):
     box = trimesh.creation.box((0.24, 0.16, 0.12))
     places = trimesh.sample.sample_surface(box, 12, seed=0)[0] / METRES[contacts]
     names = [f"{number:02}.wav" for number in range(len(places))]

@@ -84,9 +84,7 @@ def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_photographs_alone_need_structure_from_motion(
-    tmp_path: Path, installed: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_alone_need_structure_from_motion(tmp_path, installed, monkeypatch):
     for name in "abc":
         write_image(tmp_path / "images" / f"{name}.jpg")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
@@ -218,9 +216,7 @@ def test_the_unit_of_contacts_is_found_from_photographs(tmp_path: Path, capsys: 
         ("table.xlsx", "impacts.csv"),
     ],
 )
-def test_a_file_that_looks_like_an_input_and_is_not_used_is_named_and_ends_a_fit(
-    tmp_path: Path, name: str, advice: str, capsys: Streams
-) -> None:
+def test_a_file_that_looks_like_an_input_and_is_not_used_is_named_and_ends_a_fit(tmp_path, name, advice, capsys):
     folder = fill_plate(tmp_path / "plate")
     (folder / "surface.obj").unlink(missing_ok=True)
     (folder / "surface.ply").unlink(missing_ok=True)

@@ -149,9 +149,7 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
     assert {"modes.png", "gains.png", "spectrograms.png"} <= {each.name for each in (tmp_path / "plots").iterdir()}
 
 
-def test_the_paper_leaves_visual_features_out_only_if_that_is_allowed(
-    capture: Path, tmp_path: Path, capsys: Streams
-) -> None:
+def test_the_paper_leaves_visual_features_out_only_if_that_is_allowed(capture, tmp_path, capsys):
     words = ["fit", str(capture), "--preset", "paper", "--without-shape", "--cache", str(tmp_path), *TINY]
     with raises(FitError, name="features"):
         run_verb(*words)

@@ -92,9 +92,7 @@ COMMANDS = ("check", "modes", "fit -o OUT.safetensors", *(f"fit --until {stage}"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_names_the_unit_of_the_mesh_and_writes_nothing(
-    command: str, tmp_path: Path, capsys: Streams
-) -> None:
+def test_every_command_names_the_unit_of_the_mesh_and_writes_nothing(command, tmp_path, capsys):
     # Contacts in meters, and a mesh in a unit that the settings do not name.
     folder = fill_plate(tmp_path / "plate", surface=False)
     write_surface_file(folder)

@@ -130,9 +130,7 @@ def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(fie
         assert "850 Hz" in str(caught.value)
 
 
-def test_towards_a_recording_and_an_interrupted_edit_goes_on(
-    field: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_towards_a_recording_and_an_interrupted_edit_goes_on(field, capsys, monkeypatch):
     target = adjust_modes(ceramic(), pitch=1.3).render(PLACES[:1])[0]
     soundfile.write(field.with_name("like.wav"), torch.cat([torch.zeros(800), target]).numpy() / 50, int(RATE))
     words = ["--like", str(field.with_name("like.wav"))]
@@ -268,9 +266,7 @@ WRONG: dict[str, tuple[str | None, object]] = {
 
 
 @pytest.mark.parametrize("words", WRONG)
-def test_what_cannot_be_done_is_refused_before_a_model_is_loaded(
-    words: str, field: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_done_is_refused_before_a_model_is_loaded(words, field, monkeypatch):
     monkeypatch.setattr(StableAudio, "load", lambda *_, **__: pytest.fail("a model was loaded"))
     name, value = WRONG[words]
     with raises(AvmsfError, name=name, value=value):

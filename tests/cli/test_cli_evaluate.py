@@ -83,9 +83,7 @@ def test_files_are_of_one_set_of_training_recordings(plates: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("words", WRONG)
-def test_what_is_wrong_is_said_before_anything_is_written(
-    words: str, plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_wrong_is_said_before_anything_is_written(words, plates, tmp_path, monkeypatch):
     monkeypatch.chdir(plates.parent)
     before = sorted(path.name for path in plates.parent.iterdir())
     name, value = WRONG[words]
@@ -96,9 +94,7 @@ def test_what_is_wrong_is_said_before_anything_is_written(
     assert sorted(path.name for path in plates.parent.iterdir()) == before
 
 
-def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked_for(
-    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_methods_hear_the_start_of_sounds_and_share_the_modes_that_are_asked_for(tmp_path, capsys, monkeypatch):
     plates, results = fill_plates(tmp_path / "plates", ("a",), truth=True), tmp_path / "results"
     words = ["farthest", str(plates), "--methods", "knn-gains,paper", "--no-cdpam"]
     words += [*sets("extraction=short-time lift.encoder=descriptors"), "--output", str(results)]
@@ -132,9 +128,7 @@ def test_no_figure_at_all_is_an_error(plates: Path, tmp_path: Path) -> None:
         )
 
 
-def test_ctrl_c_keeps_what_is_there(
-    plates: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_keeps_what_is_there(plates, tmp_path, capsys, monkeypatch):
     from avmsf.evaluation.simple_methods import NearestRecording
 
     def stop(self: NearestRecording, contacts: object, **how: object) -> None:
@@ -155,9 +149,7 @@ def test_ctrl_c_keeps_what_is_there(
     assert json.loads((tmp_path / "results" / "summary.json").read_text())["missing"] == {}
 
 
-def test_settings_and_the_device_reach_the_evaluation(
-    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_settings_and_the_device_reach_the_evaluation(plates, tmp_path, monkeypatch):
     asked: list[Evaluation] = []
 
     def stop(evaluation: Evaluation, *objects: object, **settings: object) -> None:

@@ -80,9 +80,7 @@ def gaussians(path: Path) -> GaussianCloud:
     return cloud
 
 
-def test_faust_gets_what_it_compiles_unless_asked_for_more(
-    field_file: Path, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_faust_gets_what_it_compiles_unless_asked_for_more(field_file, tmp_path, capsys, monkeypatch):
     output = tmp_path / "a.dsp"
     # 64 points of 5 modes with phases and the noise's 1200 samples are 1840 numbers. Beside the noise 10 would be left
     # of 1300: it is given up.
@@ -136,9 +134,7 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
     assert soundfile.info(folder / rows[0]["file"]).frames == 400
 
 
-def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(
-    field_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(field_file, tmp_path, monkeypatch):
     sampled = SampledField.of(load(field_file), limit=5)
     factor = torch.tensor([1.0, 1.0, 1e-3, 1.0, 1.0])[:, None]
     silent = replace(sampled, gains=factor * sampled.gains)
@@ -165,9 +161,7 @@ WRONG: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("words", WRONG)
-def test_what_cannot_be_exported_is_refused(
-    words: str, field_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_exported_is_refused(words, field_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     box(tmp_path / "box.ply")
     box(tmp_path / "large.stl", 1000.0)
@@ -255,9 +249,7 @@ def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_pat
 
 
 @pytest.mark.parametrize("size", [1.0, 3.0])
-def test_a_captures_mesh_is_as_large_as_the_field(
-    size: float, field_file: Path, tmp_path: Path, capsys: Streams
-) -> None:
+def test_a_captures_mesh_is_as_large_as_the_field(size, field_file, tmp_path, capsys):
     field, capture = (
         load(field_file),
         fill(tmp_path / "capture", rows=["a.wav,0,0,0"], settings='surface_unit = "cm"\n'),

@@ -116,9 +116,7 @@ def test_no_impacts_files_are_anothers(place: Place, tmp_path: Path, capsys: Str
     assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{end}" for stem in stems for end in ("png", "ply")}
 
 
-def test_recordings_without_an_impact_on_the_object_have_no_place(
-    place: Place, tmp_path: Path, capsys: Streams
-) -> None:
+def test_recordings_without_an_impact_on_the_object_have_no_place(place, tmp_path, capsys):
     silent = str(place.folder / "silent.wav")
     soundfile.write(silent, np.zeros(SAMPLES), RATE)
     noise = torch.randn(SAMPLES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -144,9 +142,7 @@ def test_one_bad_recording_does_not_cost_the_others(place: Place, hit: str, caps
 
 
 @pytest.mark.parametrize("several", [(), ("--several",)])
-def test_a_captures_settings_say_how_recordings_are_read(
-    several: tuple[str, ...], place: Place, hit: str, tmp_path: Path, capsys: Streams
-) -> None:
+def test_a_captures_settings_say_how_recordings_are_read(several, place, hit, tmp_path, capsys):
     impact = place.impact(STRUCK)
     noise = torch.randn(len(impact), generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     path = str(place.folder / "stereo.wav")
@@ -172,8 +168,8 @@ def test_the_error_is_the_distance_from_the_true_contact(place: Place, hit: str,
 
 
 def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_not_trained_on(
-    place: Place, hit: str, tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    place, hit, tmp_path, capsys, monkeypatch
+):
     points, names = place.points.double(), ("fitted.wav", "a/hit.wav", "b/hit.wav", "other.flac")
     sound = soundfile.read(hit)[0]
     for name in names:
@@ -260,9 +256,7 @@ def test_what_cannot_be_done_is_refused(words: str, place: Place, hit: str, tmp_
 
 
 @pytest.mark.parametrize("text", TABLES)
-def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(
-    text: str, place: Place, hit: str, tmp_path: Path
-) -> None:
+def test_a_table_that_names_no_recordings_or_has_another_unit_is_refused(text, place, hit, tmp_path):
     table = tmp_path / "places.csv"
     table.write_text(text)
     with raises(OutputError if "hit.wav" in text else CaptureError, file=table, **TABLES[text]):

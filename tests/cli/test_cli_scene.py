@@ -72,9 +72,7 @@ def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
     assert c == pytest.approx(THICKNESS, abs=0.02)
 
 
-def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follows_it(
-    capture: Path, kept: Path, tmp_path: Path, capsys: Streams
-) -> None:
+def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follows_it(capture, kept, tmp_path, capsys):
     cache = tmp_path / "cache"
     shutil.copytree(kept, cache)
     words = ["fit", capture, "--cache", cache, *SMALL]
@@ -84,9 +82,7 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
-def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(
-    kept: Path, capture: Path, tmp_path: Path, capsys: Streams
-) -> None:
+def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(kept, capture, tmp_path, capsys):
     shutil.copytree(kept, tmp_path / "cache")
     words = ["fit", str(capture), "--cache", str(tmp_path / "cache"), "--gain-model", "smooth", *SMALL_SPLAT, *TINY]
     stages = {}

@@ -28,9 +28,7 @@ SMALL = "--set views.count=6 --set splat.steps=30 --set start_points=400 --set f
 
 
 @pytest.mark.slow
-def test_the_demo_errs_by_half_of_the_nearest_recording_and_finds_the_wall(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_demo_errs_by_half_of_the_nearest_recording_and_finds_the_wall(tmp_path, capsys):
     assert main(["demo", str(tmp_path), "--quiet"]) == 0
     capsys.readouterr()
     assert main([*shlex.split(demo.COMMANDS[1].format(tmp_path)), "--json"]) == 0
@@ -41,9 +39,7 @@ def test_the_demo_errs_by_half_of_the_nearest_recording_and_finds_the_wall(
 
 
 @pytest.mark.slow
-def test_the_demo_goes_all_the_way(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_demo_goes_all_the_way(tmp_path, capsys, monkeypatch):
     check, fit, *others = [each.replace("--set splat.steps=500", SMALL) for each in demo.COMMANDS]
     monkeypatch.setattr(demo, "COMMANDS", [check, fit, *others])
     folder = tmp_path / "a demo"
@@ -150,9 +146,7 @@ def test_an_outlier_says_what_was_done_and_has_figures_only_for_verbose(monkeypa
 NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
 
 
-def test_the_same_command_goes_on_to_the_same_field(
-    tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_command_goes_on_to_the_same_field(tmp_path, capsys, monkeypatch):
     folder, cache = fill_plate(tmp_path / "plate"), tmp_path / "plate" / ".avmsf"
     whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
     assert main(["fit", str(folder), "--output", str(whole), "--cache", str(tmp_path / "other"), *NETWORK]) == 0

@@ -51,9 +51,7 @@ def test_the_curve_is_stored_drawn_and_shown(words: list[str], tmp_path: Path, m
     assert not list(tmp_path.glob("new.safetensors.*"))
 
 
-def test_an_interrupted_edit_has_the_whole_curve(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_edit_has_the_whole_curve(words, tmp_path, monkeypatch):
     def report(name: str) -> dict:
         found: dict = load(tmp_path / name).origin.report[EDITS][-1]["clap"]
         return found

@@ -67,9 +67,7 @@ def wait() -> None:
 
 
 @pytest.mark.parametrize("act", [lambda: bytearray(1 << 62), lambda: torch.empty(1 << 60, dtype=torch.uint8)])
-def test_missing_memory_ends_a_verb_with_a_sentence(
-    run: Callable[..., int], act: Callable[[], object], capsys: Streams
-) -> None:
+def test_missing_memory_ends_a_verb_with_a_sentence(run, act, capsys):
     assert run(act) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith("avmsf check: ")
@@ -101,9 +99,7 @@ def test_an_ignored_sigterm_stays_ignored(run: Callable[..., int]) -> None:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_ctrl_c_in_a_finalizer_ends_the_verb_all_the_same(
-    run: Callable[..., int], own_ctrl_c: None, capsys: Streams
-) -> None:
+def test_ctrl_c_in_a_finalizer_ends_the_verb_all_the_same(run, own_ctrl_c, capsys):
     class Closing:
         def __del__(self) -> None:
             os.kill(os.getpid(), signal.SIGINT)
@@ -117,9 +113,7 @@ def test_ctrl_c_in_a_finalizer_ends_the_verb_all_the_same(
     assert capsys.readouterr().err == "avmsf check: interrupted\n"
 
 
-def test_a_terminal_obeys_nothing_that_stands_in_a_file(
-    run: Callable[..., int], capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_terminal_obeys_nothing_that_stands_in_a_file(run, capsys, monkeypatch):
     def fail() -> None:
         raise CaptureError(f"format 7, written by {EVIL}")
 

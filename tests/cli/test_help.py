@@ -15,7 +15,6 @@ from avmsf.cli import VERBS, main
 from avmsf.cli.edit import Options as EditOptions
 from avmsf.cli.evaluate import Options as EvaluateOptions
 from avmsf.cli.fit import Options as FitOptions
-from avmsf.cli.options import Configured
 from avmsf.cli.paths import Existing, InputError
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
@@ -68,9 +67,7 @@ def test_the_help_of_a_protocol_begins_with_what_it_does_and_its_methods(capsys:
         (EditOptions, ["field", "-o", "new"], "--set prompt.generated=x.wav --set model_seconds=Infinity"),
     ],
 )
-def test_settings_are_printed_as_a_file_that_gives_them_back(
-    options: type[Configured], needed: list[str], words: str, tmp_path: Path, capsys: Streams
-) -> None:
+def test_settings_are_printed_as_a_file_that_gives_them_back(options, needed, words, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         options.parse([*words.split(), "--print-config"])
     file = tmp_path / "settings.toml"

@@ -77,9 +77,7 @@ def states(streams: Streams, *words: str, code: int = 0) -> dict[str, str]:
     return {name: each["state"] for name, each in results["results"].items()}
 
 
-def test_all_are_made_but_what_fails_for_a_reason_and_kept_while_nothing_changes(
-    fields: list[str], tmp_path: Path, capsys: Streams
-) -> None:
+def test_all_are_made_but_what_fails_for_a_reason_and_kept_while_nothing_changes(fields, tmp_path, capsys):
     pages, words = tmp_path / "pages", ["--to", "gltf", "--contacts", "20", "-o", str(tmp_path / "pages")]
     assert main(["export", *fields, *words, "--workers", "2"]) == 2
     shown = capsys.readouterr().out
@@ -98,9 +96,7 @@ def test_all_are_made_but_what_fails_for_a_reason_and_kept_while_nothing_changes
 
 
 @pytest.mark.parametrize("done", [["a"], []])
-def test_ctrl_c_keeps_what_is_done(
-    done: list[str], fields: list[str], tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_keeps_what_is_done(done, fields, tmp_path, capsys, monkeypatch):
     pages, last = tmp_path / "pages", "a: done" if done else "running a for 0 s (0 of 2, "
     words = ["export", *fields[:2], "--to", "gltf", "-o", str(pages)]
     say = ProgressDisplay.say
@@ -135,9 +131,7 @@ def test_what_cannot_be_of_many_is_refused(captures: tuple[Path, ...], tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [("--workers", "2"), ("--ray", "local")])
-def test_fields_of_many_are_those_of_each(
-    place: tuple[str, str], captures: tuple[Path, ...], tmp_path: Path, capsys: Streams
-) -> None:
+def test_fields_of_many_are_those_of_each(place, captures, tmp_path, capsys):
     if place[0] == "--ray":
         pytest.importorskip("ray")
     results, _ = results_of(capsys, *fit(captures, tmp_path / "many", *SMOOTH, *place))
@@ -149,9 +143,7 @@ def test_fields_of_many_are_those_of_each(
 
 
 @pytest.mark.slow
-def test_pages_of_many_have_the_captures_of_their_names(
-    captures: tuple[Path, ...], fields: list[str], tmp_path: Path, capsys: Streams
-) -> None:
+def test_pages_of_many_have_the_captures_of_their_names(captures, fields, tmp_path, capsys):
     words = ["--to", "web", "--contacts", "20", "--capture"]
     assert run_verb("export", fields[0], *words, str(captures[0]), "-o", str(tmp_path / "alone.html")) == 0
     together = ["export", *fields[:2], *words, str(captures[0].parent), "-o", str(tmp_path / "pages")]

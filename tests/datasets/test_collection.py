@@ -170,9 +170,7 @@ def test_a_collection_s_check_reads_no_sound(tmp_path: Path, monkeypatch: pytest
     assert d.problems[0].startswith("shape.obj")
 
 
-def test_check_of_a_dataset_is_json_and_ends_with_2_where_nothing_can_be_read(
-    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_of_a_dataset_is_json_and_ends_with_2_where_nothing_can_be_read(place, tmp_path, capsys):
     assert main(["check", str(place / "impact/RI"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["objects"][0]["facts"]["identifier"] == "22_Cup"
     write_raw(tmp_path / "of", {"2": ("0", "1")}, contacts=False)

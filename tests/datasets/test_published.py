@@ -186,9 +186,7 @@ BLOCK = "gain:\n- 12\n- 18\n- 3\npad: [1, 1]"
         ("metadata.yaml", "gain: [12, 18]\npad: [0.5, 1]", None, "pad", (0.5, 1.0)),
     ],
 )
-def test_lists_and_notes_that_cannot_be_meant_are_refused(
-    tmp_path: Path, file: str, text: str, row: int | None, name: str, value: object
-) -> None:
+def test_lists_and_notes_that_cannot_be_meant_are_refused(tmp_path, file, text, row, name, value):
     (tmp_path / file).write_text(f"{text}\n" if file == "metadata.yaml" else text)
     with raises(DatasetError, file=file, row=row, name=name, value=value):
         read_contacts([tmp_path / file]) if file == "list.json" else read_gain_db(tmp_path / file)

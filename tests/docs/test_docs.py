@@ -141,9 +141,7 @@ def test_a_number_has_three_digits_and_a_column_that_no_shown_row_has_is_of_dash
     assert table.splitlines() == ["|  | error ↓ | gone |", "|---|---|---|", "| mean | .500 | – |"]
 
 
-def test_a_method_without_results_has_no_column_and_its_part_is_named(
-    pages: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_method_without_results_has_no_column_and_its_part_is_named(pages, monkeypatch):
     found = {"gains.sim20": (pages.Record("gains.sim20.mean.mixture", 0.5),)}
     monkeypatch.setattr(pages, "_records", lambda part: found.get(part, ()))
     text = pages.written("<!-- measured: results -->\n<!-- end -->")

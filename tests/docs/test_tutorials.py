@@ -100,12 +100,12 @@ def done() -> set[tuple[str, str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_step_of_a_page_runs(
-    page: Path,
-    done: set[tuple[str, str]],
-    request: pytest.FixtureRequest,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    page,
+    done,
+    request,
+    tmp_path,
+    monkeypatch,
+):
     for folder, text in parts(page).items():
         assert steps(text)
         monkeypatch.chdir(shutil.copytree(request.getfixturevalue(folder), tmp_path / folder))

@@ -156,9 +156,7 @@ def test_diffsound_searches_the_vertices_of_the_mesh(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_distance(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_distance(tmp_path, monkeypatch):
     data, results = fill_plates(tmp_path / "plates", ("a",), count=20, truth=True), tmp_path / "results"
     asked: dict[bool, torch.Tensor] = {}
     drawn: dict[str, tuple[ContactPosterior, torch.Tensor]] = {}

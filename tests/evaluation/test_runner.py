@@ -170,9 +170,7 @@ def test_methods_share_modes_that_are_found_once_and_kept(plates: Path, tmp_path
     assert counts == [(8, 8), (4, 4), (2, 2), (1, 1)]
 
 
-def test_results_of_different_evaluations_are_not_mixed(
-    plates: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_of_different_evaluations_are_not_mixed(plates, tmp_path, monkeypatch):
     results, plan = ResultsFolder(tmp_path / "results"), planned(plates, "knn3")
     run_objects(plan, ("a",), results)
     before = (results.path / "objects" / "a.json").read_bytes()
@@ -306,9 +304,7 @@ def test_an_own_method_in_python_gets_the_score_of_the_same_built_in_one(tmp_pat
     assert evaluate(NearestThree(train), test).mean()["relative_stft"] > 1.02 * own.mean()["relative_stft"]
 
 
-def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(tmp_path, monkeypatch):
     own = strikes(STRIKES, starts=delays(STRIKES))
     peaks = own.delayed(own.sounds.abs().argmax(1).double())
     run, fitted = run_of(peaks, tmp_path, own), []
@@ -325,9 +321,7 @@ def test_fields_are_fitted_to_own_starts_and_all_are_scored_from_the_peaks(
     assert published.values["relative_stft"] == nearest.values["relative_stft"] != ours.values["relative_stft"]
 
 
-def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_own(tmp_path, monkeypatch):
     fitted = list[str]()
 
     def trained(method: FieldMethod, task: Task) -> SoundField:

@@ -239,9 +239,7 @@ def test_an_opposite_impact_negates_the_sound_and_does_not_cancel() -> None:
     ("direction", "distance", "nearest"),
     [(Y, 0.99, 1), (Y, 1.01, 0), ([-0.8, 0.6, 0.0], 0.44, 1), ([-0.8, 0.6, 0.0], 0.46, 0)],
 )
-def test_an_impact_is_farther_by_the_cosine_of_its_direction(
-    direction: list[float], distance: float, nearest: int
-) -> None:
+def test_an_impact_is_farther_by_the_cosine_of_its_direction(direction, distance, nearest):
     train = along_x([0.0, distance, 2.0], [direction, X, Y])
     assert rendered(train, 0.0, X).abs().equal(train.sounds[nearest].abs())
 

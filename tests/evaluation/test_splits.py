@@ -252,8 +252,8 @@ def test_the_papers_method_is_the_preset_with_one_damping(name: str, damping: An
 
 
 def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     def missing(*_: Any, **__: Any) -> DinoEncoder:
         raise SceneError("facebook/dinov2-base: no weights", value="facebook/dinov2-base")
 
@@ -312,9 +312,7 @@ def test_methods_without_features_share_results_with_any_encoder(tmp_path: Path)
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorials" / "evaluate.md"
 
 
-def test_a_method_and_a_metric_of_the_tutorial_are_in_the_tables(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_method_and_a_metric_of_the_tutorial_are_in_the_tables(tmp_path, monkeypatch):
     fill_plates(tmp_path / "objects", ("mug",))
     monkeypatch.chdir(tmp_path)
     (block,) = (

@@ -157,9 +157,7 @@ def vessel(sections: int) -> Trimesh:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("dense", "coarse"), [(ellipsoid(5), ellipsoid(4)), (vessel(160), vessel(70))])
-def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(
-    dense: Trimesh, coarse: Trimesh, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(dense, coarse, monkeypatch):
     # Those that the wall is made of are far fewer.
     limit(monkeypatch, 6000)
     found, known = (

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, SupportsIndex
 
 import numpy as np
 import pytest
@@ -132,9 +131,7 @@ ONE = torch.tensor([[0.4, 0.1, 0.0]])
         (1, bar_contacts(1), None, {"name": "candidates", "value": 0}),
     ],
 )
-def test_arguments_that_no_contact_can_be_suggested_for_are_refused(
-    count: SupportsIndex, candidates: Tensor | None, directions: Tensor | None, fault: dict[str, Any]
-) -> None:
+def test_arguments_that_no_contact_can_be_suggested_for_are_refused(count, candidates, directions, fault):
     with raises(ArrayError if "row" in fault and "value" not in fault else FitError, **fault):
         suggest(of_one_hypothesis(), count, candidates=candidates, directions=directions)
 

@@ -70,8 +70,8 @@ def cut_short(size: int) -> bytes:
     ids=["missing", "corrupt", "no image"],
 )
 def test_a_texture_that_cannot_be_read_is_named_and_a_material_without_one_has_its_color(
-    tmp_path: Path, image: bytes | None, library: str, value: str | None, color: list[float]
-) -> None:
+    tmp_path, image, library, value, color
+):
     (tmp_path / "card.obj").write_text(
         "mtllib card.mtl\nusemtl skin\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     )

@@ -136,9 +136,7 @@ POSE = " ".join(map(repr, (*quaternion(ring(4)[0]), *ring(4)[0].world_to_camera[
         ),
     ],
 )
-def test_malformed_text_is_named_by_line(
-    tmp_path: Path, file: str, before: str, after: str, row: int | None, name: str | None
-) -> None:
+def test_malformed_text_is_named_by_line(tmp_path, file, before, after, row, name):
     read = read_sparse_points if file == "points3D.txt" else read_views
     write_colmap_text(tmp_path, ring(4), NAMES)
     text = (tmp_path / file).read_text()

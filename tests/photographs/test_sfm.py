@@ -170,9 +170,7 @@ def test_of_several_models_the_largest_is_kept(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("groups", [(), (("a.png", "b.png", "c.png"),), (("a.png", "b.png"), ("c.png", "d.png"))])
-def test_too_few_cameras_are_refused_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, groups: tuple[tuple[str, ...], ...]
-) -> None:
+def test_too_few_cameras_are_refused_by_name(tmp_path, monkeypatch, groups):
     folder = pictures(tmp_path / "cup", "abcdefgh")
     pretend(tmp_path, monkeypatch, write_models(*groups))
     registered = groups[0] if groups else ()

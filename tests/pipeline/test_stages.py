@@ -114,9 +114,7 @@ def test_a_stage_that_fails_midway_runs_again_even_under_an_older_recipe(tmp_pat
     assert folder.path("cloud.ply").read_text() == "old"
 
 
-def test_a_record_of_another_version_or_code_or_a_damaged_one_does_not_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_of_another_version_or_code_or_a_damaged_one_does_not_count(tmp_path, monkeypatch):
     make, folder = Maker(), StageFolder(tmp_path)
     folder.keep(stage(make))
     monkeypatch.setattr("avmsf.__version__", "0.0.0")
@@ -171,9 +169,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are_bodies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are_bodies(tmp_path, monkeypatch):
     capture = read_capture(fill_plate(tmp_path / "plate"))
     failures: list[Exception | None] = []
 

@@ -60,9 +60,7 @@ def test_recordings_are_the_truth_and_noise_of_the_asked_level(simulation: Simul
 
 
 @pytest.mark.parametrize("imperfections", [Imperfections(), Imperfections.none()], ids=["usual", "none"])
-def test_without_noise_recordings_are_the_truth_to_the_last_bit_of_float32(
-    recipe: ObjectRecipe, cache: Path, imperfections: Imperfections
-) -> None:
+def test_without_noise_recordings_are_the_truth_to_the_last_bit_of_float32(recipe, cache, imperfections):
     simulation = simulate_object(replace(recipe, imperfections=imperfections, noise_db=None), cache=cache)
     found, expected = simulation.recordings.double(), rings(simulation)
     assert float((found - expected).abs().max()) < 1e-7 * float(expected.abs().max())
@@ -158,9 +156,7 @@ def test_a_surface_turned_inside_out_or_without_area_cannot_be_struck() -> None:
         draw_strikes(cloud, 10, up=UP, imperfections=Imperfections(), seed=0)
 
 
-def test_elastic_modes_are_kept_by_all_that_decides_them(
-    recipe: ObjectRecipe, cache: Path, simulation: Simulation
-) -> None:
+def test_elastic_modes_are_kept_by_all_that_decides_them(recipe, cache, simulation):
     told: list[str] = []
     again = simulate_object(replace(recipe, noise_db=-20.0, impacts=5), cache=cache, progress=told.append)
     assert told == ["sounds"]
@@ -257,9 +253,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(simulation: Simulation
     assert [each.name for each in tmp_path.rglob("*")] == ["mine", "thesis.txt"]
 
 
-def test_a_set_killed_half_way_goes_on_and_refuses_to_mix(
-    recipe: ObjectRecipe, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_set_killed_half_way_goes_on_and_refuses_to_mix(recipe, cache, tmp_path, monkeypatch):
     recipes = {name: replace(recipe, views=0, noise_db=level) for name, level in
                (("first", -30.0), ("second", -40.0), ("third", None))}  # fmt: skip
     written = write_simulation

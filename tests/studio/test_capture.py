@@ -17,7 +17,7 @@ from avmsf._utils.processes import write_lock
 from avmsf.capture import read_capture
 from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.capture.table import Impact
-from avmsf.errors import AvmsfError, CaptureError, FolderInUseError, RecordingLengthError
+from avmsf.errors import CaptureError, FolderInUseError, RecordingLengthError
 from avmsf.pipeline.config import CACHE
 from avmsf.studio.capture import CaptureEditor, read_contact
 from avmsf.studio.responses import RequestError, response_to
@@ -83,9 +83,7 @@ def test_a_repeated_request_writes_nothing_twice(tmp_path: Path) -> None:
     assert editor.add(blow(1), contact(0.2))["file"] == "003.wav"
 
 
-def test_what_fails_for_want_of_space_leaves_everything_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_fails_for_want_of_space_leaves_everything_as_it_was(tmp_path, monkeypatch):
     editor = recorded(tmp_path, 2)
     before = contents(tmp_path)
     replace = os.replace
@@ -188,9 +186,7 @@ UNIX = 'file, x,y,z,note\na.wav,0, 0,0,\n\nb.wav,0,0,20,"two\nlines"\nc.wav,30,0
         (UNIX, "\n001.wav,11.0,2.0,30.0,\n", '\nb.wav,0,0,20,"two\nlines"\n'),
     ],
 )
-def test_a_table_of_the_users_own_stays_to_the_last_byte_but_for_what_changes(
-    tmp_path: Path, text: str, row: str, without: str
-) -> None:
+def test_a_table_of_the_users_own_stays_to_the_last_byte_but_for_what_changes(tmp_path, text, row, without):
     folder = fill(tmp_path / "filled", settings='unit = "cm"')
     (folder / "impacts.csv").write_bytes(text.encode())
     editor = CaptureEditor(folder)
@@ -290,9 +286,7 @@ def test_a_recording_of_another_format_becomes_a_wav_of_the_same_samples(tmp_pat
         ("file,x,y,z\na.wav,0,0,0\na.wav,1,0,0\n", RequestError, {"name": "a.wav", "value": [2, 3]}),
     ],
 )
-def test_a_broken_table_and_a_recording_of_two_rows_are_left_alone(
-    tmp_path: Path, text: str, kind: type[AvmsfError], attributes: dict[str, object]
-) -> None:
+def test_a_broken_table_and_a_recording_of_two_rows_are_left_alone(tmp_path, text, kind, attributes):
     folder = fill(tmp_path / "filled")
     (folder / "impacts.csv").write_text(text)
     editor, before = CaptureEditor(folder), contents(folder)

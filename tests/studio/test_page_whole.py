@@ -2,7 +2,6 @@
 
 import base64
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,9 +24,7 @@ pytestmark = pytest.mark.page
 WATCH = "window.refused = []; addEventListener('securitypolicyviolation', (e) => refused.push(e.violatedDirective));"
 
 
-def test_a_field_is_struck_and_a_dropped_recording_of_it_located(
-    serving: Any, visit_studio: Any, tmp_path: Path
-) -> None:
+def test_a_field_is_struck_and_a_dropped_recording_of_it_located(serving, visit_studio, tmp_path):
     server = serving(open_plate(tmp_path / "home", "elastic"))
     page = visit_studio(server)
     row = page.evaluate("avmsf.strike(60, { force: 2 })")
@@ -77,9 +74,7 @@ def test_the_page_needs_no_more_than_it_is_allowed(serving: Any, browser: "Brows
 
 
 @pytest.mark.parametrize(("kind", "name"), [("gaussians", "page.html"), ("mesh", "folder")])
-def test_an_exported_page_shows_and_plays_the_object_without_a_network(
-    browser: "Browser", kind: str, name: str, tmp_path: Path, serve: Callable[[Path], str]
-) -> None:
+def test_an_exported_page_shows_and_plays_the_object_without_a_network(browser, kind, name, tmp_path, serve):
     write_webpage(plate_table(), tmp_path / name, object=plate_object(kind, tmp_path))
     address = serve(tmp_path / name) if name == "folder" else (tmp_path / name).as_uri()
     context = browser.new_context()

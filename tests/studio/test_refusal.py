@@ -64,9 +64,7 @@ def refused(answer: Answer, *statuses: int) -> str:
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, Exception) else str(value),
 )
-def test_a_failure_becomes_a_sentence(
-    plate: Served, monkeypatch: pytest.MonkeyPatch, error: Exception, undo: int, edit: int
-) -> None:
+def test_a_failure_becomes_a_sentence(plate, monkeypatch, error, undo, edit):
     def fail(*arguments: object) -> None:
         raise error
 
@@ -199,9 +197,7 @@ ORIGINS = ["https://evil.example", "null", "http://127.0.0.1:1", "https://127.0.
 @pytest.mark.parametrize(
     ("header", "value"), [*(("Host", host) for host in HOSTS), *(("Origin", origin) for origin in ORIGINS)]
 )
-def test_another_name_of_this_machine_and_another_sites_page_are_refused(
-    server: Served, header: str, value: str
-) -> None:
+def test_another_name_of_this_machine_and_another_sites_page_are_refused(server, header, value):
     for method, place, body in (("GET", "manifest.json", None), ("POST", "undo", {"base": 1})):
         answer = server.ask(method, place, body, headers={header: value.format(port=server.port)})
         assert answer.status == 403

@@ -149,9 +149,7 @@ def test_a_descent_is_asked_for_alone(plate: Served) -> None:
     assert list(plate.studio.folder.glob("lead-*")) == []
 
 
-def test_a_guided_edit_that_another_tab_has_overtaken_is_taken_and_its_change_comes_back_by_undo(
-    plate: Served, tmp_path: Path
-) -> None:
+def test_a_guided_edit_that_another_tab_has_overtaken_is_taken_and_its_change_comes_back_by_undo(plate, tmp_path):
     script = "import json, shutil, sys; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
     wait = (
         "import os, time\nwhile not os.path.exists(sys.argv[2]): time.sleep(0.01)\nprint(json.dumps({'result': task}))"
@@ -286,8 +284,8 @@ BROWSER += "Path(sys.argv[1]).write_text(f'{path.stat().st_mode & 0o777:o} {path
 
 @pytest.mark.slow
 def test_the_command_serves_until_it_is_told_to_end_and_tells_no_browsers_command_line_its_secret(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     opened, seen, script = open_plate(tmp_path / "opened"), tmp_path / "seen", tmp_path / "browser.py"
     script.write_text(BROWSER)
     command = [sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())", "studio"]

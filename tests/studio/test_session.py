@@ -103,9 +103,7 @@ def test_what_is_no_slider_is_named(words: dict[str, Any], name: str, value: obj
         ({"pitch": 2.0}, OSError),
     ],
 )
-def test_an_edit_that_fails_leaves_everything_as_it_was(
-    tmp_path: Path, words: dict[str, Any], kind: type[Exception]
-) -> None:
+def test_an_edit_that_fails_leaves_everything_as_it_was(tmp_path, words, kind):
     """The last one where the picture of the revision cannot be made."""
 
     def show(revision: Revision) -> None:

@@ -349,9 +349,7 @@ def test_volume_and_recordings_are_heard(any_page: "Page") -> None:
 
 @pytest.mark.parametrize("damping", [0.0, 30.0, 2500.0])
 @pytest.mark.parametrize(("frequency", "contact_time"), [(300.0, 0.0), (300.0, 0.002), (2600.0, 0.0005), (900.0, 0.02)])
-def test_a_mallet_leaves_a_mode_swinging_as_the_page_draws_it(
-    any_page: "Page", frequency: float, contact_time: float, damping: float
-) -> None:
+def test_a_mallet_leaves_a_mode_swinging_as_the_page_draws_it(any_page, frequency, contact_time, damping):
     rate = 44_100.0
     words = "([f, d, r, t]) => swingAfter(pulseSamples(t, r, 'half-sine'), 2 * Math.PI * f / r, d / r)"
     found = any_page.evaluate(words, [frequency, damping, rate, contact_time])

@@ -84,9 +84,7 @@ def exact(delayed: tuple[Impacts, Extraction]) -> tuple[Impacts, Extraction]:
     return train, extract_modes(train)
 
 
-def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(
-    delayed: tuple[Impacts, Extraction], exact: tuple[Impacts, Extraction]
-) -> None:
+def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(delayed, exact):
     fields = [fit(train, FEATURES, modes, CONFIG) for train, modes in (delayed, exact)]
     known = [each.gain_field for each in fields]
     assert all(isinstance(each, MixtureGains) for each in known)

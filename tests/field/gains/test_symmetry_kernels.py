@@ -98,9 +98,7 @@ def test_motions_of_a_group_are_closed_though_the_planes_found_are_not_quite_per
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["even", "odd"])
-def test_gains_on_the_other_side_are_those_of_the_mirrored_contact_with_the_modes_sign(
-    sign: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gains_on_the_other_side_are_those_of_the_mirrored_contact_with_the_modes_sign(sign, monkeypatch):
     monkeypatch.setattr(symmetry, "RESIDUALS", (0.0,))
     near = impacts(6, seed=2)
     points = torch.cat([CENTER + (near.points - CENTER).abs(), reflected(near).points[:3]])
