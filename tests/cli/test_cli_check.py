@@ -1,17 +1,36 @@
-"""`avmsf check`: settings that it proposes and writes, the alignment, and a mesh in another unit."""
+"""What check says of recordings, alignment and whatever shows the object."""
 
+import importlib.util
+import json
+import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import soundfile
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
+from avmsf.capture.filenames import expect_views, pictures_in
+from avmsf.capture.settings import METRES
 from avmsf.cli import main
+from avmsf.errors import SceneError
+from avmsf.gaussians.initialize import StartPoints, starting_cloud
+from avmsf.gaussians.ply import write_splats
+from avmsf.mesh.surface import surface_points
+from avmsf.photographs.folder import read_camera_file, write_frames
+from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced
 from factories.capture_folder import RATE, fill, ring
 from factories.plate_capture import fill_plate
-from factories.small_scene import write_surface_file
+from factories.raising import raises
+from factories.small_scene import slab, slab_views, write_surface_file
 from factories.verbs import results_of
+from factories.views_folder import frames, write_image, write_transforms
+from factories.views_folder import ring as camera_ring
 
 Streams = pytest.CaptureFixture[str]
 
@@ -108,3 +127,206 @@ def test_every_command_names_the_unit_of_the_mesh_and_writes_nothing(command, tm
     assert 'surface_unit = "mm"' in said.out + said.err
     assert sorted(folder.rglob("*")) == before
     assert [each.name for each in tmp_path.iterdir()] == ["plate"]
+
+
+def found(folder: Path) -> VisualInputs:
+    visual = inputs(folder, CaptureSettings())
+    assert visual is not None
+    return visual
+
+
+def images(folder: Path, *names: str) -> None:
+    for name in names:
+        write_image(folder / name)
+
+
+NAMED = [{**frame, "mask_path": f"cut/{name}.png"} for name, frame in zip("abcd", frames(camera_ring(4)), strict=True)]
+MASKS: dict[str, tuple[Callable[[Path], object], int, int, list[str]]] = {
+    "none": (lambda folder: None, 4, 0, []),
+    "all": (lambda folder: images(folder, *(f"masks/{name}.png" for name in "abcd")), 4, 4, []),
+    "of no photograph": (lambda folder: images(folder, "masks/e.png"), 4, 0, ["masks/e.png"]),
+    "all but one": (lambda folder: images(folder, *(f"masks/{name}.png" for name in "acd")), 4, 3, ["b.png"]),
+    "named, not there": (lambda folder: write_transforms(folder, NAMED), 4, 0, ["4 photographs"]),
+    "an alpha channel": (lambda folder: Image.new("RGBA", (8, 8)).save(folder / "images" / "a.png"), 4, 1, ["b.png"]),
+    "no photograph": (lambda folder: (folder / "images" / "b.png").unlink(), 3, 0, ["b.png"]),
+}
+
+
+@pytest.mark.parametrize("case", MASKS)
+def test_photographs_with_cameras_and_masks(case: str, tmp_path: Path) -> None:
+    """What a change of the folder gives: photographs, those with a mask, and what the problems name."""
+    write_transforms(tmp_path, frames(camera_ring(4)))
+    change, photographs, masks, problems = MASKS[case]
+    change(tmp_path)
+    visual = found(tmp_path)
+    assert (visual.photographs, visual.cameras, visual.masks) == (photographs, "transforms.json", masks)
+    assert len(visual.problems) == len(problems)
+    assert all(name in problem for name, problem in zip(problems, visual.problems, strict=True))
+
+
+def test_an_empty_folder_of_images_is_refused_unless_a_mesh_shows_the_object(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    with raises(SceneError, file=tmp_path):
+        expect_views(tmp_path, CaptureSettings())
+    (tmp_path / "surface.obj").touch()
+    expect_views(tmp_path, CaptureSettings())
+
+
+def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:
+    """`avmsf fit FOLDER/images`, of the wrong folder, leaves its cache there."""
+    write_transforms(tmp_path, frames(camera_ring(4)))
+    write_image(tmp_path / "images" / ".avmsf" / "motion" / "view_000.png")
+    assert pictures_in(tmp_path / "images", deep=True) == [tmp_path / "images" / f"{name}.png" for name in "abcd"]
+    assert read_camera_file(tmp_path).without_camera() == []
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_photographs_alone_need_structure_from_motion(tmp_path, installed, monkeypatch):
+    for name in "abc":
+        write_image(tmp_path / "images" / f"{name}.jpg")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
+    visual = found(tmp_path)
+    assert (visual.photographs, visual.cameras, visual.masks) == (3, None, 0)
+    assert len(visual.problems) == (not installed)
+
+
+def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
+    (tmp_path / "splats.ply").touch()
+    (tmp_path / "turn.mp4").touch()
+    visual = found(tmp_path)
+    assert visual == VisualInputs(0, None, 0, "turn.mp4", None, "splats.ply", ())
+    assert visual.reconstructs
+    (tmp_path / "two.mp4").touch()
+    assert len(found(tmp_path).problems) == 1
+    (tmp_path / "transforms.json").write_text("{}")
+    assert "transforms.json" in found(tmp_path).problems[0]
+    write_surface_file(tmp_path)
+    # Pictures next to a mesh may be its textures.
+    assert found(tmp_path).mesh is not None
+    assert not found(tmp_path).reconstructs
+
+
+def pictured_slab(folder: Path) -> Path:
+    """A struck plate that is the upper side of a slab in photographs with cameras and masks."""
+    fill_plate(folder, surface=False)
+    write_frames(slab_views(64), folder)
+    return folder
+
+
+Y_UP = np.array([[1.0, 0, 0, 0.3], [0, 0, 1, 0.1], [0, -1, 0, -0.2], [0, 0, 0, 1]])
+SCALES = np.array([[1.0, 1, 1, 7.3]] * 3 + [[1.0, 1, 1, 1]])
+CAMERAS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], dict[str, Any], str]] = {
+    "as they are": (lambda pose: pose, {}, ""),
+    "moved": (lambda pose: Y_UP @ pose, {"applied_transform": Y_UP[:3].tolist()}, "applied_transform"),
+    "moved and scaled": (
+        lambda pose: (Y_UP @ pose) * SCALES,
+        {"applied_transform": Y_UP[:3].tolist(), "applied_scale": 7.3},
+        "applied_scale = 7.3",
+    ),
+    "stated, not done": (lambda pose: pose, {"applied_scale": 7.3, "applied_transform": Y_UP[:3].tolist()}, ""),
+    "world to camera": (np.linalg.inv, {}, "once each pose is inverted (world to camera"),
+    "OpenCV's axes": (lambda pose: pose @ np.diag([1.0, -1, -1, 1]), {}, "third column of each pose are negated"),
+    "transposed": (lambda pose: pose.T, {}, "perhaps the matrix is transposed"),
+}
+
+
+def said_of(folder: Path) -> list[str]:
+    """Return what is wrong with all that shows the object, alone and next to the contacts."""
+    visual = found(folder)
+    return [*visual.problems, *map(str, misplaced(folder, None, visual))]
+
+
+@pytest.mark.parametrize("case", CAMERAS)
+def test_what_is_wrong_with_cameras_is_named(tmp_path: Path, case: str) -> None:
+    folder, (change, extra, words) = pictured_slab(tmp_path / "slab"), CAMERAS[case]
+    record = json.loads((folder / "transforms.json").read_text()) | extra
+    for frame in record["frames"]:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    (folder / "transforms.json").write_text(json.dumps(record))
+    said = said_of(folder)
+    assert [words in each for each in said] == [True] * bool(words)
+
+
+TURN = Rotation.from_euler("zyx", [28, 15, -40], degrees=True)
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("as they are", ""),
+        ("nan", "expected a finite float32 number as y of each vertex, got nan"),
+        ("colors", "got Gaussians without f_dc_0, f_dc_1, f_dc_2"),
+        ("y down", "(x, y, z) taken as (x, -y, -z)"),
+        ("moved", "the Gaussians and the contacts are in different frames"),
+        ("moved as stated", "once moved as dataparser_transforms.json"),
+    ],
+)
+def test_gaussians_are_opened_and_another_frame_is_told(tmp_path: Path, case: str, words: str) -> None:
+    folder = fill_plate(tmp_path / "plate", surface=False)
+    centers = surface_points(slab(), count=2000)
+    if case.startswith("moved"):
+        centers = 2.9 * (centers @ torch.from_numpy(TURN.as_matrix()).T + torch.tensor([0.3, 0.1, -0.2]))
+    if case == "moved as stated":
+        matrix = np.c_[TURN.as_matrix(), [0.3, 0.1, -0.2]].tolist()
+        (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": matrix, "scale": 2.9}))
+    if case == "y down":
+        centers = centers * torch.tensor([1.0, -1.0, -1.0])
+    cloud = starting_cloud(StartPoints(centers, torch.rand(len(centers), 3)), degree=0, scale=1.0, opacity=0.9)
+    if case == "nan":
+        cloud.centers[7, 1] = math.nan
+    write_splats(cloud, folder / "splats.ply")
+    if case == "colors":
+        content = (folder / "splats.ply").read_bytes()
+        (folder / "splats.ply").write_bytes(content.replace(b"property float f_dc_", b"property float color"))
+    said = said_of(folder)
+    assert [words in each and "feet" not in each for each in said] == [True] * bool(words)
+
+
+@pytest.mark.parametrize("unit", ["m", "mm", "in"])
+def test_the_unit_of_contacts_is_found_from_photographs(tmp_path: Path, capsys: Streams, unit: str) -> None:
+    folder = pictured_slab(tmp_path / "slab")
+    header, *rows = (folder / "impacts.csv").read_text().split()
+    cells = [row.split(",") for row in rows]
+    for row in cells:
+        row[1:4] = [str(float(cell) / METRES[unit]) for cell in row[1:4]]
+    (folder / "impacts.csv").write_text("\n".join([header, *map(",".join, cells)]))
+    (folder / "capture.toml").unlink()
+    proposed = [] if unit == "m" else [unit]
+    for words, found in (((), proposed), (("--write-settings",), proposed), ((), [])):
+        proposals = results_of(capsys, "check", folder, *words, code=None)[0]["proposals"]
+        assert [each["value"] for each in proposals if each["key"] == "unit"] == found
+    if proposed:
+        assert CaptureSettings.read(folder / "capture.toml").unit == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [
+        ("bowl_scan.obj", 'surface = "bowl_scan.obj"'),
+        ("scan/textured.glb", 'surface = "scan/textured.glb"'),
+        ("surface.usdz", "surface.obj"),
+        ("splats.spz", "splats.ply"),
+        ("point_cloud/iteration_30000/point_cloud.ply", "splats.ply"),
+        ("train/transforms_train.json", "transforms.json"),
+        ("keyframes/0001.jpg", "images"),
+        ("IMG_0001.HEIC", ".jpg"),
+        ("table.xlsx", "impacts.csv"),
+    ],
+)
+def test_a_file_that_looks_like_an_input_and_is_not_used_is_named_and_ends_a_fit(tmp_path, name, advice, capsys):
+    folder = fill_plate(tmp_path / "plate")
+    (folder / "surface.obj").unlink(missing_ok=True)
+    (folder / "surface.ply").unlink(missing_ok=True)
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).touch()
+    (sentence,) = found(folder).unused
+    assert sentence.startswith(name.removesuffix("0001.jpg"))
+    assert advice in sentence
+    assert main(["fit", str(folder), "-o", str(tmp_path / "field.safetensors"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["value"] == [sentence]
+    assert not (tmp_path / "field.safetensors").exists()
+
+
+def test_every_file_of_a_capture_with_photographs_or_a_mesh_is_used(tmp_path: Path) -> None:
+    write_transforms(fill_plate(tmp_path), frames(camera_ring(4)))
+    assert found(tmp_path).unused == ()

@@ -1,11 +1,17 @@
-"""How a verb ends that cannot go on: by one sentence and an exit code."""
+"""How a verb ends, and many captures at a time."""
 
+import csv
 import io
+import math
+import multiprocessing
 import os
+import random
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,10 +20,17 @@ from types import FrameType
 import pytest
 import torch
 
+from avmsf._utils import progress
+from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import check, main
 from avmsf.cli.output import display, print_json, say, show, table
+from avmsf.cli.paths import InputError, OutputError
 from avmsf.errors import CaptureError
-from factories.verbs import results_of
+from avmsf.field.store import save
+from factories.made_fields import positional, sounding
+from factories.plate_capture import TINY, fill_plate
+from factories.raising import raises
+from factories.verbs import results_of, run_verb
 
 Streams = pytest.CaptureFixture[str]
 STORED = Path(__file__).parents[1] / "field" / "data" / "format-8" / "mixture.safetensors"
@@ -179,3 +192,151 @@ def test_a_closed_output_ends_silently(words: str) -> None:
     _, err = run.communicate(timeout=300)
     assert b"BrokenPipe" not in err
     assert run.returncode == 141
+
+
+NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
+SMOOTH = ("--gain-model", "smooth", "--train-count", "5", *TINY)
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+
+
+@pytest.fixture
+def fields(tmp_path: Path) -> list[str]:
+    """Return the files of two fields, and of one that is damaged."""
+    for name in ("a", "b", "damaged"):
+        save(sounding(positional()), tmp_path / f"{name}.safetensors")
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    return [str(tmp_path / f"{name}.safetensors") for name in ("a", "b", "damaged")]
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    """Return a plate, and the same plate with a recording less."""
+    folder = tmp_path_factory.mktemp("captures")
+    first = fill_plate(folder / "a")
+    shutil.copytree(first, folder / "b")
+    lines = (first / "impacts.csv").read_text().splitlines(keepends=True)
+    (folder / "b" / "impacts.csv").write_text("".join(lines[:-1]))
+    return first, folder / "b"
+
+
+def fit(captures: tuple[Path, ...], output: Path, *words: str) -> list[str]:
+    caches = output.with_name(f"{output.name} caches")
+    return ["fit", *map(str, captures), "-o", str(output), "--cache", str(caches), *words]
+
+
+def fields_one_by_one(captures: tuple[Path, ...], folder: Path, *words: str) -> dict[str, bytes]:
+    """Return the bytes of the fields that single commands write, each on one thread."""
+    made = {}
+    for capture in captures:
+        path = folder / f"{capture.name}.safetensors"
+        command = ["fit", capture, "-o", path, "--cache", folder / capture.name, *words]
+        subprocess.run([sys.executable, "-m", "avmsf", *map(str, command)], env=os.environ | ONE_THREAD, check=True)
+        made[path.name] = path.read_bytes()
+    return made
+
+
+def table_of(output: Path) -> dict[str, dict[str, str]]:
+    with (output / "results.csv").open(newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+def states(streams: Streams, *words: str, code: int = 0) -> dict[str, str]:
+    results, _ = results_of(streams, *words, code=code)
+    return {name: each["state"] for name, each in results["results"].items()}
+
+
+def test_all_are_made_but_what_fails_for_a_reason_and_kept_while_nothing_changes(fields, tmp_path, capsys):
+    pages, words = tmp_path / "pages", ["--to", "gltf", "--contacts", "20", "-o", str(tmp_path / "pages")]
+    assert main(["export", *fields, *words, "--workers", "2"]) == 2
+    shown = capsys.readouterr().out
+    rows = table_of(pages)
+    assert [row["state"] for row in rows.values()] == ["done", "done", "failed"]
+    assert "damaged.safetensors" in rows["damaged"]["failure"]
+    assert f"failed: damaged: {rows['damaged']['failure']}" in shown
+    assert int(rows["b"]["bytes"]) == (pages / "b.glb").stat().st_size
+    assert run_verb("export", fields[0], *words[:-1], str(tmp_path / "alone.glb")) == 0
+    assert (pages / "a.glb").read_bytes() == (tmp_path / "alone.glb").read_bytes()
+    (pages / "b.glb").unlink()
+    assert states(capsys, "export", *fields[:2], *words) == {"a": "as before", "b": "done"}
+    again = ["export", fields[0], fields[1], *words, "--up", "y"]
+    assert states(capsys, *again, code=2) == {"a": "failed", "b": "failed"}
+    assert states(capsys, *again, "--overwrite") == {"a": "done", "b": "done"}
+
+
+@pytest.mark.parametrize("done", [["a"], []])
+def test_ctrl_c_keeps_what_is_done(done, fields, tmp_path, capsys, monkeypatch):
+    pages, last = tmp_path / "pages", "a: done" if done else "running a for 0 s (0 of 2, "
+    words = ["export", *fields[:2], "--to", "gltf", "-o", str(pages)]
+    say = ProgressDisplay.say
+
+    def stop(self: ProgressDisplay, text: str, *, always: bool = False) -> None:
+        if text.startswith(last):
+            raise KeyboardInterrupt
+        say(self, text, always=always)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ProgressDisplay, "say", stop)
+        patched.setattr(progress, "LINE_SECONDS", math.inf if done else 0.0)
+        assert main(words) == 130
+    assert (list(table_of(pages)) if done else sorted(pages.glob("*.csv"))) == done
+    assert states(capsys, *words) == {"a": "as before" if done else "done", "b": "done"}
+
+
+def test_what_cannot_be_of_many_is_refused(captures: tuple[Path, ...], tmp_path: Path) -> None:
+    twice = tmp_path / captures[0].name
+    shutil.copytree(captures[0], twice)
+    with raises(OutputError, name="--output"):
+        run_verb("fit", *map(str, captures))
+    with raises(InputError, file=twice, value=twice.name):
+        run_verb(*fit((captures[0], twice), tmp_path / "many"))
+    (tmp_path / "features.npz").touch()
+    with raises(InputError, name="--features"):
+        run_verb(*fit(captures, tmp_path / "many", "--features", str(tmp_path / "features.npz")))
+    for verb, name in (("fit", "captures"), ("export", "fields")):
+        with raises(InputError, name=name):
+            run_verb(verb, *(["--to", "web", "-o", str(tmp_path / "x")] if verb == "export" else []))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [("--workers", "2"), ("--ray", "local")])
+def test_fields_of_many_are_those_of_each(place, captures, tmp_path, capsys):
+    if place[0] == "--ray":
+        pytest.importorskip("ray")
+    results, _ = results_of(capsys, *fit(captures, tmp_path / "many", *SMOOTH, *place))
+    found, row = results["results"]["a"], table_of(tmp_path / "many")["a"]
+    assert float(row["relative STFT error"]) == pytest.approx(found["scores"]["field"]["relative_stft"], rel=0.01)
+    assert float(row["by leave-one-out"]) == pytest.approx(found["report"]["quality"]["error"], rel=0.01)
+    for name, content in fields_one_by_one(captures, tmp_path / "alone", *SMOOTH).items():
+        assert (tmp_path / "many" / name).read_bytes() == content
+
+
+@pytest.mark.slow
+def test_pages_of_many_have_the_captures_of_their_names(captures, fields, tmp_path, capsys):
+    words = ["--to", "web", "--contacts", "20", "--capture"]
+    assert run_verb("export", fields[0], *words, str(captures[0]), "-o", str(tmp_path / "alone.html")) == 0
+    together = ["export", *fields[:2], *words, str(captures[0].parent), "-o", str(tmp_path / "pages")]
+    assert states(capsys, *together) == {"a": "done", "b": "done"}
+    assert (tmp_path / "pages" / "a.html").read_bytes() == (tmp_path / "alone.html").read_bytes()
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_change_nothing(captures: tuple[Path, ...], tmp_path: Path) -> None:
+    chance, killed = random.Random(0), list[int | None]()
+    alone = fields_one_by_one(captures, tmp_path / "alone", *NETWORK)
+
+    def kill() -> None:
+        while len(killed) < 3:
+            time.sleep(chance.uniform(0, 3))
+            running = [each for each in multiprocessing.active_children() if each.pid not in killed]
+            if running:
+                victim = chance.choice(running)
+                victim.kill()
+                killed.append(victim.pid)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    assert main(fit(captures, tmp_path / "many", *NETWORK, "--workers", "2")) == 0
+    killer.join()
+    for name, content in alone.items():
+        assert (tmp_path / "many" / name).read_bytes() == content
