@@ -15,8 +15,9 @@ from avmsf.evaluation.modal_metrics import truth_at
 from avmsf.evaluation.simple_methods import floor
 from avmsf.evaluation.splits import split
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
-from avmsf.modal.extraction.finders import HighResolution, ModeFinder, ShortTime
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.recipe import SIM20

@@ -14,7 +14,7 @@ from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.task import Task
-from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.extraction.stft import ShortTime
 from factories.plate_field import RATE
 from factories.plate_set import fill_plates
 from factories.raising import raises

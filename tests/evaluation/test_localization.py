@@ -43,7 +43,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.contact_map import ContactPosterior
-from avmsf.modal.extraction.finders import HighResolution, ShortTime
+from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
 from factories.made_audio import save_audio
 from factories.made_clap import save_clap

@@ -36,7 +36,7 @@ from avmsf.fem.walls import shell
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
-from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.synthesis import synthesize
 from factories.made_sheet import sheet_over
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts

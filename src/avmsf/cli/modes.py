@@ -58,8 +58,7 @@ def run(options: Options) -> int:
     from avmsf.capture import read_capture
     from avmsf.cli.report import levels, mode_rows, mode_table
     from avmsf.modal.extraction.alignment_report import AlignmentReport
-    from avmsf.modal.extraction.extract import extract_modes
-    from avmsf.modal.extraction.finders import FINDERS
+    from avmsf.modal.extraction.extract import FINDERS, extract_modes
     from avmsf.modal.extraction.quality import measure_quality
 
     config = options.pipeline

@@ -20,7 +20,7 @@ from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.mesh.points import farthest_points
 from avmsf.modal.config import scaled_fft_size
-from avmsf.modal.extraction.finders import ShortTime
+from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.spectra import magnitude_stft
 
 CANDIDATES = 2000

@@ -45,8 +45,8 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.extraction.extract import Extraction, extract_sounds
-from avmsf.modal.extraction.finders import FINDERS, lowest_frequency
+from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_sounds
+from avmsf.modal.extraction.finders import lowest_frequency
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.config import PRESETS, PipelineConfig

@@ -19,7 +19,8 @@ from avmsf.evaluation.results import SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import shared_cdpam
 from avmsf.evaluation.task import Method, VisualInput
 from avmsf.features.descriptors import ImageDescriptors
-from avmsf.modal.extraction.finders import FINDERS, HighResolution, ModeFinder
+from avmsf.modal.extraction.extract import FINDERS
+from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig
 from avmsf.pipeline.features import choose_encoder
 

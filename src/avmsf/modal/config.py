@@ -8,7 +8,7 @@ from avmsf.errors import ArrayError, ExtractionError
 ExtractionMethod = Literal["high-resolution", "short-time"]
 """high-resolution: ESPRIT in subbands. short-time: the paper's, bin by bin of a short-time spectrum.
 
-A class for each is in `avmsf.modal.extraction.finders.FINDERS`."""
+A class for each is in `avmsf.modal.extraction.extract.FINDERS`."""
 PulseShape = Literal["half-sine", "hertz"]
 """How a hammer's force rises and falls: a mass on a linear spring, or on a Hertzian contact."""
 MAX_CONTACT_SECONDS = 0.02

@@ -28,8 +28,7 @@ from avmsf.field.store import load, save
 from avmsf.field.training import Progress
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
-from avmsf.modal.extraction.extract import Extraction, extract_once
-from avmsf.modal.extraction.finders import FINDERS
+from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_once
 from avmsf.pipeline.bodies import candidate_bodies, expect_no_recordings, guess_field
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE, PipelineConfig
 from avmsf.pipeline.record import modes_words, supporting_poles, with_record

@@ -14,8 +14,9 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.modal.config import ExtractionMethod
-from avmsf.modal.extraction.extract import extract_modes, extract_once, extract_sounds
-from avmsf.modal.extraction.finders import FINDERS, HighResolution, ShortTime, lowest_frequency
+from avmsf.modal.extraction.extract import FINDERS, extract_modes, extract_once, extract_sounds
+from avmsf.modal.extraction.finders import HighResolution, lowest_frequency
+from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from factories.raising import raises

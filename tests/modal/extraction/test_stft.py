@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.modal.extraction.finders import ShortTime
-from avmsf.modal.extraction.stft import Lines, narrow_band
+from avmsf.modal.extraction.stft import ShortTime, narrow_band
+from avmsf.modal.modes import ModalBank
 
 RATE = 16000.0
 
@@ -17,11 +17,8 @@ def tone(frequency: float, damping: float, *, gain: float = 1.0, seconds: float 
     return gain * (times >= 0) * torch.exp(-damping * times.clamp_min(0)) * torch.sin(2 * math.pi * frequency * times)
 
 
-def find(sounds: Tensor, *, latest_peak: float = 0.1, least_damping: float = 0.5, count: int = 20):
-    lines = Lines.of(
-        sounds, sample_rate=RATE, fft_size=512, hop=32, latest_peak=latest_peak, least_damping=least_damping
-    )
-    return lines.modes(count)
+def find(sounds: Tensor, *, latest_peak: float = 0.1, least_damping: float = 0.5, count: int = 20) -> ModalBank:
+    return ShortTime(count, 512 / RATE, 32 / RATE, latest_peak, least_damping).find(sounds, RATE)
 
 
 @pytest.mark.parametrize("chosen", [1, 9, 31])

@@ -15,8 +15,8 @@ from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.finders import ShortTime
 from avmsf.modal.extraction.least_squares import fit_sine_gains
+from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import common_phase
 from avmsf.modal.residual_noise import Residual, noise_power
 

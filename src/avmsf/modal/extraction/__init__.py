@@ -16,6 +16,6 @@ In go `Impacts`; out comes an `Extraction`: a `ModalBank`, each recording's comp
 `quality` judges how well the recordings support each mode; `recorder_faults` finds what is wrong with recordings. Start
 reading at `extract.extract_modes`.
 
-A new method is a subclass of `finders.ModeFinder`, its entry in `finders.FINDERS` and its name in
+A new method is a subclass of `finders.ModeFinder`, its entry in `extract.FINDERS` and its name in
 `avmsf.modal.config.ExtractionMethod`: commands, settings, evaluations and files take it from there.
 """

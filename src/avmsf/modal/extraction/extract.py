@@ -21,15 +21,19 @@ from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError, FieldFileError
+from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.alignment import Alignment, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency
 from avmsf.modal.extraction.frequency_shifts import FrequencyShifts
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual, estimate_residual, noise_bins
 from avmsf.modal.synthesis import synthesize
 
+FINDERS: dict[ExtractionMethod, type[ModeFinder]] = {"high-resolution": HighResolution, "short-time": ShortTime}
+"""By the names that `avmsf modes --extraction` and `PipelineConfig.extraction` take."""
 _KIND = FileKind("avmsf-modes", "modes", "find them again", FieldFileError)
 _ALIGNMENT = "alignment."
 

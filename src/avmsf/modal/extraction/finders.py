@@ -1,19 +1,18 @@
-"""Finders of the modes that recordings share: matrix pencils in subbands, and the paper's short-time method."""
+"""Finders of the modes that recordings share, and the one by matrix pencils in subbands."""
 
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from avmsf.modal.config import ExtractionMethod, expect_modes
+from avmsf.modal.config import expect_modes
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.frequency_shifts import FrequencyShifts, find_shifts
 from avmsf.modal.extraction.least_squares import refine
 from avmsf.modal.extraction.selection import Selection, chance_ratio, merge
-from avmsf.modal.extraction.stft import Lines
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import noise_bins, noise_power
 
@@ -112,64 +111,6 @@ class HighResolution(ModeFinder):
         return bank
 
 
-@dataclass(frozen=True)
-class ShortTime(ModeFinder):
-    """The paper's method: one candidate a bin of a short-time spectrum, log-linear decay, consensus (section 3.4).
-
-    Times are in seconds so that they hold at any sample rate; the defaults are the paper's 2048 and 64 samples at
-    44.1 kHz. Kept are the modes of the largest mean gain.
-    """
-
-    fft_seconds: float = 2048 / 44100
-    """Length of the transform, rounded to a power of two in samples."""
-    hop_seconds: float = 64 / 44100
-    """Step between frames, rounded to a power of two in samples."""
-    latest_peak: float = 0.1
-    """A bin whose envelope peaks later than this after the onset holds noise, s."""
-    least_damping: float = 0.5
-    """A bin that decays more slowly than this is hum, 1/s."""
-
-    def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
-        """Return the modes of `sounds`, at most `modes` of them."""
-        return self._lines(sounds, sample_rate).modes(self.modes)
-
-    def gains(
-        self, sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
-    ) -> Float64[Tensor, "contacts modes"]:
-        """Return the gain g of eq. 5 in each recording at the bins nearest to the modes: not negative, without a sign.
-
-        It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most.
-        """
-        nearest = torch.round(bank.frequency * self._fft_size(sample_rate) / sample_rate).long()
-        bins, modes = torch.unique(nearest, return_inverse=True)
-        return self._lines(sounds, sample_rate, bins).gain[:, modes]
-
-    def _fft_size(self, sample_rate: float) -> int:
-        return _power_of_two(self.fft_seconds * sample_rate, least=32)
-
-    def _lines(
-        self, sounds: Float[Tensor, "contacts samples"], sample_rate: float, bins: Int[Tensor, " bins"] | None = None
-    ) -> Lines:
-        fft_size = self._fft_size(sample_rate)
-        return Lines.of(
-            sounds,
-            sample_rate=sample_rate,
-            fft_size=fft_size,
-            hop=min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4),
-            latest_peak=self.latest_peak,
-            least_damping=self.least_damping,
-            bins=bins,
-        )
-
-
-FINDERS: dict[ExtractionMethod, type[ModeFinder]] = {"high-resolution": HighResolution, "short-time": ShortTime}
-"""By the names that `avmsf modes --extraction` and `PipelineConfig.extraction` take."""
-
-
 def lowest_frequency(samples: int, sample_rate: float) -> float:
     """Return the lowest frequency (Hz) at which sounds of this length let a mode be told from rumble."""
     return _MIN_PERIODS * sample_rate / samples
-
-
-def _power_of_two(value: float, *, least: int) -> int:
-    return max(least, 1 << round(math.log2(max(value, 1.0))))

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Complex, Float, Float64, Int
 from scipy.special import bdtrc
 from torch import Tensor
 
+from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.modal.modes import ModalBank
 
 _PEAK_DB = 60.0
@@ -69,46 +70,6 @@ class Lines:
     bin_width: float
     """Distance of neighboring bins, Hz."""
 
-    @classmethod
-    def of(
-        cls,
-        sounds: Float[Tensor, "contacts samples"],
-        *,
-        sample_rate: float,
-        fft_size: int,
-        hop: int,
-        latest_peak: float,
-        least_damping: float,
-        bins: Int[Tensor, " bins"] | None = None,
-    ) -> "Lines":
-        """Fit the lines of all bins, or of some.
-
-        No mode can be in a bin whose envelope peaks later than `latest_peak` seconds after the onset, or falls by less
-        than `least_damping` 1/s, or as fast as the window.
-        """
-        lines = [
-            _regress(
-                narrow_band(sound[None], fft_size=fft_size, hop=hop, bins=bins)[0], hop / sample_rate, fft_size // hop
-            )
-            for sound in sounds
-        ]
-        gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
-        # The line of a bin of noise, extended to the onset from its late peak, may start anywhere: reject before
-        # ranking. An envelope that falls as fast as the window itself is the window's, not a mode's.
-        ringing = (damping >= least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
-        # The phase is known up to whole turns from one hop to the next: those that bring it nearest to the center.
-        numbers = torch.arange(gain.shape[1]) if bins is None else bins
-        center = numbers.double() * (sample_rate / fft_size)
-        turns = sample_rate / hop
-        frequency = center + torch.remainder(advance - center + turns / 2, turns) - turns / 2
-        return cls(
-            torch.where((peak <= latest_peak) & ringing, gain, 0.0),
-            damping,
-            frequency,
-            sample_rate,
-            sample_rate / fft_size,
-        )
-
     def modes(self, count: int) -> ModalBank:
         """Return up to `count` modes, the strongest of those that the recordings agree on.
 
@@ -147,6 +108,64 @@ class Lines:
         strongest = sorted(sorted(audible, key=lambda mode: -mode[2])[:count])
         table = torch.tensor(strongest, dtype=torch.float64).reshape(-1, 3)
         return ModalBank(table[:, 0].clone(), table[:, 1].clone())
+
+
+@dataclass(frozen=True)
+class ShortTime(ModeFinder):
+    """The paper's method: one candidate a bin of a short-time spectrum, log-linear decay, consensus (section 3.4).
+
+    Times are in seconds so that they hold at any sample rate; the defaults are the paper's 2048 and 64 samples at
+    44.1 kHz. Kept are the modes of the largest mean gain.
+    """
+
+    fft_seconds: float = 2048 / 44100
+    """Length of the transform, rounded to a power of two in samples."""
+    hop_seconds: float = 64 / 44100
+    """Step between frames, rounded to a power of two in samples."""
+    latest_peak: float = 0.1
+    """A bin whose envelope peaks later than this after the onset holds noise, s."""
+    least_damping: float = 0.5
+    """A bin that decays more slowly than this is hum, 1/s."""
+
+    def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:
+        """Return the modes of `sounds`, at most `modes` of them."""
+        return self._lines(sounds, sample_rate).modes(self.modes)
+
+    def gains(
+        self, sounds: Float[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
+    ) -> Float64[Tensor, "contacts modes"]:
+        """Return the gain g of eq. 5 in each recording at the bins nearest to the modes: not negative, without a sign.
+
+        It is that of the bin's narrow-band signal, two thirds of a steady sine's amplitude at most.
+        """
+        nearest = torch.round(bank.frequency * self._fft_size(sample_rate) / sample_rate).long()
+        bins, modes = torch.unique(nearest, return_inverse=True)
+        return self._lines(sounds, sample_rate, bins).gain[:, modes]
+
+    def _fft_size(self, sample_rate: float) -> int:
+        return _power_of_two(self.fft_seconds * sample_rate, least=32)
+
+    def _lines(
+        self, sounds: Float[Tensor, "contacts samples"], sample_rate: float, bins: Int[Tensor, " bins"] | None = None
+    ) -> Lines:
+        """Return the lines of all bins, or of some.
+
+        No mode can be in a bin whose envelope peaks late, or falls as slowly as hum, or as fast as the window.
+        """
+        fft_size = self._fft_size(sample_rate)
+        hop = min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
+        signals = (narrow_band(sound[None], fft_size=fft_size, hop=hop, bins=bins)[0] for sound in sounds)
+        lines = [_regress(each, hop / sample_rate, fft_size // hop) for each in signals]
+        gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
+        # The line of a bin of noise, extended to the onset from its late peak, may start anywhere: reject before
+        # ranking. An envelope that falls as fast as the window itself is the window's, not a mode's.
+        ringing = (damping >= self.least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
+        # The phase is known up to whole turns from one hop to the next: those that bring it nearest to the center.
+        numbers = torch.arange(gain.shape[1]) if bins is None else bins
+        center, turns = numbers.double() * (sample_rate / fft_size), sample_rate / hop
+        frequency = center + torch.remainder(advance - center + turns / 2, turns) - turns / 2
+        gain = torch.where((peak <= self.latest_peak) & ringing, gain, 0.0)
+        return Lines(gain, damping, frequency, sample_rate, sample_rate / fft_size)
 
 
 def _nearest(
@@ -222,3 +241,7 @@ def _regress(
     gain = torch.where(count >= 3, torch.exp(mean_level - slope * mean_time), 0.0)
     turn = (signals[..., 1:] * signals[..., :-1].conj() * used[..., 1:]).sum(-1)
     return gain, -slope, torch.angle(turn).to(torch.float64) / (2 * math.pi * step), peak.to(torch.float64) * step
+
+
+def _power_of_two(value: float, *, least: int) -> int:
+    return max(least, 1 << round(math.log2(max(value, 1.0))))
