@@ -327,7 +327,7 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
     from avmsf.capture.table import in_folder, read_rows
     from avmsf.cli.info import describe_shape
     from avmsf.mesh.surface import read_surface, write_surface
-    from avmsf.pipeline.scene import SceneStages
+    from avmsf.pipeline.scene import CLOUD, SceneStages
     from avmsf.pipeline.shape import keep_surface, object_shape
 
     folder, stages, words = options.capture, options.stages, "-o field.safetensors"
@@ -343,7 +343,7 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
     with stages.lock("avmsf fit"):
         match options.until:
             case "gaussians":
-                made = scene.cloud
+                made = scene[CLOUD]
             case "features":
                 made = scene.features
                 model = "--preset paper" if options.preset == "paper" else "--gain-model visual"

@@ -33,7 +33,7 @@ from avmsf.mesh.surface import Surface
 from avmsf.modal.clips import resampled, with_length
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
-from avmsf.pipeline.scene import FEATURES, SceneStages
+from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate import recipe
@@ -99,7 +99,7 @@ class ObjectInputs:
         Raises SceneError where nothing shows the object.
         """
         with self._stages(identifier, self._best_views, views) as stages:
-            return read_splats(stages.cloud.path)
+            return read_splats(stages[CLOUD].path)
 
     def bodies(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""

@@ -14,12 +14,12 @@ from torch import Tensor
 from avmsf.capture.placement import FACTORS, WRONG_ROWS, FrameMismatch, check_placement
 from avmsf.capture.settings import CaptureSettings, unit_named
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.points import farthest_points
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.folder import check_cameras
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.photographs.visual_hull import Votes, carve
+from avmsf.pipeline.views import spread_views
 
 MAX_VIEWS = 12
 """Views that are compared, as far apart as they stand."""
@@ -59,7 +59,9 @@ def compare_outlines(
         outline = torch.isfinite(tracer.depth(camera)).numpy()
         mask = cv2.resize(view.mask.numpy(), (width, height), interpolation=cv2.INTER_AREA) > 127
         either, differs = outline | mask, outline ^ mask
-        far = _distance_to_edge(mask) > 1.0 + MASK_PIXELS * scale
+        # Each pixel's distance to the nearest one on the other side of the mask's edge.
+        sides = (each.astype(np.uint8) for each in (mask, ~mask))
+        far = sum(cv2.distanceTransform(each, cv2.DIST_L2, 5) for each in sides) > 1.0 + MASK_PIXELS * scale
         area = max(1, int(either.sum()))
         found.append((differs.sum() / area, (differs & far).sum() / area, (outline.sum() / max(1, mask.sum())) ** 0.5))
     return OutlineDifference(*np.median(np.array(found), axis=0).tolist())
@@ -205,13 +207,9 @@ def _surface_of(hull: Votes) -> Float[Tensor, "places 3"]:
     return torch.from_numpy(hull.grid.centers(np.argwhere(edge) - 1))
 
 
-def _masked(views: Sequence[View]) -> list[View]:
+def _masked(views: Sequence[View]) -> Sequence[View]:
     """Return views with masks that show something, `MAX_VIEWS` at most, as far apart as they stand."""
-    masked = [view for view in views if view.foreground.any()]
-    if not masked:
-        return []
-    positions = torch.stack([view.camera.position for view in masked])
-    return [masked[row] for row in farthest_points(positions, min(MAX_VIEWS, len(masked))).tolist()]
+    return spread_views([view for view in views if view.foreground.any()], MAX_VIEWS)
 
 
 def _share_inside(contacts: Float[Tensor, "contacts 3"], views: Sequence[View]) -> float:
@@ -247,12 +245,3 @@ def _scaled(camera: Camera, factor: float) -> Camera:
     pose = camera.world_to_camera.clone()
     pose[:3, 3] *= factor
     return replace(camera, world_to_camera=pose)
-
-
-def _distance_to_edge(mask: np.ndarray) -> np.ndarray:
-    """Return each pixel's distance to the nearest one on the other side of the mask's edge."""
-    inside, outside = mask.astype(np.uint8), (~mask).astype(np.uint8)
-    distance: np.ndarray = cv2.distanceTransform(inside, cv2.DIST_L2, 5) + cv2.distanceTransform(
-        outside, cv2.DIST_L2, 5
-    )
-    return distance

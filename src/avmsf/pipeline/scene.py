@@ -42,8 +42,8 @@ class SceneStages(Pipeline):
 
     Gaussians that lie in the folder are the object's; where there are no photographs beside them, pictures of them from
     all sides are described. A mesh needs no Gaussians: its own surface is the object unless the settings say otherwise,
-    and pictures of it are described. Each raises what it raises; SceneError where the folder shows nothing of the
-    object.
+    and pictures of it are described. `VIEWS` is the folder of views, `CLOUD` the file of Gaussians. Each raises what it
+    raises; SceneError where the folder shows nothing of the object.
     """
 
     def __init__(
@@ -78,16 +78,6 @@ class SceneStages(Pipeline):
         """Raise SceneError, before anything is written, where the folder shows nothing of the object."""
         if not self:
             raise no_views(self.source_folder)
-
-    @property
-    def views(self) -> Kept:
-        """The folder of views."""
-        return self[VIEWS]
-
-    @property
-    def cloud(self) -> Kept:
-        """The file of Gaussians: the folder's own, or fitted to its views, those of a mesh included."""
-        return self[CLOUD]
 
     @property
     def features(self) -> Kept:
@@ -196,7 +186,7 @@ class SceneStages(Pipeline):
 
         Where fewer than 3 views have masks, pictures of the Gaussians stand for them.
         """
-        views, cloud = read_views(self.views.path), read_splats(self.cloud.path)
+        views, cloud = read_views(self[VIEWS].path), read_splats(self[CLOUD].path)
         enough = masks_suffice(views)
         source = f"{len(views)} views" if enough else "images of the Gaussians, as fewer than 3 views have masks,"
         self.listener.log(f"shape: of {source} and {len(cloud)} Gaussians")

@@ -28,6 +28,7 @@ from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
 from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
+from avmsf.pipeline.views import VIEWS
 from avmsf.reconstruction import ObjectShape
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
@@ -149,13 +150,13 @@ def _shape_of_views(
     stated = stated_moves(scene.source_folder, meters=settings.views_meters)
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
-        views = read_views(scene.views.path)
+        views = read_views(scene[VIEWS].path)
         warning = None if capture.surface is None else check_outlines(capture.surface, views, settings)
         if warning is not None:
             warnings.warn(warning, stacklevel=2)
         expect_contacts_in_views(impacts.contacts, views, settings, stated=stated)
     if scene.splats is not None:
-        points = read_splats(scene.cloud.path).centers
+        points = read_splats(scene[CLOUD].path).centers
         expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians", stated=stated)
     features, report = given or (load_features(scene.features.path), read_report(scene.features.path))
     surface, digest = object_shape(capture.surface, scene)
@@ -219,7 +220,7 @@ def object_shape(found: Surface | None, scene: SceneStages | None) -> tuple[Call
             raise SceneError.expected(wanted, name="surface", advice="add surface.obj")
 
         return unknown, ""
-    return once(scene.shape), f"{scene.cloud.digest} {scene.views.digest}"
+    return once(scene.shape), f"{scene[CLOUD].digest} {scene[VIEWS].digest}"
 
 
 def keep_surface(pipeline: Pipeline, make: Callable[[], Surface | ObjectShape], digest: str) -> Kept:

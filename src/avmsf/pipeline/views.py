@@ -110,7 +110,7 @@ def view_stages(source: Source, config: ViewsConfig, *, settings: CaptureSetting
             views = _rendered(source.path, config, settings=settings, log=log)
         else:
             views = _photographed(motion or source.path, config, meters=settings.views_meters, log=log)
-        write_views(_spread(views, config.count), path, replace=True)
+        write_views(spread_views(views, config.count), path, replace=True)
 
     def recipe() -> dict[str, Any]:
         names = ("rendered", "count") if source.kind == "mesh" else ("longest", "masks", "count")
@@ -134,7 +134,7 @@ def _copy_photographs(source: Source, folder: Path) -> None:
         shutil.copyfile(file, place)
 
 
-def _spread(views: Sequence[View], count: int) -> Sequence[View]:
+def spread_views(views: Sequence[View], count: int) -> Sequence[View]:
     """Return at most `count` views whose cameras are farthest apart, in the order of all; all for 0."""
     if not 0 < count < len(views):
         return views

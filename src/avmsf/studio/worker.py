@@ -31,7 +31,7 @@ from avmsf.errors import NO_MEMORY, AvmsfError, CaptureWarning, lacks_memory
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
 from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.scene import SceneStages
+from avmsf.pipeline.scene import CLOUD, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.capture import COMMAND
 
@@ -94,7 +94,7 @@ def make_object(task: Values, events: EventWriter) -> Values:
     scene = SceneStages(folder, stages, SceneConfig(), settings=settings_of(folder), listener=events.listener)
     scene.expect_any()
     with stages.lock(COMMAND):
-        return {"object": str(scene.cloud.path)}
+        return {"object": str(scene[CLOUD].path)}
 
 
 def lead(task: Values, events: EventWriter) -> Values:
