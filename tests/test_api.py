@@ -39,7 +39,7 @@ from avmsf.pipeline import PipelineConfig
 from factories.plate_capture import fill_plate
 from factories.plate_field import RATE, plate_impacts
 from factories.raising import raises, warns
-from factories.settings import sets
+from factories.verbs import sets
 
 NAMES = {
     *("Capture", "SoundField", "Surface"),

@@ -28,8 +28,8 @@ from avmsf.baselines.sonicgauss.small import (
 from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, draw_times, flow_loss, integrate, train
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
+from factories.clouds import SECONDS, cloud, impacts
 from factories.raising import raises
-from factories.sonicgauss_cases import SECONDS, cloud, impacts
 
 TINY = SmallConfig(width=16, heads=2, blocks=1, encoder_blocks=1, tokens=4), TrainingConfig(4, batch=4, rate=1e-3)
 

@@ -23,8 +23,8 @@ from avmsf.baselines.sonicgauss.published import PublishedSizes, PublishedSonicG
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.task import report_of
+from factories.clouds import cloud, impacts
 from factories.raising import raises
-from factories.sonicgauss_cases import cloud, impacts
 
 pytest.importorskip("diffusers")
 

@@ -23,8 +23,7 @@ from factories.made_fields import directional, positional, saved, sounding
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.plate_field import CONTACT_TIME, HIGHEST, RATE
 from factories.raising import raises
-from factories.settings import sets
-from factories.verbs import results_of, run_verb
+from factories.verbs import results_of, run_verb, sets
 from oracles.plate import plate_modes
 
 Streams = pytest.CaptureFixture[str]

@@ -28,8 +28,7 @@ from avmsf.modal.modes import ModalBank
 from factories.made_clap import save_clap
 from factories.made_fields import FIELDS, mixture, places, sounding
 from factories.raising import raises
-from factories.settings import sets
-from factories.verbs import results_of, run_verb
+from factories.verbs import results_of, run_verb, sets
 
 Streams = pytest.CaptureFixture[str]
 RATE = 8000.0

@@ -18,8 +18,7 @@ from avmsf.modal.extraction.stft import ShortTime
 from factories.plate_field import RATE
 from factories.plate_set import fill_plates
 from factories.raising import raises
-from factories.settings import sets
-from factories.verbs import results_of, run_verb
+from factories.verbs import results_of, run_verb, sets
 
 Streams = pytest.CaptureFixture[str]
 CHEAP = ("--methods", "knn3,nearest", "white-noise", "--no-cdpam")

@@ -20,9 +20,8 @@ from avmsf.photographs.folder import write_frames, write_views
 from avmsf.plotting.surfaces import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 from factories.plate_capture import PLATE, TINY, fill_plate
-from factories.settings import sets
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
-from factories.verbs import results_of
+from factories.verbs import results_of, sets
 
 Streams = pytest.CaptureFixture[str]
 LIFT = sets("lift.encoder=descriptors lift.points=1200")

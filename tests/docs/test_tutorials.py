@@ -13,8 +13,8 @@ from avmsf.evaluation.registry import METHODS, METRICS
 from avmsf.photographs.folder import write_frames
 from factories.plate_capture import fill_plate
 from factories.plate_set import fill_plates
-from factories.settings import sets
 from factories.small_scene import slab_views
+from factories.verbs import sets
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS = REPOSITORY / "docs"

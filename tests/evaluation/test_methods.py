@@ -38,10 +38,10 @@ from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.synthesis import synthesize
+from factories.clouds import cloud
 from factories.made_sheet import sheet_over
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
-from factories.sonicgauss_cases import cloud
 from oracles.block import block
 
 TINY = replace(QUICK, hidden=16, layers=1, warmup_steps=6, steps=4, fft_sizes=(256,), early=256)

@@ -1,9 +1,11 @@
-"""Open sheets over a rectangle."""
+"""Open sheets over a rectangle, and a bent tile as a painted mesh: the smallest object to simulate."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 
 from avmsf.mesh.surface import Surface
 
@@ -18,3 +20,16 @@ def sheet_over(
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     points = np.stack([across, along, height(across, along)], axis=-1).reshape(-1, 3)
     return Surface(torch.from_numpy(points).float(), torch.from_numpy(faces))
+
+
+def tile(path: Path, *, bend: float = 1.0) -> Path:
+    """Write a bent tile in four colors, open below; without a bend it is flat."""
+    across, along = np.meshgrid(np.linspace(-0.1, 0.1, 13), np.linspace(-0.07, 0.07, 9), indexing="ij")
+    places = np.stack([across, along, bend * (0.6 * across**2 + 0.3 * across * along)], axis=-1).reshape(-1, 3)
+    rows = np.arange(13 * 9).reshape(13, 9)
+    corners = [rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]]
+    faces = np.stack([corners[0], corners[1], corners[2], corners[0], corners[2], corners[3]], axis=-1).reshape(-1, 3)
+    colors = np.array([[200, 40, 30], [30, 90, 200], [240, 220, 60], [70, 160, 80]], dtype=np.uint8)
+    painted = colors[(places[:, 0] > 0) + 2 * (places[:, 1] > 0)]
+    path.write_bytes(trimesh.Trimesh(places, faces, vertex_colors=painted, process=False).export(file_type="ply"))
+    return path

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from avmsf.capture import Capture, write_capture
 from factories.plate_field import RATE, plate_impacts, rectangle
-from factories.settings import sets
+from factories.verbs import sets
 from oracles.plate import Plate
 
 PLATE = Plate(alpha=40.0)

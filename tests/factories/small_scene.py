@@ -9,7 +9,7 @@ from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import View
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from factories.plate_capture import PLATE
-from factories.settings import sets
+from factories.verbs import sets
 
 THICKNESS = 0.02
 """Of the slab, meters; its upper side is the plate that is struck, at z = 0."""

@@ -1,4 +1,4 @@
-"""A verb of the command line, run in this process."""
+"""Verbs of the command line, run in this process, and their settings."""
 
 import json
 from importlib import import_module
@@ -29,3 +29,8 @@ def results_of(streams: pytest.CaptureFixture[str], *words: object, code: int | 
     assert code is None or ended == code
     out, err = streams.readouterr()
     return json.loads(out), err
+
+
+def sets(settings: str) -> tuple[str, ...]:
+    """Return the arguments --set NAME=VALUE of settings that blanks separate."""
+    return tuple(word for each in settings.split() for word in ("--set", each))

@@ -35,12 +35,11 @@ from avmsf.pipeline.scene import without_far
 from avmsf.pipeline.shape import OFF_MESH, moved_onto
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 from factories.ball_views import MIDDLE, RADIUS
-from factories.clouds import random_cloud
+from factories.clouds import cloud, random_cloud
 from factories.plate_capture import fill_plate
 from factories.raising import raises
-from factories.settings import sets
 from factories.small_scene import slab, slab_views
-from factories.sonicgauss_cases import cloud
+from factories.verbs import sets
 
 
 def lifted(features: torch.Tensor) -> Lifted:

@@ -23,7 +23,7 @@ from avmsf.pipeline.bodies import expect_no_recordings, guess_field
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from factories.made_modes import breathing_sphere
 from factories.raising import raises
-from factories.settings import sets
+from factories.verbs import sets
 from oracles.block import block
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.02, 0.012

@@ -6,7 +6,7 @@ import pytest
 
 from avmsf.simulate.recipe import ObjectRecipe
 from avmsf.simulate.simulation import Simulation, simulate_object
-from factories.made_tile import tile
+from factories.made_sheet import tile
 
 
 @pytest.fixture(scope="session")

@@ -23,7 +23,7 @@ from avmsf.simulate.simulation import Simulation, simulate_object
 from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
 from avmsf.simulate.strikes import MIN_NORMAL_HEIGHT, draw_strikes, nearest_on
 from factories.looked_at import surface_of
-from factories.made_tile import tile
+from factories.made_sheet import tile
 from factories.raising import raises
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

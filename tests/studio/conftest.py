@@ -37,22 +37,13 @@ def browser() -> Iterator["Browser"]:
         chromium.close()
 
 
-class _Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of each request."""
-
-    def end_headers(self) -> None:
-        self.send_header("Cache-Control", "no-store")
-        super().end_headers()
-
-
 @pytest.fixture(scope="session")
 def serve() -> Iterator[Callable[[Path], str]]:
     """Return a function that serves a folder on loopback until the tests end, and returns its URL."""
     with contextlib.ExitStack() as servers:
 
         def start(folder: Path) -> str:
-            handler = functools.partial(_Quiet, directory=str(folder))
+            handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
             server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
             thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
             thread.start()
