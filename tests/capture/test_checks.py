@@ -151,7 +151,7 @@ def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
     folder = fill(
         tmp_path / ".work" / "cup",
         rows=rows,
-        replace={"b.wav": clipped, "c.wav": double, "d.wav": np.zeros(4000), "f.wav": ring(), "stray.wav": ring()},
+        replace={"b.wav": clipped, "c.wav": double, "d.wav": np.zeros(4000), "f.wav": ring(), "STRAY.WAV": ring()},
     )
     (folder / "e.wav").write_bytes(b"RIFF")
     # None of the capture's.
@@ -173,7 +173,7 @@ def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
     assert problems["gone.wav"].startswith("gone.wav")
     assert "8000 Hz" in rates
     assert "5, 6" in repeated
-    assert "stray.wav" in unlisted
+    assert "STRAY.WAV" in unlisted
     assert "002" not in unlisted
     # What the command line prints as JSON.
     assert json.loads(json.dumps(asdict(report), allow_nan=False))["recordings"][1]["clipped"] > 3

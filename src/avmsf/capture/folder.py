@@ -161,7 +161,7 @@ def _copies(issues: Issues) -> list[str]:
 
 def _unlisted(folder: Path, names: Collection[str]) -> list[str]:
     """Return a sentence on wav files without a row; hidden ones, such as what the studio has removed, are left out."""
-    found = (path.relative_to(folder).as_posix() for path in files_in(folder) if path.suffix == ".wav")
+    found = (path.relative_to(folder).as_posix() for path in files_in(folder) if path.suffix.lower() == ".wav")
     unlisted = [name for name in found if name not in names]
     verb = "has" if len(unlisted) == 1 else "have"
     return [f"{counted(len(unlisted), 'wav file')} {verb} no row in {TABLE}: {listed(unlisted)}"] if unlisted else []

@@ -46,7 +46,7 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
             "another, write response_channel in capture.toml"
         )
     if clipped:
-        problems.append(f"{counted(clipped, 'clipped sample')}: turn the gain down and record it again")
+        problems.append(f"{counted(clipped, 'clipped sample')}: record it again with less gain, or remove its row")
     if second is not None:
         problems.append(f"a second impact at {second / rate:.3f} s: record it again, or reduce seconds")
     if noise > HIGHEST_NOISE_DB:

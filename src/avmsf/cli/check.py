@@ -152,7 +152,7 @@ def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None
     rows = [
         (
             row.file,
-            "unreadable" if not row.readable else "warning" if row.problems or row.file in doubtful else "good",
+            "error" if not row.readable else "warning" if row.problems or row.file in doubtful else "good",
             decimals(row.seconds, 2),
             decimals(row.sample_rate, 0),
             decimals(row.peak_db, 1),

@@ -150,7 +150,7 @@ def run(options: Options) -> int:
     before, after = ModeLevels.of(old), ModeLevels.of(new)
     rows = mode_changes(before, after)
     notes = [f"note: {each}" for each in notes_on(edits, new, before, after, scale=options.scale)]
-    show("\n".join([changes_table(rows, before, after), *notes]))
+    show("\n".join([changes_table(rows, before, after, new.is_mode), *notes]))
     if options.plots is not None:
         draw(options.plots, (old, contact), (new, options.scale * contact), edits[-1])
     show(f"wrote {options.output}")

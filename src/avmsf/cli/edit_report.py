@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
@@ -42,19 +42,23 @@ def mode_changes(before: ModeLevels, after: ModeLevels) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in cells]
 
 
-def changes_table(rows: list[dict[str, Any]], before: ModeLevels, after: ModeLevels) -> str:
-    """Return the modes of most energy, before or after, as a table."""
+def changes_table(
+    rows: list[dict[str, Any]], before: ModeLevels, after: ModeLevels, is_mode: Bool[Tensor, " modes"]
+) -> str:
+    """Return the modes of most energy, before or after, as a table; supporting poles are in none of its rows."""
+    count = int(is_mode.sum())
     energy = (before.size.square() * before.t60).maximum(after.size.square() * after.t60)
-    listed = energy.argsort(descending=True)[:MAX_LISTED_MODES].sort().values.tolist()
+    most = energy.where(is_mode, -1.0).argsort(descending=True)
+    listed = most[: min(MAX_LISTED_MODES, count)].sort().values.tolist()
     cells = []
     for row in (rows[place] for place in listed):
         change = row["level_change_db"]
         level = "silent" if row["silent"] else decimals(change, 1) if math.isfinite(change) else "back"
         frequencies = [format_number(row[f"frequency_{when}"], 5) for when in ("before", "after")]
         cells.append([*frequencies, *(format_number(row[f"t60_{when}"]) for when in ("before", "after")), level])
-    title = f"the {MAX_LISTED_MODES} modes of most energy among {len(rows)}"
-    if len(rows) <= MAX_LISTED_MODES:
-        title = counted(len(rows), "mode")
+    title = f"the {MAX_LISTED_MODES} modes of most energy among {count}"
+    if count <= MAX_LISTED_MODES:
+        title = counted(count, "mode")
     columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level change (dB)"]
     return table(f"{title}, before and after", columns, cells, words=0)
 

@@ -127,7 +127,7 @@ def run(options: Options) -> int:
     )
     values = {"files": list(map(str, paths)), "sample_rate": field.sample_rate, "seconds": seconds}
     print_result(text, {**values, "peak": peak, "peak_dbfs": peak_dbfs})
-    next_command("avmsf export", options.field, "--to web -o page")
+    next_command("avmsf export", options.field, "--to web -o page.html")
     return 0
 
 

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.text import counted
@@ -93,6 +93,7 @@ def change_material(
     bank = ModalBank(
         torch.where(left, before.frequency, angular / (2.0 * math.pi)), torch.where(left, before.damping, damping)
     )
+    lost = before.frequency[dead & field.is_mode].tolist()
     mass = (new.density / old.density) * size**3
     scale = (before.frequency / bank.frequency) ** law.frequency / mass**law.mass
     entry: dict[str, Any] = {
@@ -101,8 +102,8 @@ def change_material(
         "to": asdict(new),
         "size": float(size),
         "law": law.name,
-        "overdamped_hertz": bank.frequency[dead].tolist(),
-        "remarks": _remarks(old, new, bank, dead),
+        "overdamped_hertz": lost,
+        "remarks": _remarks(old, new, lost, int(field.is_mode.sum())),
     }
     changed = edited(field, bank, torch.where(left, 0.0, scale), entry=entry, length=size)
     return replace(changed, origin=replace(changed.origin, capture=_name(field.origin, old, new)))
@@ -126,8 +127,8 @@ def _damps(material: Material) -> bool:
     return material.alpha > 0 or material.beta > 0
 
 
-def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, " modes"]) -> list[str]:
-    """Return messages on neglected changes and overdamped modes."""
+def _remarks(old: Material, new: Material, lost: Sequence[float], modes: int) -> list[str]:
+    """Return messages on neglected changes, and on the modes, in Hz, of all that are overdamped."""
     remarks = []
     if new.poisson != old.poisson:
         stiffer = math.sqrt((1.0 - old.poisson**2) / (1.0 - new.poisson**2)) - 1.0
@@ -135,10 +136,10 @@ def _remarks(old: Material, new: Material, bank: ModalBank, dead: Bool[Tensor, "
             f"Poisson's ratio changes from {old.poisson:g} to {new.poisson:g}, which this law neglects: bending "
             f"frequencies of a thin wall would change by about {100 * stiffer:+.1f} %, and the mode shapes slightly"
         )
-    if bool(dead.any()):
+    if lost:
         remarks.append(
-            f"{int(dead.sum())} of {counted(len(bank), 'mode')} overdamped by alpha {new.alpha:g} 1/s and beta "
-            f"{new.beta:g} s, and silent: " + ", ".join(f"{each:.4g} Hz" for each in bank.frequency[dead].tolist())
+            f"{len(lost)} of {counted(modes, 'mode')} overdamped by alpha {new.alpha:g} 1/s and beta "
+            f"{new.beta:g} s, and silent: " + ", ".join(f"{each:.4g} Hz" for each in lost)
         )
     return remarks
 

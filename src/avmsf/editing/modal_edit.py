@@ -56,20 +56,20 @@ def muted(field: SoundField) -> Bool[Tensor, " modes"]:
 
 
 def silenced(field: SoundField) -> Bool[Tensor, " modes"]:
-    """Return which modes are silent because they lie at half the sample rate or above.
+    """Return which modes of the object are silent because they lie at half the sample rate or above.
 
     They stay in the bank for edits that restore them.
     """
-    return ~field.audible & ~muted(field)
+    return ~field.audible & ~muted(field) & field.is_mode
 
 
 def remarks(entries: Sequence[Mapping[str, Any]], field: SoundField) -> list[str]:
     """Return messages on the edits `entries` and on modes of the field that are silent."""
     words = [remark for entry in entries for remark in entry.get("remarks", [])]
-    silent = field.bank.frequency[silenced(field)].tolist()
+    silent, modes = field.bank.frequency[silenced(field)].tolist(), counted(int(field.is_mode.sum()), "mode")
     if silent:
         words.append(
-            f"{len(silent)} of {counted(len(field.bank), 'mode')}, from {min(silent):.4g} Hz to {max(silent):.4g} Hz, "
+            f"{len(silent)} of {modes}, from {min(silent):.4g} Hz to {max(silent):.4g} Hz, "
             f"{'is' if len(silent) == 1 else 'are'} silent because not below half the sample rate of "
             f"{field.sample_rate:g} Hz; lower the pitch to restore them"
         )

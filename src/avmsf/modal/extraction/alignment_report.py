@@ -76,7 +76,7 @@ class AlignmentReport:
         ]
         found += [
             f"{name}: its noise and its sound are both about {abs(change):.0f} dB {'above' if change > 0 else 'below'} "
-            "the others': another gain or scale; export it as the others, or record it again"
+            "the others': another gain or scale; export it as the others, record it again, or remove its row"
             for name, change in self.gain_changes_db.items()
         ]
         if self.uneven_decay_db is not None:
