@@ -12,7 +12,7 @@ from torch import Tensor
 from avmsf.errors import ArrayError, FitError
 from avmsf.field.gains.elastic import REACH
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
+from avmsf.field.hammer_access import HAMMER_DIAMETER, reached_on_mesh, reached_on_points
 from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import SoundField
 from factories.believing_field import (
@@ -184,12 +184,16 @@ def cup(inner: float, height: float) -> trimesh.Trimesh:
     return mesh
 
 
-def by_mesh(mesh: trimesh.Trimesh) -> MeshAccess:
-    return MeshAccess(np.array(mesh.vertices), np.array(mesh.faces))
+def struck_on(mesh: trimesh.Trimesh, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return reached_on_mesh(np.array(mesh.vertices), np.array(mesh.faces), places)
 
 
-def by_points(mesh: trimesh.Trimesh) -> PointAccess:
-    return PointAccess(np.array(trimesh.sample.sample_surface(mesh, 12_000, seed=0)[0]))
+def by_mesh(mesh: trimesh.Trimesh, places: np.ndarray) -> np.ndarray:
+    return struck_on(mesh, places)[0]
+
+
+def by_points(mesh: trimesh.Trimesh, places: np.ndarray) -> np.ndarray:
+    return reached_on_points(np.array(trimesh.sample.sample_surface(mesh, 12_000, seed=0)[0]), places)
 
 
 both = pytest.mark.parametrize("access", [by_mesh, by_points])
@@ -201,11 +205,9 @@ def test_nothing_inside_a_closed_shell_can_be_struck(access, hollow) -> None:  #
     outer, inner = trimesh.creation.icosphere(4, 0.1), trimesh.creation.icosphere(4, hollow)
     inner.invert()
     shell = trimesh.util.concatenate([outer, inner])
-    struck, _, _ = access(shell)(np.array(inner.vertices)[::10])
-    assert not struck.any()
+    assert not access(shell, np.array(inner.vertices)[::10]).any()
     # Points leave their surface less sure than triangles do.
-    struck, _, _ = access(shell)(np.array(outer.vertices)[::10])
-    assert struck.mean() > (0.99 if access is by_mesh else 0.95)
+    assert access(shell, np.array(outer.vertices)[::10]).mean() > (0.99 if access is by_mesh else 0.95)
 
 
 @pytest.mark.parametrize("inner", [0.03, 0.05])
@@ -218,19 +220,18 @@ def test_a_wall_inside_is_struck_over_the_opposite_rim_alone(inner: float) -> No
     def wall(depth: float) -> np.ndarray:
         return np.stack([inner * np.cos(angle), inner * np.sin(angle), np.full(40, height - depth)], axis=1)
 
-    judge = by_mesh(cup(inner, height))
+    open_cup = cup(inner, height)
     # Turns are tried 30 degrees apart, so that the steepest may miss the rim's middle by 15; the rod is thick.
-    assert judge(wall(0.5 * reach * np.cos(np.radians(15)) - HAMMER_DIAMETER))[0].all()
-    assert not judge(wall(1.05 * reach))[0].any()
-    assert not judge(wall(2 * reach))[0].any()
+    assert by_mesh(open_cup, wall(0.5 * reach * np.cos(np.radians(15)) - HAMMER_DIAMETER)).all()
+    assert not by_mesh(open_cup, wall(1.05 * reach)).any()
+    assert not by_mesh(open_cup, wall(2 * reach)).any()
 
 
 def test_the_axis_of_a_hammer_lies_clear_and_is_the_nearest_to_the_normal() -> None:
     inner, height = 0.03, 0.18
-    judge = by_mesh(cup(inner, height))
     # The outer wall is struck straight on, the inner one over the opposite rim, 60 mm away.
     places = np.array([[inner + WALL, 0.0, 0.1], [inner, 0.0, height - 0.02], [inner, 0.0, height - 0.04]])
-    struck, _, axes = judge(places)
+    struck, _, axes = struck_on(cup(inner, height), places)
     assert struck.all()
     assert axes[0] == pytest.approx([1.0, 0.0, 0.0], abs=0.06)
     tilt = np.degrees(np.arccos(-axes[1:, 0]))
@@ -242,17 +243,17 @@ def test_the_axis_of_a_hammer_lies_clear_and_is_the_nearest_to_the_normal() -> N
 def test_suggestions_are_struck_along_the_axis_that_lies_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     contacts, leaning = bar_contacts(6), np.array([0.6, 0.0, 0.8])
 
-    def judge(access: MeshAccess, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def judge(vertices: np.ndarray, faces: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return np.ones(len(places), dtype=bool), places, np.broadcast_to(leaning, places.shape)
 
-    monkeypatch.setattr(MeshAccess, "__call__", judge)
+    monkeypatch.setattr("avmsf.field.next_contacts.reached_on_mesh", judge)
     found = suggest(sound_field(elastic_field(contacts, drawn_gains(contacts, seed=1))), 2).directions
     assert torch.allclose(found, -torch.from_numpy(leaning).expand(2, 3))
 
 
 def test_a_place_within_a_wall_is_moved_onto_its_surface_and_one_far_off_is_none() -> None:
-    judge = by_mesh(trimesh.creation.box((0.3, 0.2, 0.1)))
-    struck, feet, _ = judge(np.array([[0.01, 0.02, 0.048], [0.0, 0.0, 0.0], [0.0, 0.0, 0.07]]))
+    places = np.array([[0.01, 0.02, 0.048], [0.0, 0.0, 0.0], [0.0, 0.0, 0.07]])
+    struck, feet, _ = struck_on(trimesh.creation.box((0.3, 0.2, 0.1)), places)
     assert struck.tolist() == [True, False, False]
     assert feet[0] == pytest.approx([0.01, 0.02, 0.05])
 

@@ -33,95 +33,74 @@ _NEIGHBORS = 12
 scattered at random, one disc in e^12 = 160,000 of that size has none."""
 
 
-class MeshAccess:
-    """Tests places by the triangles of a closed surface, or of an open one that is seen from outside."""
+def reached_on_mesh(
+    vertices: Float64[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    places: Float64[np.ndarray, "places 3"],
+) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"], Float64[np.ndarray, "places 3"]]:
+    """Return which places, meters, can be struck, the surface's nearest points, and the hammer's axis there.
 
-    def __init__(self, vertices: Float64[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> None:
-        self._size, triangles = float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices[faces]
-        crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        areas = np.linalg.norm(crosses, axis=1)
-        solid = areas > 0
-        self._triangles, self._normals = triangles[solid], crosses[solid] / areas[solid, None]
-        self._closest, self._rays = ClosestPoints(self._triangles), RayCaster(self._triangles)
-
-    def __call__(
-        self, places: Float64[np.ndarray, "places 3"]
-    ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"], Float64[np.ndarray, "places 3"]]:
-        """Return which places, meters, can be struck, the surface's nearest points, and the hammer's axis there.
-
-        The axis is a unit vector away from the surface: of those that lie clear the one nearest to the normal.
-        """
-        found, gap = self._closest(places), _GAP_RATIO * self._size
-        feet = (self._triangles[found.rows] * found.weights[:, :, None]).sum(axis=1)
-        normals = self._normals[found.rows]
-        tips, near = feet + (_RADIUS + gap) * normals, found.distances <= MAX_DISTANCE_RATIO * self._size
-        open_to = near & (self._free(feet + gap * normals, normals) > _RADIUS)
-        reached, used = np.zeros(len(places), dtype=bool), normals.copy()
-        for axes in _axes(normals):
-            left = np.flatnonzero(open_to & ~reached)
-            reached[left] = self._clear(tips[left], axes[left])
-            used[left] = axes[left]
-        return reached, feet, used
-
-    def _clear(
-        self, tips: Float64[np.ndarray, "rods 3"], axes: Float64[np.ndarray, "rods 3"]
-    ) -> Bool[np.ndarray, " rods"]:
-        """Return whether rods with these middles of their round tips lie clear."""
-        clear = np.isinf(self._free(tips, axes))
-        one, other = _across(axes)
-        for turn in range(_SIDES):
-            angle = 2 * math.pi * turn / _SIDES
-            outward = math.cos(angle) * one + math.sin(angle) * other
-            clear &= self._free(tips, outward) > _RADIUS
-            clear &= np.isinf(self._free(tips + _RADIUS * outward, axes))
-        return clear
-
-    def _free(
-        self, origins: Float64[np.ndarray, "rays 3"], directions: Float64[np.ndarray, "rays 3"]
-    ) -> Float64[np.ndarray, " rays"]:
-        """Return the distance to the first triangle along each ray."""
-        return self._rays(origins, directions, lead=0.0)[1]
+    The surface is closed, or an open one that is seen from outside. The axis is a unit vector away from it: of those
+    that lie clear the one nearest to the normal.
+    """
+    size, triangles = float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices[faces]
+    crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    areas = np.linalg.norm(crosses, axis=1)
+    triangles, all_normals = triangles[areas > 0], crosses[areas > 0] / areas[areas > 0, None]
+    found, gap, rays = ClosestPoints(triangles)(places), _GAP_RATIO * size, RayCaster(triangles)
+    feet, normals = (triangles[found.rows] * found.weights[:, :, None]).sum(axis=1), all_normals[found.rows]
+    tips, near = feet + (_RADIUS + gap) * normals, found.distances <= MAX_DISTANCE_RATIO * size
+    open_to = near & (rays(feet + gap * normals, normals, lead=0.0)[1] > _RADIUS)
+    reached, used = np.zeros(len(places), dtype=bool), normals.copy()
+    for axes in _axes(normals):
+        left = np.flatnonzero(open_to & ~reached)
+        reached[left] = _lies_clear(rays, tips[left], axes[left])
+        used[left] = axes[left]
+    return reached, feet, used
 
 
-class PointAccess:
-    """Tests places by points all over a surface, where there are no triangles.
+def _lies_clear(
+    rays: RayCaster, tips: Float64[np.ndarray, "rods 3"], axes: Float64[np.ndarray, "rods 3"]
+) -> Bool[np.ndarray, " rods"]:
+    """Return whether rods with these middles of their round tips meet no triangle."""
+    clear = np.isinf(rays(tips, axes, lead=0.0)[1])
+    one, other = _across(axes)
+    for turn in range(_SIDES):
+        angle = 2 * math.pi * turn / _SIDES
+        outward = math.cos(angle) * one + math.sin(angle) * other
+        clear &= rays(tips, outward, lead=0.0)[1] > _RADIUS
+        clear &= np.isinf(rays(tips + _RADIUS * outward, axes, lead=0.0)[1])
+    return clear
+
+
+def reached_on_points(
+    points: Float64[np.ndarray, "points 3"], places: Float64[np.ndarray, "places 3"]
+) -> Bool[np.ndarray, " places"]:
+    """Return which places, meters, can be struck on a surface of which points are known all over.
 
     Between points the surface is unknown, so the rod is thick enough to slip through none of it. A place on one side of
     a thinner wall can be struck if the other side can: the two are one.
     """
+    points = points[:: -(-len(points) // _MAX_POINTS)]
+    tree, count = cKDTree(points), min(_NEIGHBORS + 1, len(points))
+    radius = max(_RADIUS, float(np.median(tree.query(points, k=count)[0].reshape(len(points), -1)[:, -1])))
+    near = points[tree.query(places, k=count)[1].reshape(len(places), -1)]
+    # The direction in which the points around each place spread least.
+    normals = np.linalg.svd(near - near.mean(axis=1, keepdims=True), full_matrices=True)[2][:, -1]
 
-    def __init__(self, points: Float64[np.ndarray, "points 3"]) -> None:
-        self._points = points[:: -(-len(points) // _MAX_POINTS)]
-        self._tree = cKDTree(self._points)
-        self._count = min(_NEIGHBORS + 1, len(self._points))
-        apart = self._tree.query(self._points, k=self._count)[0].reshape(len(self._points), -1)[:, -1]
-        self._radius = max(_RADIUS, float(np.median(apart)))
-
-    def __call__(
-        self, places: Float64[np.ndarray, "places 3"]
-    ) -> tuple[Bool[np.ndarray, " places"], Float64[np.ndarray, "places 3"], None]:
-        """Return which places, meters, can be struck, the places, and no axes: a normal of a few points is rough."""
-        normals = self._normals(places)
-        reached = np.zeros(len(places), dtype=bool)
-        for side in (normals, -normals):
-            tips = places + self._radius * side
-            # A tip that overlaps the surface by more than a third of its radius strikes what is behind it.
-            above = self._tree.query(tips)[0] > self._radius * 2 / 3
-            axes = np.stack(_axes(side), axis=1)
-            for row in np.flatnonzero(above & ~reached):
-                reached[row] = self._clear(tips[row], axes[row]).any()
-        return reached, places, None
-
-    def _clear(self, tip: Float64[np.ndarray, "3"], axes: Float64[np.ndarray, "axes 3"]) -> Bool[np.ndarray, " axes"]:
-        offsets = self._points - tip
+    def clear(tip: Float64[np.ndarray, "3"], axes: Float64[np.ndarray, "axes 3"]) -> Bool[np.ndarray, " axes"]:
+        offsets = points - tip
         along = offsets @ axes.T
         across = (offsets**2).sum(axis=1)[:, None] - along**2
-        return ~((along > 0) & (across < self._radius**2)).any(axis=0)
+        return ~((along > 0) & (across < radius**2)).any(axis=0)
 
-    def _normals(self, places: Float64[np.ndarray, "places 3"]) -> Float64[np.ndarray, "places 3"]:
-        """Return the direction in which the points around each place spread least."""
-        near = self._points[self._tree.query(places, k=self._count)[1].reshape(len(places), -1)]
-        return np.linalg.svd(near - near.mean(axis=1, keepdims=True), full_matrices=True)[2][:, -1]
+    reached = np.zeros(len(places), dtype=bool)
+    for side in (normals, -normals):
+        tips, axes = places + radius * side, np.stack(_axes(side), axis=1)
+        # A tip that overlaps the surface by more than a third of its radius strikes what is behind it.
+        for row in np.flatnonzero((tree.query(tips)[0] > radius * 2 / 3) & ~reached):
+            reached[row] = clear(tips[row], axes[row]).any()
+    return reached
 
 
 def _axes(normals: Float64[np.ndarray, "places 3"]) -> list[Float64[np.ndarray, "places 3"]]:

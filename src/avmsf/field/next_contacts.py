@@ -15,7 +15,7 @@ from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import off_surface
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.hammer_access import HAMMER_DIAMETER, MeshAccess, PointAccess
+from avmsf.field.hammer_access import HAMMER_DIAMETER, reached_on_mesh, reached_on_points
 from avmsf.field.posterior import energy_of, fitted_mixture
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.points import farthest_points
@@ -177,13 +177,11 @@ def _reachable(
 
     Without a body they stay where they are, and have no directions.
     """
-    body = gains.body
-    access = (
-        PointAccess(gains.points.double().numpy())
-        if body is None
-        else MeshAccess(body.nodes.double().numpy(), body.triangles[:, :3].numpy())
-    )
-    reached, places, axes = access(points.numpy())
+    body, places, axes = gains.body, points.numpy(), None
+    if body is None:
+        reached = reached_on_points(gains.points.double().numpy(), places)
+    else:
+        reached, places, axes = reached_on_mesh(body.nodes.double().numpy(), body.triangles[:, :3].numpy(), places)
     if not reached.any():
         wanted = f"positions that a hammer of {1000 * HAMMER_DIAMETER:g} mm reaches from outside"
         advice = "check the object's shape, or give candidates"
