@@ -99,7 +99,7 @@ def visit(browser: "Browser", site: Callable[..., str]) -> Iterator[Open]:
 
 
 @pytest.fixture(scope="module")
-def plain(browser: "Browser", site: Callable[..., str]) -> Iterator["Page"]:
+def page(browser: "Browser", site: Callable[..., str]) -> Iterator["Page"]:
     """Return one page of the plate's contacts without a server, for tests that leave no more behind than a blow."""
     with opening(browser) as open_page:
         yield open_page(site())

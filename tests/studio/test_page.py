@@ -36,8 +36,7 @@ def test_a_click_strikes_the_contact_that_it_shows_and_a_mode_is_painted_by_its_
     expect_painted(page, kind)
 
 
-def test_dragging_turns_and_does_not_strike(plain: "Page") -> None:
-    page = plain
+def test_dragging_turns_and_does_not_strike(page: "Page") -> None:
     page.click("#reset-view")
     x, y = on_screen(page, (0.0, 0.0, 0.01))
     before, before_row = on_screen(page, (0.1, 0.0, 0.01)), page.evaluate("avmsf.studio.last?.row")
@@ -49,8 +48,7 @@ def test_dragging_turns_and_does_not_strike(plain: "Page") -> None:
     assert np.hypot(*np.subtract(on_screen(page, (0.1, 0.0, 0.01)), before)) > 20
 
 
-def test_a_longer_press_strikes_harder(plain: "Page") -> None:
-    page = plain
+def test_a_longer_press_strikes_harder(page: "Page") -> None:
     page.click("#reset-view")
     page.mouse.move(*on_screen(page, (0.0, 0.0, 0.01)))
     forces = []
@@ -70,8 +68,7 @@ def test_a_longer_press_strikes_harder(plain: "Page") -> None:
     page.evaluate("Object.assign(avmsf.studio.bundle.manifest, { perNewton: false, backgroundForce: null })")
 
 
-def test_keys_turn_and_strike_what_is_in_the_middle(plain: "Page") -> None:
-    page = plain
+def test_keys_turn_and_strike_what_is_in_the_middle(page: "Page") -> None:
     page.click("#reset-view")
     page.locator("#stage canvas").focus()
     before = on_screen(page, (0.1, 0.0, 0.01))
@@ -118,8 +115,7 @@ def pixel(page: "Page", x: float, y: float) -> tuple[float, float]:
     return float(colors[0]), float(colors[2])
 
 
-def test_the_table_tells_pitch_decay_and_level_at_the_contact(plain: "Page") -> None:
-    page = plain
+def test_the_table_tells_pitch_decay_and_level_at_the_contact(page: "Page") -> None:
     row = page.evaluate("avmsf.strike([-0.12, -0.08, 0.01])")
     page.click("#tab-modes")
     cells = [float(text) for text in page.locator("tr[data-mode='3'] td").all_inner_texts()]
@@ -177,12 +173,12 @@ def thin_plate(count: int, *, start: float = 0.0) -> tuple[np.ndarray, np.ndarra
     return points.astype(np.float32), np.column_stack([0 * lateral, side]).astype(np.float32)
 
 
-def test_the_nearest_contacts_are_found_and_those_of_the_same_side_of_a_wall(plain: "Page") -> None:
+def test_the_nearest_contacts_are_found_and_those_of_the_same_side_of_a_wall(page: "Page") -> None:
     """Contacts drawn on both faces of a plate that is thinner than they are apart, against numpy."""
     points, normals = thin_plate(400)
     places = thin_plate(60, start=0.3)[0] * np.float32([1, 1, 0]) + np.float32([0, 0, 0.01])
     found = page_module(
-        plain,
+        page,
         "contacts",
         """({ Contacts }, { points, normals, places }) => {
           const flat = (values) => Float32Array.from(values.flat());
@@ -202,12 +198,12 @@ def test_the_nearest_contacts_are_found_and_those_of_the_same_side_of_a_wall(pla
     assert all(side is None for (_, _, side), it in zip(found, unclear, strict=True) if it)
 
 
-def test_a_thin_plate_is_painted_on_each_side_by_its_own_contacts(plain: "Page") -> None:
+def test_a_thin_plate_is_painted_on_each_side_by_its_own_contacts(page: "Page") -> None:
     """One side black, the other white: no position between contacts is gray, with or without normals of its own."""
     points, normals = thin_plate(600)
     positions, sides = thin_plate(300, start=0.3)
     found = page_module(
-        plain,
+        page,
         "paint",
         """async ({ Paint }, given) => {
           const { Contacts } = await import(new URL("page/contacts.js", document.baseURI));
