@@ -166,7 +166,7 @@ def test_settings_and_the_device_reach_the_evaluation(plates, tmp_path, monkeypa
     ]
     assert main(["evaluate", *words, "--device", "cpu"]) == 130
     inputs = asked[0].inputs
-    assert (inputs.body.wall, inputs.geometry, asked[0].device) == (0.0, "noisy", "cpu")
+    assert (inputs.body.wall, inputs.geometry, inputs.device) == (0.0, "noisy", "cpu")
     # Figures of another wall are not these.
     assert asked[0].settings["body"]["wall"] == 0.0
 
