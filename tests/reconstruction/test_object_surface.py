@@ -274,11 +274,11 @@ def test_an_outline_lies_where_half_of_a_pixel_is_covered() -> None:
     (view, *_) = views_of(ball(RADIUS))
     mask = torch.zeros_like(view.mask)
     mask[:, 40:80] = 255
-    mask[:, 80] = 64
+    mask[:, 80] = 85
     inside = Outline.of(replace(view, mask=mask)).inside
-    # Between the middles of pixels 79, all covered, and 80, a quarter covered: two thirds of the way.
-    assert inside[64, 78] == pytest.approx(1.67, abs=0.2)
-    assert inside[64, 85] == pytest.approx(-5.33, abs=0.2)
+    # Between the middles of pixels 79, all covered, and 80, a third covered: three quarters of the way.
+    assert inside[64, 78] == pytest.approx(1.75, abs=0.1)
+    assert inside[64, 85] == pytest.approx(-5.25, abs=0.1)
 
 
 def test_the_hull_of_a_ball_is_the_ball_within_half_a_pixel() -> None:
