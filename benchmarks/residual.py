@@ -16,9 +16,12 @@ from avmsf.evaluation.task import Sounds
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
+from avmsf.field.gains.data import along_phase
 from avmsf.field.gains.estimator import MixtureEstimator
+from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import extract_modes
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.simulate.recipe import SIM20
 from benchmarks import objects
@@ -39,8 +42,9 @@ def _measure(settings: Settings, part: str) -> Iterator[Record]:
     error; l1_log: log-mel distance, nepers; means over contacts, then objects. trained: the residual's magnitudes
     follow the spectral loss, as in the paper; measured: they are fitted to the log spectra after training (the
     default). Both render Gaussian noise; low_fluctuation: as measured, rendered with noise of low fluctuation (the
-    default). known_force: the same with each impact's force given, beneath which the background has its level; nearest,
-    knn: the nearest recording, and the mean of three. Dampings are shared; all kernel families, on the plate no elastic
+    default). known_force: the same with each impact's force given, beneath which the background has its level;
+    own_gains, own_gains_known_force: the same two with each recording's own least-squares gains; nearest, knn: the
+    nearest recording, and the mean of three. Dampings are shared; all kernel families, on the plate no elastic
     one.
     """
     rows: dict[str, list[dict[str, float]]] = {}
@@ -65,8 +69,13 @@ def _compared(case: _Case, settings: Settings) -> Iterator[tuple[str, dict[str, 
     steady = replace(field.origin, config=replace(field.origin.config, residual_noise="low-fluctuation"))
     field = replace(field, origin=steady)
     yield "low_fluctuation", _scores(_rendered(field, test), test)
+    own = along_phase(fit_gains(test.sounds, field.bank, sample_rate=test.sample_rate), field.phase)
+    sounds, background = field.modal_sounds(Gains(own.to(torch.complex64)), field.samples), field.noise()
+    yield "own_gains", _scores(sounds + background, test)
     if test.forces is not None:
         yield "known_force", _scores(_rendered(field, test, test.forces) / test.forces[:, None], test)
+        relative = test.forces[:, None] / (field.residual.force or 1.0)
+        yield "own_gains_known_force", _scores(sounds + background / relative, test)
     aligned = modes.aligned(train)
     yield "nearest", _scores(NearestRecording(aligned).render(test.contacts), test)
     yield "knn", _scores(MeanWaveform(aligned).render(test.contacts), test)
