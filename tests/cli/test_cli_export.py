@@ -132,6 +132,8 @@ def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> Non
     rows = table_of(folder / "samples.csv")
     assert [(row["force"], row["contact_time"]) for row in rows] == [("0.5", "0.001"), ("2", "0")] * 2
     assert soundfile.info(folder / rows[0]["file"]).frames == 400
+    mallets = export(field_file, "wavs", tmp_path / "m", "--contacts", 1, "--contact-times", 0.001, 0)
+    assert [row["contact_time"] for row in table_of(mallets / "samples.csv")] == ["0.001", "0"]
 
 
 def test_a_contact_that_is_hardly_heard_is_no_key_unless_it_is_asked_for(field_file, tmp_path, monkeypatch):

@@ -321,6 +321,8 @@ def _wav_settings(options: Options, average_force: float) -> dict[str, Any]:
     forces, times = options.forces or (average_force,), options.contact_times
     if len(times) == 1:
         times = times * len(forces)
+    elif len(forces) == 1:
+        forces = forces * max(len(times), 1)
     if times and len(times) != len(forces):
         wanted = f"one, or one for each of {len(forces)} --forces"
         raise ExportError.expected(wanted, len(times), name="--contact-times")
