@@ -10,13 +10,13 @@ folder. Supports are compared on a basis of few elements (`HeldModes`), which is
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
-from typing import ClassVar, Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -58,7 +58,6 @@ _SHAPE_THICKNESSES = 5
 """Thicknesses that are computed at first of a shape whose wall is not known."""
 _MEANS = frozenset({"memory", "timeout", "pytetwild"})
 """Names of errors that are no fault of a surface or its wall."""
-_Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +80,14 @@ class CandidateBody:
     @property
     def name(self) -> str:
         """What it is, for people."""
-        parts = [self.closed * "closed " + body_name(self.thickness), "" if self.support is None else self.support.name]
+        parts = [body_name(self.thickness, closed=self.closed), "" if self.support is None else self.support.name]
         parts.append("" if self.updated is None else "stiffness and density updated")
         return ", ".join(filter(None, parts))
 
 
-def body_name(thickness: float | None) -> str:
+def body_name(thickness: float | None, *, closed: bool = False) -> str:
     """Return what a body with a wall of this thickness, meters, is called; None is all that the surface encloses."""
-    return "solid body" if thickness is None else f"wall of {millimeters(thickness, 2)}"
+    return "solid body" if thickness is None else f"{closed * 'closed '}wall of {millimeters(thickness, 2)}"
 
 
 class CandidateBodies:
@@ -145,13 +144,10 @@ class SurfaceBodies(CandidateBodies):
     one lies behind its triangles, whichever way they face. Modes are cached by content in the folder `cache`, for they
     take most of the time; a damaged file is made again.
 
-    Raises SimulationError for a count, degrees of freedom and thicknesses that cannot be. `bodies` raises it for a
-    surface of points, and where no body can be had, with the reason for each: by the name "surface", or by that of the
+    Raises SimulationError for too few degrees of freedom. `bodies` raises it for a surface of points, and where no body
+    can be had, with the reason for each: by the name "surface", or by that of the
     reason where only memory, time or the mesher stood against it.
     """
-
-    walls_are_closed: ClassVar[bool] = False
-    """Whether walls go all round their cavities."""
 
     def __init__(
         self,
@@ -167,23 +163,15 @@ class SurfaceBodies(CandidateBodies):
         cache: Path | None = None,
         log: Callable[[str], None] | None = None,
     ) -> None:
-        for name, value, least in (("count", count, 1), ("dofs", dofs, MIN_DOFS)):
-            if value < least:
-                raise SimulationError.expected(f"{least} or more", value, name=name)
-        if thicknesses is not None and not len(thicknesses):
-            raise SimulationError.expected("thicknesses in meters, or None for a solid body", [], name="thicknesses")
-        for row, each in enumerate(thicknesses or ()):
-            if each is not None and not 0 < each < float("inf"):
-                wanted = "more than 0 m, or None for a solid body"
-                raise SimulationError.expected(wanted, each, row=row, name="thicknesses")
+        if dofs < MIN_DOFS:
+            raise SimulationError.expected(f"{MIN_DOFS} or more", dofs, name="dofs")
         self.shape = None if isinstance(surface, Surface) else surface
         """The shape, where it is no surface."""
         self.supports, self.held_at, self.dofs = supports, tuple(held_at), dofs
         self.unit_ratios = unit_ratios or self.unit_ratios
-        self._surface, self._digest, self._log = surface, surface.digest(), log or (lambda message: None)
+        self._surface, self._log = surface, log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)
-        self._coarse_only = set[tuple[float | None, Support | None]]()
         self._solved, self.solid = once(self._solve), once(self._make_solid)
         self._walls, self._remeshing = once(lambda dofs: wall_solids(self.checked, dofs)), Lock()
 
@@ -213,15 +201,16 @@ class SurfaceBodies(CandidateBodies):
         thickness: float | None,
         *,
         dofs: int | None = None,
+        closed: bool = False,
         support: Support | None = None,
         perturbed: bool = True,
     ) -> ElasticModes:
         """Return the modes of one body, with about so many degrees of freedom; the same arguments compute them once.
 
-        `perturbed` modes come with the first-order changes of their matrices. Raises SimulationError where there is no
-        such body.
+        A `closed` wall goes all round its cavity. `perturbed` modes come with the first-order changes of their
+        matrices. Raises SimulationError where there is no such body.
         """
-        return self._solved(thickness, self.dofs if dofs is None else dofs, support, perturbed)
+        return self._solved(thickness, self.dofs if dofs is None else dofs, closed, support, perturbed)
 
     def refined(self, body: CandidateBody) -> CandidateBody:
         """Return a body computed with about all the degrees of freedom that were asked for; a fine one as it is.
@@ -229,17 +218,14 @@ class SurfaceBodies(CandidateBodies):
         Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned,
         which was good enough to choose by, and `log` is called with the reason.
         """
-        if body.closed and self._closed is not None:
-            return self._closed.refined(body)
-        key = body.thickness, body.support
-        if body.fine or key in self._coarse_only:
+        if body.fine:
             return body
         try:
             if body.support is None:
-                return self._body(body.thickness, fine=True)
-            return replace(body, elastic=self.modes(body.thickness, support=body.support), fine=True)
+                return self._body(body.thickness, body.closed, fine=True)
+            elastic = self.modes(body.thickness, closed=body.closed, support=body.support)
+            return replace(body, elastic=elastic, fine=True)
         except SimulationError as error:
-            self._coarse_only.add(key)
             self._log(f"{body.name}: using the coarse mesh: {error}")
             return body
 
@@ -249,11 +235,9 @@ class SurfaceBodies(CandidateBodies):
         Of tetrahedra that are few enough to choose by; `refined` makes the chosen body fine, without a check of its
         convergence. `log` is called with the reason for None.
         """
-        if body.closed and self._closed is not None:
-            return self._closed.held(body)
         patches = patches_about(self.held_at) or None
         try:
-            solid = self.solid(body.thickness, self._coarse_dofs)
+            solid = self.solid(body.thickness, self._coarse_dofs, closed=body.closed)
             return HeldModes(solid, self._material, count=self._count, patches=patches)
         except (SimulationError, MemoryError) as error:
             self._log(f"{body.name}: no supports tested: {error}")
@@ -264,35 +248,38 @@ class SurfaceBodies(CandidateBodies):
 
         `log` is called with the reason.
         """
-        if body.closed and self._closed is not None:
-            return self._closed.with_thickness(body, thickness)
         try:
-            return self._body(thickness, fine=False)
+            return self._body(thickness, body.closed, fine=False)
         except SimulationError as error:
-            self._log_refused(f"{body_name(thickness)}: {error}")
+            self._log_refused(f"{body_name(thickness, closed=body.closed)}: {error}")
             return None
 
     @cached_property
     def _found(self) -> tuple[tuple[CandidateBody, ...], Mapping[float | None, str]]:
         """The bodies, and why others cannot be had."""
-        errors: dict[float | None, SimulationError] = {}
-
-        def attempt(make: Callable[[float | None], _Made], thickness: float | None) -> _Made | None:
+        wanted = list(dict.fromkeys(self._guesses() if self._thicknesses is None else self._thicknesses))
+        errors: dict[tuple[float | None, bool], SimulationError] = {}
+        for thickness in wanted:
             try:
-                return make(thickness)
+                self._expect_possible(thickness)
             except SimulationError as error:
-                errors[thickness] = error
+                errors[thickness, False] = error
+        possible = [each for each in wanted if (each, False) not in errors]
+
+        def make(wall: tuple[float | None, bool]) -> CandidateBody | None:
+            try:
+                return self._body(*wall, fine=len(possible) == 1)
+            except SimulationError as error:
+                errors[wall] = error
                 return None
 
-        wanted = list(dict.fromkeys(self._guesses() if self._thicknesses is None else self._thicknesses))
-        for thickness in wanted:
-            attempt(self._expect_possible, thickness)
-        possible = [each for each in wanted if each not in errors]
-        make = partial(attempt, partial(self._body, fine=len(possible) == 1))
+        closed = [(each, True) for each in possible if each is not None and self._closed is not None]
         # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
         with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
-            bodies = [body for body in pool.map(make, possible) if body is not None]
-        refused = {each: errors[each] for each in wanted if each in errors}
+            bodies = [
+                body for body in pool.map(make, [*((each, False) for each in possible), *closed]) if body is not None
+            ]
+        refused = {each: errors[each] for each in [*((each, False) for each in wanted), *closed] if each in errors}
         reasons = _grouped(refused)
         if not bodies:
             causes = {str(error.name) for error in refused.values()}
@@ -303,27 +290,14 @@ class SurfaceBodies(CandidateBodies):
             raise SimulationError.expected(wanted_body, reasons, got=got, name=name, advice=advice)
         for reason in reasons:
             self._log_refused(reason)
-        if self._closed is not None:
-            try:
-                bodies += self._closed.bodies
-            except SimulationError as error:
-                self._log_refused(f"closed walls: {error}")
         if len(bodies) == 1:
             bodies = [self.refined(bodies[0])]
-        return tuple(bodies), MappingProxyType({thickness: str(error) for thickness, error in refused.items()})
+        return tuple(bodies), {each: str(error) for (each, around), error in refused.items() if not around}
 
     @cached_property
-    def _closed(self) -> "SurfaceBodies | None":
-        """The same walls without an opening, where no view sees into one."""
-        shape = None if self.shape is None or self.walls_are_closed else self.shape.closed()
-        walls = self._guesses() if self._thicknesses is None else self._thicknesses
-        walls = [wall for wall in walls if wall is not None]
-        if shape is None or not walls:
-            return None
-        return _ClosedBodies(
-            shape, thicknesses=walls, supports=self.supports, held_at=self.held_at, count=self._count, dofs=self.dofs,
-            material=self._material, cache=self._cache, log=self._log,
-        )  # fmt: skip
+    def _closed(self) -> HollowShape | None:
+        """The shape without an opening, where no view sees into one."""
+        return None if self.shape is None else self.shape.closed()
 
     def _guesses(self) -> list[float | None]:
         """Return the thicknesses to try; None for what the surface encloses."""
@@ -339,25 +313,25 @@ class SurfaceBodies(CandidateBodies):
         else:
             self.checked.expect_wall(thickness, guessed=self._thicknesses is None and self.shape is None)
 
-    def _body(self, thickness: float | None, *, fine: bool) -> CandidateBody:
+    def _body(self, thickness: float | None, closed: bool, *, fine: bool) -> CandidateBody:
         """Return a free body with all degrees of freedom, or with few of them where it need not be fine."""
         if not fine and self.dofs > self._coarse_dofs:
             try:
-                modes = self.modes(thickness, dofs=self._coarse_dofs, perturbed=False)
-                return CandidateBody(thickness, modes, fine=False, closed=self.walls_are_closed)
+                modes = self.modes(thickness, dofs=self._coarse_dofs, closed=closed, perturbed=False)
+                return CandidateBody(thickness, modes, fine=False, closed=closed)
             except SimulationError as error:
                 # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
                 if self.shape is not None:
                     raise
                 self._log(f"retrying with more tetrahedra ({error})")
-        return CandidateBody(thickness, self._converged(thickness), closed=self.walls_are_closed)
-
-    def _converged(self, thickness: float | None) -> ElasticModes:
-        """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
-        modes = self.modes(thickness)
+        modes = self.modes(thickness, closed=closed)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
-        if self.dofs <= COARSE_DOFS or (self.shape is not None and thickness is not None):
-            return modes
+        if self.dofs > COARSE_DOFS and (self.shape is None or thickness is None):
+            modes = self._converged(thickness, modes)
+        return CandidateBody(thickness, modes, closed=closed)
+
+    def _converged(self, thickness: float | None, modes: ElasticModes) -> ElasticModes:
+        """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
         name = body_name(thickness)
         try:
             error = _frequency_error(self.modes(thickness, dofs=COARSE_DOFS, perturbed=False), modes)
@@ -377,11 +351,13 @@ class SurfaceBodies(CandidateBodies):
             )
         return modes
 
-    def _solve(self, thickness: float | None, dofs: int, support: Support | None, perturbed: bool) -> ElasticModes:
+    def _solve(
+        self, thickness: float | None, dofs: int, closed: bool, support: Support | None, perturbed: bool
+    ) -> ElasticModes:
         """Return the modes of one body, read from the cache where they are there."""
 
         def compute() -> ElasticModes:
-            solid = self.solid(thickness, dofs)
+            solid = self.solid(thickness, dofs, closed=closed)
             size = count_dofs(solid)
             self._log(f"{self._count} elastic modes of {size} degrees of freedom")
             try:
@@ -393,35 +369,32 @@ class SurfaceBodies(CandidateBodies):
 
         if self._cache is None:
             return compute()
+        surface = self._closed if closed else self._surface
+        assert surface is not None
         values = {
             "wall": thickness, "dofs": dofs, "perturbed": perturbed, "count": self._count, "format": _FORMAT,
             "support": None if support is None else asdict(support), "material": asdict(self._material),
-            "surface": self._digest, "version": version("avmsf"), "source": source_digest(__name__),
+            "surface": surface.digest(), "version": version("avmsf"), "source": source_digest(__name__),
         }  # fmt: skip
         return modes_once(self._cache / f"nominal-{key_of(values)}.safetensors", compute, log=self._log)
 
-    def _make_solid(self, thickness: float | None, dofs: int) -> Solid:
+    def _make_solid(self, thickness: float | None, dofs: int, *, closed: bool = False) -> Solid:
         """Return about so many degrees of freedom of a wall of a thickness, meters, or of all that is enclosed."""
         expect_memory(dofs)
-        self._log(f"dividing the {body_name(thickness)} into tetrahedra")
+        self._log(f"dividing the {body_name(thickness, closed=closed)} into tetrahedra")
         if thickness is None:
             return filled_solid(self.checked, dofs)
-        if self.shape is None:
+        shape = self._closed if closed else self.shape
+        if shape is None:
             # Threads that make several walls wait for the sheet that all of them follow.
             with self._remeshing:
                 make = self._walls(dofs)
             return make(thickness)
-        return shape_solid(self.shape, thickness, dofs, log=self._log)
+        return shape_solid(shape, thickness, dofs, log=self._log)
 
     def _log_refused(self, reason: str) -> None:
         """Log why a body cannot be had, where there are others; without an error's advice."""
         self._log(f"not a candidate body: {reason.partition('; ')[0].replace(': wall: expected', ': expected')}")
-
-
-class _ClosedBodies(SurfaceBodies):
-    """Bodies around a cavity without an opening."""
-
-    walls_are_closed = True
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
@@ -435,10 +408,10 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
     return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
 
 
-def _grouped(refused: Mapping[float | None, SimulationError]) -> list[str]:
+def _grouped(refused: Mapping[tuple[float | None, bool], SimulationError]) -> list[str]:
     """Return each reason once, after the names of all that it holds for."""
     names: dict[str, list[str]] = {}
-    for thickness, error in refused.items():
-        names.setdefault(str(error), []).append(body_name(thickness))
+    for (thickness, closed), error in refused.items():
+        names.setdefault(str(error), []).append(body_name(thickness, closed=closed))
     shown = {reason: f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(each) for reason, each in names.items()}
     return [f"{each}: {reason}" for reason, each in shown.items()]
