@@ -203,12 +203,6 @@ def test_colors_tell_places_apart() -> None:
 def test_what_cannot_be_made() -> None:
     with raises(SimulationError, name="kind", value="cup"):
         make_shape("cup")
-    with raises(SimulationError, name="seed", value=-1):
-        make_shape("mug", seed=-1)
-    with raises(SimulationError, name="size", value=0.0):
-        make_shape("mug", size=0.0)
-    with raises(SimulationError, name="wall", value=pytest.approx(math.nan, nan_ok=True)):
-        make_shape("bowl", wall=math.nan)
     with raises(SimulationError, name="wall", value=pytest.approx(0.08)):
         make_shape("mug", wall=0.08)
 
@@ -273,9 +267,3 @@ def test_chance_decides_and_zero_changes_nothing() -> None:
     one, same, other = (vary_thickness(solid, 0.05, generator=chance(seed)).points for seed in (1, 1, 2))
     assert torch.equal(one, same)
     assert float((one - other).norm(dim=1).max()) > 1e-5
-
-
-@pytest.mark.parametrize("part", [-0.1, 0.6, float("nan")])
-def test_impossible_variations(part: float) -> None:
-    with raises(SimulationError, name="part", value=pytest.approx(part, nan_ok=True)):
-        vary_thickness(make_shape("spoon").solid, part, generator=chance())

@@ -1,5 +1,6 @@
 """From a recipe to a body: what it looks like, what it is made of, and its elastic modes, kept by content."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import shell
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
-from avmsf.simulate.imperfections import smooth_field, stream, support_places, support_springs
+from avmsf.simulate.imperfections import smooth_field, stream, support_places
 from avmsf.simulate.recipe import AXES, ObjectRecipe
 from avmsf.simulate.shapes import make_shape, textured
 from avmsf.simulate.thickness_variation import vary_thickness
@@ -94,13 +95,12 @@ def _made_solid(recipe: ObjectRecipe, surface: Surface) -> Solid:
 def _elastic(recipe: ObjectRecipe, solid: Solid, legs: Float64[Tensor, "legs 3"]) -> ElasticModes:
     material, imperfections = material_named(recipe.material), recipe.imperfections
     middles = solid.points[solid.cells].mean(dim=1)
-    diagonal = float((solid.points.amax(0) - solid.points.amin(0)).norm())
     stiffness, density = (
-        smooth_field(middles, spread, diagonal=diagonal, generator=stream(recipe.seed, name))
+        smooth_field(middles, spread, diagonal=solid.size, generator=stream(recipe.seed, name))
         for name, spread in (("stiffness", imperfections.stiffness), ("density", imperfections.density))
     )
     mass = material.density * float((solid.volumes * density).sum())
-    strength = support_springs(mass, imperfections)
+    strength = mass * (2.0 * math.pi * imperfections.support) ** 2 / len(legs)
     return elastic_modes(
         solid,
         material,

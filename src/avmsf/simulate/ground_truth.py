@@ -28,8 +28,6 @@ _KIND = FileKind(
     SimulationError,
     formats=(1, 2),
 )
-_MODES, _TABLES = ("frequency", "damping"), ("gains", "quadrature")
-"""Tensors of a file: the real and the imaginary part of the gains are two."""
 _OPTIONAL = ("contacts", "starts", "shifts")
 _RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}
 """Settings of recipes in files of earlier versions, and their names now."""
@@ -116,10 +114,15 @@ def _check_record(record: dict[str, Any]) -> None:
 
 def _expect(tensors: dict[str, Tensor], record: dict[str, Any], path: Path) -> None:
     """Raise SimulationError unless the tensors fit together and to the record's names, and are finite."""
-    contacts = len(record["names"])
-    modes = tensors["frequency"].numel() if "frequency" in tensors else 0
-    sizes: dict[str, tuple[int, ...]] = dict.fromkeys(_MODES, (modes,)) | dict.fromkeys(_TABLES, (contacts, modes))
-    optional = {"contacts": (contacts, 3), "starts": (contacts,), "shifts": (contacts, modes)}
-    sizes |= {name: size for name, size in optional.items() if name in tensors}
-    skeleton = {name: torch.empty(size, dtype=torch.float64, device="meta") for name, size in sizes.items()}
+    contacts, modes = len(record["names"]), tensors["frequency"].numel() if "frequency" in tensors else 0
+    # The real and the imaginary part of the gains are two.
+    sizes: dict[str, tuple[int, ...]] = {
+        "frequency": (modes,), "damping": (modes,), "gains": (contacts, modes), "quadrature": (contacts, modes),
+        "contacts": (contacts, 3), "starts": (contacts,), "shifts": (contacts, modes),
+    }  # fmt: skip
+    skeleton = {
+        name: torch.empty(size, dtype=torch.float64, device="meta")
+        for name, size in sizes.items()
+        if name in tensors or name not in _OPTIONAL
+    }
     expect_tensors(tensors, skeleton, path, _KIND)

@@ -86,11 +86,6 @@ def support_places(
     return low[((low - middle) @ ways.T).argmax(dim=0)]
 
 
-def support_springs(mass: float, imperfections: Imperfections) -> float:
-    """Return the stiffness of each spring under a body of this mass, newtons per meter."""
-    return mass * (2.0 * math.pi * imperfections.support) ** 2 / _LEGS
-
-
 def damping_matrix(
     modes: ElasticModes,
     imperfections: Imperfections,

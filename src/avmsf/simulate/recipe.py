@@ -178,7 +178,7 @@ class ObjectRecipe:
             _expect(least <= value <= most, f"{least:g} to {most:g}", value, name)
         for name in ("thickness", "size"):
             value = getattr(self, name)
-            _expect(value is None or 0 < value < math.inf, "more than 0 m", value, name)
+            _expect(value is None or 0 < value <= 100.0, "more than 0 and at most 100 m", value, name)
         fits = self.noise_db is None or -math.inf < self.noise_db < 100.0
         _expect(fits, "a level in dB, such as -30, or None for none", self.noise_db, "noise_db")
         circled = self.views >= 0 and not self.views % 3

@@ -175,13 +175,9 @@ def simulate_object(
     )
     recordings, forces, truth = record(recipe, sounding, strikes)
     seen = body.surface if recipe.surface else None
-    capture = _captured(recipe, recordings, strikes, forces, truth, name=name or name_of(recipe), surface=seen)
+    name = name or f"{recipe.kind if recipe.mesh is None else recipe.mesh.stem}-{recipe.material.lower()}"
+    capture = _captured(recipe, recordings, strikes, forces, truth, name=name, surface=seen)
     return Simulation(recipe, capture, recordings, truth, body.mesh, sounding)
-
-
-def name_of(recipe: ObjectRecipe) -> str:
-    """Return what an object is called by default."""
-    return f"{recipe.kind if recipe.mesh is None else recipe.mesh.stem}-{recipe.material.lower()}"
 
 
 def sounding_body(recipe: ObjectRecipe, body: Body) -> SoundingBody:
@@ -250,18 +246,12 @@ def _captured(
         normalize="done",
         align=bool((truth.starts != 0.0).any()),
     )
-    rows = zip(
-        truth.names,
-        strikes.written_places.tolist(),
-        strikes.written_directions.tolist(),
-        forces.tolist(),
-        recordings,
-        strict=True,
+    written = strikes.written_places.tolist(), strikes.written_directions.tolist(), forces.tolist()
+    sounds = (
+        Recording(name, sound.double().numpy()[None], rate, "FLOAT")
+        for name, sound in zip(truth.names, recordings, strict=True)
     )
-    pairs = (
-        (Impact(file, place, direction, force), Recording(file, sound.double().numpy()[None], rate, "FLOAT"))
-        for file, place, direction, force, sound in rows
-    )
+    pairs = zip(map(Impact, truth.names, *written), sounds, strict=True)
     impacts, _ = preprocess(pairs, settings, measured=False)
     assert impacts is not None
     return Capture(name, impacts, surface, settings)

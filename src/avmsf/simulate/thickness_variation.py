@@ -12,8 +12,6 @@ from avmsf.mesh.rays import RayCaster
 from avmsf.simulate.imperfections import smooth_field
 from avmsf.simulate.shapes.body import mitred_normals
 
-MAX_VARIATION = 0.5
-"""Largest variation."""
 _MIN_VOLUME_RATIO = 0.02
 """Part of its volume below which a tetrahedron is moved as a whole instead."""
 _MAX_REPAIRS = 30
@@ -27,10 +25,8 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     `part` is the root mean square of the thickness over the surface relative to its mean, which stays as it is; 0
     returns the solid itself. Thickness varies over lengths from .4 diagonals on. Both sides of a wall move along their
     normals by half of what it grows, and points inside go along with those around them. No tetrahedron is turned inside
-    out. Raises SimulationError for a part below 0 or above .5, and for tetrahedra so flat that they cannot move.
+    out. Raises SimulationError for tetrahedra so flat that they cannot move.
     """
-    if not 0.0 <= part <= MAX_VARIATION:
-        raise SimulationError.expected(f"0 to {MAX_VARIATION:g} of the thickness", part, name="part")
     if part == 0.0:
         return solid
     rows, inverse = np.unique(solid.boundary.numpy(), return_inverse=True)
@@ -43,9 +39,6 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     factor = _factors(field, share, part)
     _, reach = RayCaster(corners)(corners.mean(axis=1), -doubled / areas[:, None], lead=_RAY_LEAD)
     hit = np.isfinite(reach)
-    if not hit.any():
-        advice = "make the tetrahedra again"
-        raise SimulationError.expected("a closed surface", got="an open one", name="solid", advice=advice)
     # At a rim the walls' thickness, not the rim's distance from what lies below it.
     walls = np.full(len(places), np.inf)
     np.minimum.at(walls, triangles, np.where(hit, reach, np.median(reach[hit]))[:, None])

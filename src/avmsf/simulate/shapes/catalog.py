@@ -27,8 +27,6 @@ _MAKERS: tuple[Maker, ...] = (
 )  # fmt: skip
 KINDS: Mapping[str, Maker] = MappingProxyType({maker.__name__: maker for maker in _MAKERS})
 """What draws and builds an individual of each kind."""
-_MAX_EXTENT_M = 100.0
-"""Meters."""
 _MIN_FACES = 6000
 _MAX_DRAFTS = 4
 """Drafts until walls and size are both as asked for."""
@@ -58,22 +56,15 @@ def textured(shape: Shape) -> TexturedMesh:
     return TexturedMesh.build(shape.surface.vertices, faces, colors=shape.colors[faces])
 
 
-def make_shape(kind: str, *, seed: int | None = 0, size: float | None = None, wall: float | None = None) -> Shape:
-    """Return one individual of a kind in `KINDS`; another seed draws other proportions and colors, None the first.
+def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: float | None = None) -> Shape:
+    """Return one individual of a kind in `KINDS`; another seed draws other proportions and colors.
 
     `size` is the longest side of its bounding box and `wall` the nominal thickness of its walls, meters; both are
     drawn where they are not given, and a size alone scales the walls with everything else. Raises SimulationError for
-    an unknown kind, for a negative seed, for sizes that are not positive, and for walls so thick that they fold over
-    themselves or leave nothing of the shape.
+    an unknown kind, and for walls so thick that they fold over themselves or leave nothing of the shape.
     """
     if kind not in KINDS:
         raise SimulationError.expected(f"one of {', '.join(sorted(KINDS))}", kind, name="kind")
-    seed = 0 if seed is None else seed
-    if seed < 0:
-        raise SimulationError.expected("0 or more", seed, name="seed")
-    for name, value in (("size", size), ("wall", wall)):
-        if value is not None and not 0.0 < value <= _MAX_EXTENT_M:
-            raise SimulationError.expected(f"more than 0 and at most {_MAX_EXTENT_M:g} m", value, name=name)
     draft, scale = _sized(kind, seed, size, wall)
     try:
         solid = draft.body.solid(scale=scale)

@@ -72,19 +72,18 @@ class Profile:
         """
         radius = self.at(np.linspace(0.0, 1.0, 200))[:, 0]
         around = 2.0 * np.pi * radius.mean()
-        best: tuple[float, Rings] | None = None
-        for base in range(_MIN_INNER + -_MIN_INNER % (2 * fold), max(_MAX_INNER, 2 * fold) + 1, 2 * fold):
-            for number in itertools.count(max(4, points // (4 * base))):
-                rings = self._rings(base, number)
-                if rings.starts[-1] < points:
-                    continue
-                mean = rings.starts[-1] / rings.number
-                uneven = abs(np.log(self.length / (rings.number - 1) * mean / around))
-                if best is None or uneven < best[0]:
-                    best = (uneven, rings)
-                break
-        assert best is not None
-        return best[1]
+
+        def large_enough(base: int) -> Rings:
+            numbers = itertools.count(max(4, points // (4 * base)))
+            return next(
+                rings for rings in (self._rings(base, number) for number in numbers) if len(rings.ring) >= points
+            )
+
+        def unevenness(rings: Rings) -> float:
+            return float(abs(np.log(self.length / (rings.number - 1) * (len(rings.ring) / rings.number) / around)))
+
+        bases = range(_MIN_INNER + -_MIN_INNER % (2 * fold), max(_MAX_INNER, 2 * fold) + 1, 2 * fold)
+        return min(map(large_enough, bases), key=unevenness)
 
     def _rings(self, base: int, number: int) -> Rings:
         """Return rings at even distances, of which the innermost has `base` points."""
