@@ -30,7 +30,7 @@ def visual_hull(views: Sequence[View], *, points: int, wrong_fraction: float = 0
     common.
     """
     masked = masked_views(views)
-    middle, reach = object_extent(masked)
+    middle, reach = object_extent([view.foreground for view in masked], [view.camera for view in masked])
     # The first box is a guess: where the object touches its edge, it grows.
     for _ in range(4):
         spacing = 2 * reach / _COARSE_CELLS

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float64, Int64, Real, Shaped, UInt16
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureWarning, SceneError
-from avmsf.photographs.cameras import MIN_VIEWS, Camera, View, nearest_to_lines
+from avmsf.photographs.cameras import MIN_VIEWS, Camera, View
 
-COARSE_CELLS, FINE_CELLS = 40**3, 80**3
+COARSE_CELLS, FINE_CELLS = 50**3, 80**3
 """Cells of the hull on its first and its second grid."""
 MIN_VIEW_RATIO = 1 / 3
 """Part of the views that must have a cell in their image for it to be object."""
@@ -161,10 +161,10 @@ def count_votes(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Came
 
 def carve(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]) -> Votes | None:
     """Return the votes of masks around their hull; None where they and their cameras agree on no point at all."""
-    bounds = _bounds(masks, cameras)
-    if bounds is None:
+    if sum(mask.any() for mask in masks) < 2:
         return None
-    coarse = count_votes(masks, cameras, Grid.filling(*bounds, cells=COARSE_CELLS))
+    middle, reach = object_extent(masks, cameras)
+    coarse = count_votes(masks, cameras, Grid.filling(middle - reach, middle + reach, cells=COARSE_CELLS))
     inside = coarse.occupied(missing=len(masks) // 6)
     if not inside.any():
         return None
@@ -196,30 +196,6 @@ def silhouette(
     column = np.minimum((np.arange(camera.width) + 0.5) / shrink, size[0] - 1).astype(int)
     row = np.minimum((np.arange(camera.height) + 0.5) / shrink, size[1] - 1).astype(int)
     return closed[row[:, None], column[None, :]] > 0, footprint
-
-
-def _bounds(
-    masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]
-) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]] | None:
-    """Return the corners of a box that holds the object: the middles of the masks looked at from all sides."""
-    directions, positions, angles = [], [], []
-    for mask, camera in zip(masks, cameras, strict=True):
-        rows, columns = np.nonzero(mask)
-        if not len(rows):
-            continue
-        across = (columns + 0.5 - camera.principal[0]) / camera.focal[0]
-        down = (rows + 0.5 - camera.principal[1]) / camera.focal[1]
-        ray = camera.world_to_camera[:3, :3].numpy().T @ (across.mean(), down.mean(), 1.0)
-        directions.append(ray / np.linalg.norm(ray))
-        positions.append(camera.position.numpy())
-        angles.append(float(np.hypot(across - across.mean(), down - down.mean()).max()))
-    starts = np.array(positions)
-    center = nearest_to_lines(starts, np.array(directions)) if len(starts) > 1 else None
-    if center is None:
-        return None
-    # The median, for a mask that leaked into the background is far too large.
-    radius = 1.25 * float(np.median(np.array(angles) * np.linalg.norm(starts - center, axis=1)))
-    return center - radius, center + radius
 
 
 def masked_views(views: Sequence[View]) -> list[View]:
@@ -254,16 +230,19 @@ def no_common_point(views: int) -> SceneError:
     return SceneError.expected("masks with a common volume", views, got=got, name="masks", advice=advice)
 
 
-def object_extent(views: Sequence[View]) -> tuple[np.ndarray, float]:
+def object_extent(
+    masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]
+) -> tuple[Float64[np.ndarray, " 3"], float]:
     """Return about where the object's middle is, [3] in the object frame, and how far it reaches from there, meters.
 
     The middle is the point nearest to the lines of sight through the masks' middles; those that miss it by far have
-    little weight (iteratively reweighted least squares).
+    little weight (iteratively reweighted least squares). Masks without an object say nothing.
     """
     positions, directions, sizes = [], [], []
-    for view in views:
-        rows, columns = np.nonzero(view.foreground)
-        camera = view.camera
+    for mask, camera in zip(masks, cameras, strict=True):
+        rows, columns = np.nonzero(mask)
+        if not len(rows):
+            continue
         pixel = np.array([np.median(columns) + 0.5, np.median(rows) + 0.5])
         ray = np.append((pixel - camera.principal) / camera.focal, 1.0)
         rotation = camera.world_to_camera[:3, :3].numpy()
@@ -272,7 +251,7 @@ def object_extent(views: Sequence[View]) -> tuple[np.ndarray, float]:
         sizes.append(max(np.ptp(columns) / camera.focal[0], np.ptp(rows) / camera.focal[1]))
     starts, rays = np.stack(positions), np.stack(directions)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    weight = np.ones(len(views))
+    weight = np.ones(len(rays))
     for _ in range(10):
         weighted = across * weight[:, None, None]
         # Parallel lines of sight leave one direction open, which the minimum norm solution sets to 0.

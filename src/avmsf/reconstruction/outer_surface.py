@@ -95,7 +95,7 @@ def _rough(
     views: Sequence[View], outlines: Sequence[Outline]
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
     """Return the lowest and highest corner of a box around what all but a few masks keep, meters."""
-    middle, reach = object_extent(views)
+    middle, reach = object_extent([view.foreground for view in views], [view.camera for view in views])
     for _ in range(5):
         grid = Grid(middle - reach, 2 * reach / (_COARSE_CELLS - 1), (_COARSE_CELLS,) * 3)
         solid = hull_distance(outlines, grid, rank=round(WRONG_FRACTION * len(outlines))) > -grid.spacing
