@@ -14,7 +14,6 @@ from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import connection, get_context
 from multiprocessing.context import SpawnProcess
@@ -124,49 +123,41 @@ def run_tasks(
         workers.stop(running)
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """A process, and this end of what it answers by."""
-
-    process: SpawnProcess
-    answer: connection.Connection
-
-
 class _Processes(Workers):
-    """Processes of this computer, new for each task; they end with this one."""
+    """Processes of this computer, new for each task, which is the end of its pipe; they end with this one."""
 
     def __init__(self, count: int) -> None:
-        self.count = count
+        self.count, self.processes = count, dict[connection.Connection, SpawnProcess]()
 
-    def start(self, act: Callable[[Argument], object], argument: Argument) -> _Task:
+    def start(self, act: Callable[[Argument], object], argument: Argument) -> connection.Connection:
         context = get_context("spawn")
         ours, theirs = context.Pipe()
         # Pickled here: what a task needs is loaded once its process knows how many threads it has.
-        process = context.Process(target=_work, args=(theirs, pickle.dumps((act, argument))), daemon=True)
+        self.processes[ours] = context.Process(target=_work, args=(theirs, pickle.dumps((act, argument))), daemon=True)
         with _environment(_ONE_THREAD), theirs:
-            process.start()
-        return _Task(process, ours)
+            self.processes[ours].start()
+        return ours
 
-    def wait(self, tasks: Collection[_Task]) -> Collection[_Task]:
-        ready = connection.wait([task.answer for task in tasks], _WAIT)
-        return [task for task in tasks if task.answer in ready]
+    def wait(self, tasks: Collection[connection.Connection]) -> Collection[Any]:
+        return connection.wait(tasks, _WAIT)
 
-    def outcome(self, task: _Task) -> Any:
+    def outcome(self, task: connection.Connection) -> Any:
         try:
-            return pickle.loads(task.answer.recv_bytes())
+            return pickle.loads(task.recv_bytes())
         except (EOFError, OSError):  # OSError: it ended while it answered.
-            task.process.join()
-            raise _ended_early(ending_of(task.process.exitcode or 0)) from None
+            self.processes[task].join()
+            raise _ended_early(ending_of(self.processes[task].exitcode or 0)) from None
         finally:
             self.stop([task])
 
-    def stop(self, tasks: Collection[_Task]) -> None:
+    def stop(self, tasks: Collection[connection.Connection]) -> None:
         for task in tasks:
-            task.answer.close()
+            task.close()
         for task in tasks:
-            task.process.join(_GRACE)
-            task.process.kill()
-            task.process.join()
+            process = self.processes.pop(task)
+            process.join(_GRACE)
+            process.kill()
+            process.join()
 
 
 class _Cluster(Workers):
