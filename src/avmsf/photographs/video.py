@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 
@@ -20,32 +21,32 @@ def pick_frames(path: str | Path, folder: str | Path, *, count: int) -> None:
     """Divide a video into `count` spans of equal length and write the sharpest frame of each into a new folder.
 
     Images are called frame_000123.png by their number in the video, from 0, and stand upright, as the video's rotation
-    tag says. The video is read once, with two frames in memory, unless it turns out to be of another length than it
-    claims, in which case it is read again. `folder` is whole or absent. Raises CaptureError where the video cannot be
-    read, has fewer than `count` frames, or `folder` exists and is not empty; warns with CaptureWarning of a video that
-    ends early.
+    tag says. The video is read twice, first to count its frames, with two of them in memory. `folder` is whole or
+    absent. Raises CaptureError where the video cannot be read, has fewer than `count` frames, or `folder` exists and is
+    not empty; warns with CaptureWarning of a video that ends early.
     """
     path = Path(path)
     if count < 1:
         raise CaptureError.expected("at least 1 frame", count, name="count")
     if not path.is_file():
         raise CaptureError.expected("a video file", file=path)
-    claimed = _claimed_frames(path)
     with new_folder(Path(folder), raising=CaptureError) as begun:
-        total, before = claimed if claimed >= count else sum(1 for _ in _frames(path)), -1
-        while total != before:
-            if total == 0:
-                wanted, got = "a video with frames", "none that can be read"
-                raise CaptureError.expected(wanted, 0, got=got, file=path, name="frames", advice=_CONVERT)
-            if total < count:
-                wanted, advice = f"a video of at least {count} frames", f"choose at most {total}"
-                raise CaptureError.expected(wanted, total, file=path, name="count", advice=advice)
-            # What was picked before belongs to spans of another length.
-            for picked in begun.iterdir():
-                picked.unlink()
-            total, before = _pick(path, begun, total=total, count=count), total
+        with _opened(path) as video:
+            claimed = video.get(cv2.CAP_PROP_FRAME_COUNT)
+            total = sum(1 for _ in iter(video.grab, False))
+        if total == 0:
+            wanted, got = "a video with frames", "none that can be read"
+            raise CaptureError.expected(wanted, 0, got=got, file=path, name="frames", advice=_CONVERT)
+        if total < count:
+            wanted, advice = f"a video of at least {count} frames", f"choose at most {total}"
+            raise CaptureError.expected(wanted, total, file=path, name="count", advice=advice)
+        for _, span in groupby(enumerate(_frames(path)), lambda frame: frame[0] * count // total):
+            number, sharpest = max(span, key=lambda frame: sharpness(frame[1]))
+            target = begun / f"frame_{number:06d}.png"
+            if not cv2.imwrite(str(target), sharpest):
+                raise OSError(f"{target.name} was not written")
     if total < 0.95 * claimed:
-        wanted, advice = f"{claimed} frames as its header says", "the frames are selected from these"
+        wanted, advice = f"{claimed:.0f} frames as its header says", "the frames are selected from these"
         warning = CaptureWarning.expected(wanted, total, file=path, name="frames", advice=advice)
         warnings.warn(warning, stacklevel=2)
 
@@ -63,41 +64,20 @@ def sharpness(frame: np.ndarray) -> float:
     return float(cv2.Laplacian(gray, cv2.CV_32F).var())
 
 
-def _pick(path: Path, folder: Path, *, total: int, count: int) -> int:
-    """Write the sharpest frame of each span of a video of `total` frames; return how many it had."""
-    read = 0
-
-    def numbered() -> Iterator[tuple[int, np.ndarray]]:
-        nonlocal read
-        for read, frame in enumerate(_frames(path), start=1):
-            yield read - 1, frame
-
-    # The last span takes in frames beyond the total, should there be any.
-    for _, span in groupby(numbered(), lambda frame: min(frame[0] * count // total, count - 1)):
-        number, sharpest = max(span, key=lambda frame: sharpness(frame[1]))
-        target = folder / f"frame_{number:06d}.png"
-        if not cv2.imwrite(str(target), sharpest):
-            raise OSError(f"{target.name} was not written")
-    return read
-
-
 def _frames(path: Path) -> Iterator[np.ndarray]:
-    video = _open(path)
-    try:
+    with _opened(path) as video:
         while (taken := video.read())[0]:
             yield taken[1]
-    finally:
-        video.release()
 
 
-def _claimed_frames(path: Path) -> int:
-    return max(0, round(_open(path).get(cv2.CAP_PROP_FRAME_COUNT)))
-
-
-def _open(path: Path) -> cv2.VideoCapture:
+@contextmanager
+def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         got = "a file that cannot be read"
         raise CaptureError.expected("a video", got=got, file=path, name="format", advice=_CONVERT)
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-    return video
+    try:
+        yield video
+    finally:
+        video.release()
