@@ -10,7 +10,6 @@ import signal
 import threading
 import time
 import traceback
-from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -38,27 +37,78 @@ _GRACE = 3.0
 """Seconds that a process has to end before it is killed."""
 
 
-class Workers(ABC):
-    """Where tasks run, each in a process on one thread."""
+class _Processes:
+    """Processes of this computer, new for each task, which is the end of its pipe; they end with this one."""
 
-    count: float
-    """Tasks that are begun before the first of them is done."""
+    def __init__(self, count: int) -> None:
+        self.count, self.processes = count, dict[connection.Connection, SpawnProcess]()
 
-    @abstractmethod
-    def start(self, act: Callable[[Argument], object], argument: Argument) -> Any:
+    def start(self, act: Callable[[Argument], object], argument: Argument) -> connection.Connection:
         """Begin a task and return its handle."""
+        context = get_context("spawn")
+        ours, theirs = context.Pipe()
+        # Pickled here: what a task needs is loaded once its process knows how many threads it has.
+        self.processes[ours] = context.Process(target=_work, args=(theirs, pickle.dumps((act, argument))), daemon=True)
+        with _environment(_ONE_THREAD), theirs:
+            self.processes[ours].start()
+        return ours
 
-    @abstractmethod
-    def wait(self, tasks: Collection[Any]) -> Collection[Any]:
+    def wait(self, tasks: Collection[connection.Connection]) -> Collection[Any]:
         """Return those that are done, after a second at most."""
+        return connection.wait(tasks, _WAIT)
 
-    @abstractmethod
-    def outcome(self, task: Any) -> Any:
+    def outcome(self, task: connection.Connection) -> Any:
         """Return what a task that is done returned or raised. Raises WorkerError."""
+        try:
+            return pickle.loads(task.recv_bytes())
+        except (EOFError, OSError):  # OSError: it ended while it answered.
+            self.processes[task].join()
+            raise _ended_early(ending_of(self.processes[task].exitcode or 0)) from None
+        finally:
+            self.stop([task])
 
-    @abstractmethod
-    def stop(self, tasks: Collection[Any]) -> None:
+    def stop(self, tasks: Collection[connection.Connection]) -> None:
         """End tasks that run, and what they started."""
+        for task in tasks:
+            task.close()
+        for task in tasks:
+            process = self.processes.pop(task)
+            process.join(_GRACE)
+            process.kill()
+            process.join()
+
+
+class _Cluster:
+    """Processes of a ray cluster, which has a queue of its own, with the methods of `_Processes`."""
+
+    count = float("inf")
+
+    def __init__(self, ray: ModuleType) -> None:
+        self.ray = ray
+        # A process that serves one call leaves no memory behind.
+        self.remote = ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_outcome)
+
+    def start(self, act: Callable[[Argument], object], argument: Argument) -> Any:
+        return self.remote.remote(act, argument)
+
+    def wait(self, tasks: Collection[Any]) -> Collection[Any]:
+        return self.ray.wait(list(tasks), num_returns=1, timeout=_WAIT)[0]
+
+    def outcome(self, task: Any) -> Any:
+        try:
+            return self.ray.get(task)
+        except self.ray.exceptions.RayTaskError as error:  # Its process could not load what the task needs.
+            return error.cause
+        except self.ray.exceptions.RayError as error:
+            raise _ended_early(str(error).splitlines()[0]) from error
+
+    def stop(self, tasks: Collection[Any]) -> None:
+        for task in tasks:
+            self.ray.cancel(task, force=True)
+
+
+Workers = _Processes | _Cluster
+"""Where tasks run, each in a process on one thread; `count` tasks are begun before the first of them is done."""
 
 
 @contextmanager
@@ -121,72 +171,6 @@ def run_tasks(
                 done(name, outcome)
     finally:
         workers.stop(running)
-
-
-class _Processes(Workers):
-    """Processes of this computer, new for each task, which is the end of its pipe; they end with this one."""
-
-    def __init__(self, count: int) -> None:
-        self.count, self.processes = count, dict[connection.Connection, SpawnProcess]()
-
-    def start(self, act: Callable[[Argument], object], argument: Argument) -> connection.Connection:
-        context = get_context("spawn")
-        ours, theirs = context.Pipe()
-        # Pickled here: what a task needs is loaded once its process knows how many threads it has.
-        self.processes[ours] = context.Process(target=_work, args=(theirs, pickle.dumps((act, argument))), daemon=True)
-        with _environment(_ONE_THREAD), theirs:
-            self.processes[ours].start()
-        return ours
-
-    def wait(self, tasks: Collection[connection.Connection]) -> Collection[Any]:
-        return connection.wait(tasks, _WAIT)
-
-    def outcome(self, task: connection.Connection) -> Any:
-        try:
-            return pickle.loads(task.recv_bytes())
-        except (EOFError, OSError):  # OSError: it ended while it answered.
-            self.processes[task].join()
-            raise _ended_early(ending_of(self.processes[task].exitcode or 0)) from None
-        finally:
-            self.stop([task])
-
-    def stop(self, tasks: Collection[connection.Connection]) -> None:
-        for task in tasks:
-            task.close()
-        for task in tasks:
-            process = self.processes.pop(task)
-            process.join(_GRACE)
-            process.kill()
-            process.join()
-
-
-class _Cluster(Workers):
-    """Processes of a ray cluster, which has a queue of its own."""
-
-    count = float("inf")
-
-    def __init__(self, ray: ModuleType) -> None:
-        self.ray = ray
-        # A process that serves one call leaves no memory behind.
-        self.remote = ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_outcome)
-
-    def start(self, act: Callable[[Argument], object], argument: Argument) -> Any:
-        return self.remote.remote(act, argument)
-
-    def wait(self, tasks: Collection[Any]) -> Collection[Any]:
-        return self.ray.wait(list(tasks), num_returns=1, timeout=_WAIT)[0]
-
-    def outcome(self, task: Any) -> Any:
-        try:
-            return self.ray.get(task)
-        except self.ray.exceptions.RayTaskError as error:  # Its process could not load what the task needs.
-            return error.cause
-        except self.ray.exceptions.RayError as error:
-            raise _ended_early(str(error).splitlines()[0]) from error
-
-    def stop(self, tasks: Collection[Any]) -> None:
-        for task in tasks:
-            self.ray.cancel(task, force=True)
 
 
 def _work(answer: connection.Connection, content: bytes) -> None:
