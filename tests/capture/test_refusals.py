@@ -12,7 +12,6 @@ import trimesh
 
 from avmsf.capture import CaptureSettings, check, read_capture, read_recording
 from avmsf.capture.audio import MAX_SAMPLES
-from avmsf.capture.table import MAX_ROWS
 from avmsf.errors import CaptureError, CaptureWarning
 from factories.capture_folder import HEADER, RATE, ROWS, fill, ring
 from factories.raising import raises, warns
@@ -82,7 +81,6 @@ TABLES = [
     (FORCES, ("a.wav,0,0,0,2", "b.wav,0,1,0,0"), 3, "force_newtons", 0.0),
     # A force so small would lift the sound beyond float32.
     (FORCES, ("a.wav,0,0,0,2", "b.wav,0,1,0,1e-300"), 3, "force_newtons", 1e-300),
-    (HEADER, [f"{number}.wav,0,0,0" for number in range(MAX_ROWS + 1)], MAX_ROWS + 2, None, None),
     (
         HEADER,
         [*ROWS, *(f"aa{row}.wav,0,0,0.1" for row in range(200))],

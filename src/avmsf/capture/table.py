@@ -9,7 +9,6 @@ import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,8 +22,6 @@ from avmsf.errors import CaptureError, CaptureWarning
 REQUIRED = ("file", "x", "y", "z")
 DIRECTION = ("nx", "ny", "nz")
 FORCE = "force_newtons"
-MAX_ROWS = 10_000
-"""Rows of a table: three times the 3,000 recordings that RealImpact, the largest published set, has of an object."""
 MIN_FORCE_NEWTONS, MAX_FORCE_NEWTONS = 1e-6, 1e6
 """Peak forces that a row may give: from a grain of dust to the largest impact hammers (2e4 N) and beyond."""
 FARTHEST = 100.0
@@ -95,7 +92,7 @@ class Impact:
 def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
     """Return a table's lines that are not blank, each with its number and its cells, and what separates the cells.
 
-    Raises `CaptureError` for a file that is no table of UTF-8 text, or has more than `MAX_ROWS` rows.
+    Raises `CaptureError` for a file that is no table of UTF-8 text.
     """
     if is_lfs_pointer(path):
         raise CaptureError.expected("a table", got="a Git LFS pointer", file=path, advice="run git lfs pull")
@@ -105,15 +102,12 @@ def read_cells(path: Path) -> tuple[list[tuple[int, list[str]]], str]:
         first = text.lstrip().split("\n", 1)[0]
         separator = max(",;\t", key=first.count)
         reader = csv.reader(io.StringIO(text), delimiter=separator)
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in islice(reader, MAX_ROWS + 2)]
+        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except UnicodeDecodeError as error:
         advice = "save it from the spreadsheet as 'CSV UTF-8'"
         raise CaptureError.expected("UTF-8 text", got="other bytes", file=path, advice=advice) from error
     except (OSError, ValueError, csv.Error) as error:
         raise CaptureError.expected("a table", got=f"a file that cannot be read: {error}", file=path) from error
-    if len(lines) > MAX_ROWS + 1:
-        wanted, advice = f"at most {MAX_ROWS:,} rows", "divide the table"
-        raise CaptureError.expected(wanted, got="more", file=path, row=lines[-1][0], advice=advice)
     return [(line, cells) for line, cells in lines if any(cells)], separator
 
 

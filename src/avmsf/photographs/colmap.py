@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from avmsf.errors import CaptureError
-from avmsf.photographs.lenses import CameraFile, Lens, Location, Photograph, check_count
+from avmsf.photographs.lenses import CameraFile, Lens, Location, Photograph
 
 PLACES = ("sparse/0", "sparse", ".")
 MODELS = {
@@ -44,10 +44,9 @@ def read_colmap(model: Path, folder: Path) -> CameraFile:
     camera models without a pinhole behind OpenCV's distortion.
     """
     cameras, images = _parts(model, "cameras", "images")
-    lenses, records, photographs = read_lenses(cameras), list(_images(images)), []
-    check_count(len(records), images)
+    lenses, photographs = read_lenses(cameras), []
     source = folder / "images" if (folder / "images").is_dir() else folder
-    for name, camera, pose in records:
+    for name, camera, pose in _images(images):
         lens, where = lenses.get(camera), Location(images, item=f"image {name}")
         if lens is None:
             wanted, advice = f"a camera among {', '.join(map(str, lenses))}", "export all parts of the model together"

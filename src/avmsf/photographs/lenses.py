@@ -21,8 +21,6 @@ _GRID_POINTS = 33
 """Points along each side of a pinhole's image at which a lens is tested."""
 _MAX_FIELD_RATIO = 2.0
 """Width and height that a pinhole takes in over those that the lens has in its middle, at most."""
-MAX_PHOTOGRAPHS = 10_000
-"""Photographs of one object: a video of five minutes, frame by frame. Splatting uses some hundreds."""
 
 
 @dataclass(frozen=True)
@@ -196,10 +194,3 @@ class CameraFile:
             parents = {each.image.parent for each in self.photographs}
             found = {path: path.name for parent in parents for path in pictures_in(parent, deep=False)}
         return sorted(name for path, name in found.items() if path.resolve() not in known)
-
-
-def check_count(count: int, file: Path) -> None:
-    """Raise CaptureError for more than `MAX_PHOTOGRAPHS` in a camera file."""
-    if count > MAX_PHOTOGRAPHS:
-        wanted, advice = f"at most {MAX_PHOTOGRAPHS:,} photographs", "select some hundreds"
-        raise CaptureError.expected(wanted, count, file=file, name="photographs", advice=advice)

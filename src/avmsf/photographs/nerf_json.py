@@ -17,7 +17,7 @@ from avmsf.capture.filenames import PICTURE_SUFFIXES
 from avmsf.capture.placement import FrameMismatch
 from avmsf.errors import CaptureError
 from avmsf.mesh.io import load_parts
-from avmsf.photographs.lenses import CameraFile, Lens, Location, Photograph, check_count
+from avmsf.photographs.lenses import CameraFile, Lens, Location, Photograph
 
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -38,7 +38,6 @@ def read_transforms(path: Path) -> CameraFile:
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         wanted, kind = "a list 'frames', each with file_path and transform_matrix", type(frames).__name__
         raise CaptureError.expected(wanted, kind, got=kind, file=path, name="frames")
-    check_count(len(frames), path)
     common = {key: value for key, value in record.items() if key != "frames"}
     photographs, scaled = [], []
     for row, frame in enumerate(frames):
