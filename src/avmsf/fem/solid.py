@@ -32,21 +32,10 @@ class Solid:
     def build(cls, points: Float64[Tensor, "points 3"], cells: Int[Tensor, "cells 4"]) -> "Solid":
         """Return the solid with cells turned to positive volume and unused points left out.
 
-        Raises SimulationError where there are no cells, where a cell names a point that is not there or is flat, and
-        for coordinates that are not finite.
+        Raises SimulationError where a cell is flat or its coordinates are not finite.
         """
-        if not len(cells):
-            got, advice = "none: the shape has no volume", "give a sheet a thickness"
-            raise SimulationError.expected("tetrahedra", 0, got=got, name="cells", advice=advice)
-        unfit = cells[(cells < 0) | (cells >= len(points))]
-        if len(unfit):
-            wanted = f"corners of tetrahedra from 0 to {len(points) - 1}"
-            raise SimulationError.expected(wanted, int(unfit[0]), name="cells", advice="make the tetrahedra again")
         used, rows = torch.unique(cells, return_inverse=True)
         corners = points[used]
-        if not bool(torch.isfinite(corners).all()):
-            row = int(used[(~torch.isfinite(corners)).any(dim=1).nonzero()[0]])
-            raise SimulationError.expected("finite coordinates in meters", points[row].tolist(), row=row, name="points")
         volumes = _volumes(corners, rows)
         turned = torch.where((volumes < 0)[:, None], rows[:, [0, 2, 1, 3]], rows)
         solid = cls(corners, turned)
@@ -69,11 +58,17 @@ class Solid:
         return float((self.points.amax(dim=0) - self.points.amin(dim=0)).norm())
 
     @cached_property
+    def _sides(self) -> tuple[Int[np.ndarray, " sides"], Int[np.ndarray, " triangles"]]:
+        """Number of the triangle that each side of each cell is, and how many sides each triangle is."""
+        sides = np.sort(self.cells[:, _FACES].numpy().reshape(-1, 3), axis=1)
+        _, which, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+        return which.ravel(), count
+
+    @cached_property
     def boundary(self) -> Int[Tensor, "triangles 3"]:
         """Rows of `points` at the corners of the outer triangles, counter-clockwise from outside, cell by cell."""
-        sides = self.cells[:, _FACES].reshape(-1, 3)
-        _, which, count = np.unique(np.sort(sides.numpy(), axis=1), axis=0, return_inverse=True, return_counts=True)
-        return sides[torch.from_numpy(count[which.ravel()] == 1)]
+        which, count = self._sides
+        return self.cells[:, _FACES].reshape(-1, 3)[torch.from_numpy(count[which] == 1)]
 
     @property
     def surface(self) -> Surface:
@@ -84,10 +79,8 @@ class Solid:
     @cached_property
     def parts(self) -> Int[Tensor, " cells"]:
         """Number of the part that each cell belongs to; cells that share a side are of one part, largest first."""
-        sides = np.sort(self.cells[:, _FACES].numpy().reshape(-1, 3), axis=1)
-        _, which = np.unique(sides, axis=0, return_inverse=True)
         owners = np.repeat(np.arange(len(self.cells)), 4)
-        belongs = scipy.sparse.csr_array((np.ones(len(owners)), (owners, which.ravel())))
+        belongs = scipy.sparse.csr_array((np.ones(len(owners)), (owners, self._sides[0])))
         number, label = scipy.sparse.csgraph.connected_components(belongs @ belongs.T, directed=False)
         size = np.bincount(label, weights=self.volumes.numpy(), minlength=number)
         rank = np.empty(number, dtype=np.int64)

@@ -60,7 +60,6 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     seconds to a minute. Raises SimulationError where pytetwild fails or takes more than `timeout` seconds of the
     processor, and for what encloses no body: points, sheets, parts that do not touch and walls too thin for the detail.
     """
-    expect_detail(detail)
     mesh = weld(surface)
     size, opened = mesh.scale, len(boundary_edges(mesh))
     advice = f"give a wall thickness, such as {0.015 * size:.1g} m"
@@ -78,12 +77,6 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     solid = Solid.build(solid.points, solid.cells[solid.parts == 0])
     _expect_likeness(solid, mesh, tolerance=4.0 * TOLERANCES.envelope * detail * size, advice=advice)
     return solid
-
-
-def expect_detail(detail: float) -> None:
-    """Raise SimulationError for what is no length of edges over the body's size."""
-    if not 0 < detail < 1:
-        raise SimulationError.expected("a part of the object's size, above 0 and below 1", detail, name="detail")
 
 
 def _stored(mesh: Trimesh, detail: float, timeout: float) -> tuple[np.ndarray, np.ndarray]:

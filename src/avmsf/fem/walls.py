@@ -22,7 +22,7 @@ from avmsf.errors import SimulationError
 from avmsf.fem.meshing import oriented, weld
 from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of, remeshed, unit
 from avmsf.fem.solid import Solid, prism_cells
-from avmsf.fem.tetrahedra import expect_detail, fill
+from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
@@ -66,12 +66,9 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     folds prisms, as on scans with creases, both sides of the wall are filled as `fill` does, which is slower.
 
     Raises SimulationError for a surface without triangles or area, one whose triangles face different ways, a
-    thickness that is not positive or too large for how tightly the surface bends, and a closed surface that holds less
+    thickness too large for how tightly the surface bends, and a closed surface that holds less
     than the wall would.
     """
-    if not 0 < thickness < np.inf:
-        raise SimulationError.expected("more than 0 m", thickness, name="thickness")
-    expect_detail(detail)
     mesh = oriented(weld(surface))
     if not len(boundary_edges(mesh)) and mesh.area * thickness > abs(mesh.volume):
         middle = 0.5 * abs(mesh.volume) / mesh.area
