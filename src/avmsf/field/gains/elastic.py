@@ -107,17 +107,12 @@ class Elastic(KernelFamily):
         both = [(1.0 - share) * elastic[:, None], share.expand(len(elastic), -1, 1)]
         self.shares = torch.cat(both, dim=2).flatten(0, 1)
 
-    def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
-        """Return the product of both impacts' components of each shape, and the remainder's kernel."""
-        one, other = self._along(sites), self._along(others)
-        return torch.cat([one.T[:, :, None] * other.T[:, None], self._residual_kernel(sites, others)[None]])
-
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
         """Return the squared components of each shape, and ones."""
         return torch.cat([self._along(sites).square().T, torch.ones(1, len(sites), dtype=torch.float64)])
 
     def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
-        """Return the kernels between two sets of impacts, without the basis, which may be far larger."""
+        """Return the kernels between two sets of impacts, without a basis, which would be far larger."""
         one, other = self._along(sites), self.shares[:, :-1][:, None] * self._along(others)
         mixed = (one @ other.flatten(0, 1).T).reshape(len(one), *other.shape[:2]).transpose(0, 1)
         return mixed + self._residual_kernel(sites, others) * self.shares[:, -1, None, None]

@@ -4,11 +4,9 @@ A family states one assumption about how gains vary over an object. Its kernels 
 impacts, each times the cosine between their directions.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar, TypeVar
 
 import torch
@@ -103,7 +101,7 @@ class Sites:
 Family = TypeVar("Family", bound="KernelFamily")
 
 
-class KernelFamily(ABC):
+class KernelFamily:
     """Kernels of one assumption about how gains vary over an object.
 
     Kernel h between two impacts is sum_b shares[h, b] basis_b, scaled so that its mean over the reference impacts is
@@ -140,9 +138,9 @@ class KernelFamily(ABC):
         """Which of all kernels of the family these are, as `take` chose them."""
         return torch.arange(len(self)) if self._rows is None else self._rows
 
-    @abstractmethod
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
-        """Return the basis between two sets of impacts."""
+        """Return the basis between two sets of impacts; without one, a family has its own `diagonal` and `between`."""
+        raise NotImplementedError
 
     def diagonal(self, sites: Sites) -> Float64[Tensor, "basis sites"]:
         """Return the basis of each impact with itself."""
@@ -229,7 +227,7 @@ class Smooth(KernelFamily):
 
     def __init__(self, reference: Sites, size: float) -> None:
         super().__init__(reference, size)
-        self._lengths = size * torch.tensor(LENGTHS, dtype=torch.float64)
+        self._axes, self._lengths = Axes(reference.points), size * torch.tensor(LENGTHS, dtype=torch.float64)
         alone = torch.eye(len(LENGTHS), dtype=torch.float64)
         affine = torch.tensor(AFFINE_SHARES, dtype=torch.float64)
         # The shortest is left out there: what is not affine would be noise.
@@ -237,10 +235,6 @@ class Smooth(KernelFamily):
         both = torch.cat([added, affine[:, None, None].expand(*added.shape[:2], 1)], dim=2).flatten(0, 1)
         shares = torch.cat([torch.nn.functional.pad(alone, (0, 1)), both])
         self.shares = scaled(shares, self.diagonal(reference))
-
-    @cached_property
-    def _axes(self) -> "Axes":
-        return Axes(self.reference.points)
 
     def basis(self, sites: Sites, others: Sites) -> Float64[Tensor, "basis sites others"]:
         """Return the squared exponentials and the affine kernel (1 + x . x') / (1 + dim), x standardized."""
