@@ -20,7 +20,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from avmsf._utils.files import way_out, write_whole
-from avmsf._utils.text import read_json
+from avmsf._utils.text import read_json_object
 from avmsf.errors import AvmsfError, FolderInUseError
 
 WAIT = 3.0
@@ -48,14 +48,16 @@ def write_lock(
     AvmsfError where the folder can be written to and the lock cannot be had.
     """
     folder = folder.resolve()
-    path = folder / f"{name}.lock"
+    path, named = folder / f"{name}.lock", folder / f"{name}.lock.json"
     try:
         folder.mkdir(parents=parents, exist_ok=True)
         # One object for each path makes the lock reentrant within a thread.
         lock = FileLock(path, is_singleton=True, fallback_to_soft=False)
         lock.acquire(timeout=wait)
     except Timeout as error:
-        holder, wanted = _read_holder(path), "a folder that no other process writes to"
+        holder, wanted = dict[str, Any](), "a folder that no other process writes to"
+        with suppress(AvmsfError):
+            holder = read_json_object(named, raising=AvmsfError)
         got = ", ".join(f"{name} {value}" for name, value in holder.items()) or "one that does not say its name"
         advice = f"wait until it has ended{advice}"
         raise FolderInUseError.expected(wanted, holder, got=got, file=folder, advice=advice) from error
@@ -66,12 +68,15 @@ def write_lock(
     outermost = lock.lock_counter == 1
     try:
         if outermost:
-            _write_holder(path, command)
+            since = datetime.now().astimezone().isoformat(timespec="seconds")
+            # The lock holds without it, as where the disk is full.
+            with suppress(AvmsfError):
+                write_whole(named, json.dumps({"command": command, "process": os.getpid(), "since": since}))
         yield
     finally:
         if outermost:
             with suppress(OSError):
-                _holder_of(path).unlink(missing_ok=True)
+                named.unlink(missing_ok=True)
         lock.release()
 
 
@@ -82,27 +87,6 @@ def _expect_excused(error: OSError, path: Path) -> None:
         return
     advice = "delete it if no process uses the folder" if denied else way_out(error)
     raise AvmsfError.expected("a lock", error.strerror or str(error), file=path, advice=advice) from error
-
-
-def _holder_of(path: Path) -> Path:
-    return path.with_suffix(".lock.json")
-
-
-def _write_holder(path: Path, command: str) -> None:
-    since = datetime.now().astimezone().isoformat(timespec="seconds")
-    words = json.dumps({"command": command, "process": os.getpid(), "since": since})
-    # The lock holds without it, as where the disk is full.
-    with suppress(AvmsfError):
-        write_whole(_holder_of(path), words)
-
-
-def _read_holder(path: Path) -> dict[str, object]:
-    """Return who holds a lock; nothing where the holder could not say so."""
-    try:
-        known = read_json(_holder_of(path))
-    except (OSError, ValueError):
-        return {}
-    return known if isinstance(known, dict) else {}
 
 
 def start_child(command: Sequence[str], **settings: Any) -> "subprocess.Popen[bytes]":
