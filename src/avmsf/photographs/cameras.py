@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
@@ -163,14 +163,3 @@ class View:
     def coverage(self) -> Float[Tensor, "height width"] | None:
         """The mask as numbers from 0 to 1, float32."""
         return None if self.mask is None else self.mask.float() / 255
-
-
-def nearest_to_lines(
-    positions: Float64[np.ndarray, "lines 3"], directions: Float64[np.ndarray, "lines 3"]
-) -> Float64[np.ndarray, " 3"] | None:
-    """Return the point nearest to all lines, of unit directions, by least squares; None where these are parallel."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    total = across.sum(axis=0)
-    if np.linalg.eigvalsh(total)[0] < 1e-4 * len(directions):
-        return None
-    return np.linalg.solve(total, np.einsum("ijk,ik->j", across, positions))

@@ -19,7 +19,7 @@ from avmsf._utils.files import new_folder
 from avmsf._utils.text import counted, listed
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import colmap, nerf_json
-from avmsf.photographs.cameras import MIN_VIEWS, Camera, View, nearest_to_lines
+from avmsf.photographs.cameras import MIN_VIEWS, Camera, View
 from avmsf.photographs.colmap import PLACES, find_model, read_colmap
 from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, scale, size_of
 from avmsf.photographs.lenses import CameraFile, Lens, Photograph, undistort
@@ -205,9 +205,12 @@ def check_cameras(cameras: Sequence[Camera]) -> list[CaptureWarning]:
         position = np.round(positions[0], 6).tolist()
         message = f"expected cameras at several positions, got all {len(cameras)} at {position}; check the camera file"
         return [CaptureWarning(message, name="positions", value=position)]
-    center = nearest_to_lines(positions, axes)
-    if center is None:
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] < 1e-4 * len(axes):
+        # Parallel axes meet nowhere.
         return []
+    center = np.linalg.solve(total, np.einsum("ijk,ik->j", across, positions))
     behind = int((np.einsum("ij,ij->i", axes, center - positions) < 0).sum())
     if behind <= len(cameras) / 2:
         return []
