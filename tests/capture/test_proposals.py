@@ -10,7 +10,7 @@ import soundfile
 import trimesh
 
 from avmsf.capture import CaptureSettings, check, read_capture
-from avmsf.capture.proposals import Proposal, propose_settings, settings_text, write_settings
+from avmsf.capture.proposals import Proposal, propose_settings, write_settings
 from avmsf.capture.settings import METRES
 from avmsf.errors import CaptureError
 from factories.capture_folder import RATE, fill, ring
@@ -120,7 +120,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     path = write_settings(tmp_path, proposals)
     expected = replace(CaptureSettings(), force_channel=1, highpass=20.0, unit="mm")
     assert CaptureSettings.read(path) == expected
-    assert path.read_text(encoding="utf-8") == settings_text(proposals)
+    assert "# é\nhighpass = 20.0\n" in path.read_text(encoding="utf-8")
 
 
 def test_settings_that_a_user_wrote_are_kept(tmp_path: Path) -> None:

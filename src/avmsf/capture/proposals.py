@@ -48,6 +48,9 @@ class _Tolerances:
 
 
 _TOLERANCES = _Tolerances()
+_HEADING = """\
+# Proposed by `avmsf check --write-settings` from the folder's files; change or remove what does not suit.
+"""
 
 
 @dataclass(frozen=True)
@@ -99,26 +102,19 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
 
     Raises `CaptureError`, and changes nothing, where the folder has one already or it cannot be written.
     """
-    path = Path(folder) / SETTINGS
+    path, parts = Path(folder) / SETTINGS, [_HEADING]
+    for each in proposals:
+        reason = textwrap.wrap(each.reason, 100, initial_indent="# ", subsequent_indent="# ")
+        parts.append("\n".join([*reason, each.line, ""]))
     try:
         with open(path, "x", encoding="utf-8") as file:
-            file.write(settings_text(proposals))
+            file.write("\n".join(parts))
     except FileExistsError as error:
         advice = "add the proposed lines to it by hand"
         raise CaptureError.expected("no such file", got="an existing one", file=path, advice=advice) from error
     except OSError as error:
         raise unwritable(path, error, raising=CaptureError) from error
     return path
-
-
-def settings_text(proposals: Sequence[Proposal]) -> str:
-    """Return the text of a `capture.toml` with these settings, each below its reason."""
-    advice = "change or remove what does not suit"
-    parts = [f"# Proposed by `avmsf check --write-settings` from the folder's files; {advice}.\n"]
-    for each in proposals:
-        reason = textwrap.wrap(each.reason, 100, initial_indent="# ", subsequent_indent="# ")
-        parts.append("\n".join([*reason, each.line, ""]))
-    return "\n".join(parts)
 
 
 def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tensor, "contacts 3"]:
