@@ -46,10 +46,6 @@ class FileKind:
             raise self.error.expected(wanted, sorted(metadata), got=got, file=path, name=self.key, advice=advice)
         return metadata[self.key]
 
-    def read_record(self, path: Path) -> dict[str, Any]:
-        """Return the record of a file. Raises as `read_text` and `parse`."""
-        return self.parse(self.read_text(path), path)
-
     def parse(
         self, text: str, path: Path, check: Callable[[dict[str, Any]], object] = lambda _: None
     ) -> dict[str, Any]:

@@ -68,7 +68,7 @@ class Existing:
             other = cached if "a sound field" in self.kinds and cached.is_file() else "another"
             raise InputError.expected(self.what, kind, got=kind, file=path, advice=f"name {other}")
         if "a sound field" in self.kinds and kind in (None, "a sound field"):
-            FIELD.read_record(path)
+            FIELD.parse(FIELD.read_text(path), path)
         if self.columns:
             read_table(path, self.columns, (), advice=f"write a row for each impact below {','.join(self.columns)}")
 
