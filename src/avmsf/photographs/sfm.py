@@ -18,12 +18,11 @@ from avmsf._utils.processes import end_child, ending_of, start_child
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.photographs.cameras import MIN_VIEWS
 from avmsf.photographs.folder import mask_paths
 from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, size_of
 
 WORKER = Path(__file__).with_name("sfm_worker.py")
-MIN_IMAGES = 3
-"""Fewest images with which cameras can be estimated."""
 MIN_REGISTERED_RATIO = 0.5
 """Part of the images that must get a camera."""
 
@@ -96,9 +95,9 @@ def _stage_images(images: Path, begun: Path) -> tuple[dict[str, str], list[str]]
         names[staged], sizes[name] = name, size_of(pixels)
         _stage_image(path, pixels, begun / "images" / staged)
         _stage_mask(images, pixels, name, begun / "masks" / f"{staged}.png")
-    if len(names) < MIN_IMAGES:
+    if len(names) < MIN_VIEWS:
         unread = f" and {len(unreadable)} that cannot be read: {listed(unreadable, most=8)}" if unreadable else ""
-        wanted, got = f"at least {MIN_IMAGES} photographs ({', '.join(PICTURE_SUFFIXES)})", f"{len(names)}{unread}"
+        wanted, got = f"at least {MIN_VIEWS} photographs ({', '.join(PICTURE_SUFFIXES)})", f"{len(names)}{unread}"
         raise CaptureError.expected(wanted, len(names), got=got, file=images, name="photographs")
     usual = max(sizes.values(), key=list(sizes.values()).count)
     odd = [name for name, size in sizes.items() if size != usual]
@@ -175,7 +174,7 @@ def _check_groups(
 ) -> list[CaptureWarning]:
     """Return remarks on the images without a camera in the first and largest group; raise CaptureError for too many."""
     largest = set(groups[0]) if groups else set()
-    if len(largest) < max(MIN_IMAGES, MIN_REGISTERED_RATIO * len(everything)):
+    if len(largest) < max(MIN_VIEWS, MIN_REGISTERED_RATIO * len(everything)):
         lacking = [name for name in everything if name not in largest]
         apart = f" in {len(groups)} groups that could not be joined" if len(groups) > 1 else ""
         got = f"{len(largest)} of {len(everything)}{apart}, none for {listed(lacking)}"

@@ -14,11 +14,11 @@ from avmsf.errors import SceneError
 from avmsf.mesh.points import farthest_points
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from avmsf.photographs import find_foreground, read_views
-from avmsf.photographs.cameras import View
+from avmsf.photographs.cameras import MIN_VIEWS, View
 from avmsf.photographs.colmap import find_model
 from avmsf.photographs.folder import write_views
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
-from avmsf.photographs.sfm import MIN_IMAGES, estimate_cameras
+from avmsf.photographs.sfm import estimate_cameras
 from avmsf.photographs.video import pick_frames
 from avmsf.pipeline.config import ViewsConfig
 from avmsf.pipeline.stages import Stage, digest_files
@@ -68,10 +68,10 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
     if surface is not None and shaped:
         companions = (*pictures_in(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
         return Source("mesh", (surface, *companions), surface, folder)
-    if len(images) >= MIN_IMAGES or (images and photographs != folder):
-        if len(images) < MIN_IMAGES:
+    if len(images) >= MIN_VIEWS or (images and photographs != folder):
+        if len(images) < MIN_VIEWS:
             raise SceneError.expected(
-                f"{MIN_IMAGES} photographs or more", len(images), file=photographs, advice="take more"
+                f"{MIN_VIEWS} photographs or more", len(images), file=photographs, advice="take more"
             )
         return Source("photographs", (*images, *masks), photographs, folder)
     videos = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
