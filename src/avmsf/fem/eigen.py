@@ -84,7 +84,8 @@ def lowest_vibrations(
     if supported:
         elastic = (((weighted.T @ shapes) ** 2).sum(axis=0) < 0.5) & (squares > PENDULUM * squares[-1])
         squares, shapes = squares[elastic][:count], shapes[:, elastic][:, :count]
-    return squares, shapes * _signs(shapes)
+    # The largest component of each shape is positive.
+    return squares, shapes * np.sign(shapes[np.abs(shapes).argmax(axis=0), np.arange(shapes.shape[1])])
 
 
 def factorize(
@@ -167,8 +168,3 @@ def times(mass: scipy.sparse.csr_array, vectors: np.ndarray) -> np.ndarray:
     """Return the mass matrix, the same for all three components, times one vector or several."""
     spread = np.ascontiguousarray(vectors).reshape(mass.shape[0], -1)
     return (mass @ spread).reshape(vectors.shape)
-
-
-def _signs(shapes: Float64[np.ndarray, "dofs modes"]) -> Float64[np.ndarray, " modes"]:
-    """Return the sign that makes the largest component of each shape positive."""
-    return np.sign(shapes[np.abs(shapes).argmax(axis=0), np.arange(shapes.shape[1])])

@@ -6,7 +6,7 @@ basis every support is a dense eigenproblem of 100 to 400 unknowns.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -59,12 +59,7 @@ class ElasticModes:
 
     def at(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts modes 3"]:
         """Return the shapes where the surface is nearest to each place, interpolated as the elements do."""
-        rows, weights = self._interpolation(places)
-        # A node at a time: the shapes of all six at once would be six times the result.
-        total = torch.zeros(len(rows), *self.shapes.shape[1:], dtype=torch.float64)
-        for node in range(6):
-            total += weights[:, node, None, None] * self.shapes[rows[:, node]]
-        return total
+        return self._interpolated(places, lambda shapes: shapes)
 
     def gains(
         self, places: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"]
@@ -74,12 +69,8 @@ class ElasticModes:
         An impact of one newton-second along a unit vector gives a mode the velocity gain times shape. The response at
         one place to an impact at another is the product of the two gains, whichever of them is struck.
         """
-        rows, weights = self._interpolation(places)
-        total = torch.zeros(len(places), len(self), dtype=torch.float64)
-        for node in range(6):
-            along = torch.einsum("cmd,cd->cm", self.shapes[rows[:, node]], directions.double())
-            total += weights[:, node, None] * along
-        return total
+        along = directions.double()
+        return self._interpolated(places, lambda shapes: torch.einsum("cmd,cd->cm", shapes, along))
 
     def normals(self, places: Float[Tensor, "contacts 3"]) -> Float64[Tensor, "contacts 3"]:
         """Return the unit normals, out of the body, of the triangles nearest to each place."""
@@ -105,12 +96,16 @@ class ElasticModes:
             raise SimulationError.expected("finite coordinates in meters", places[row].tolist(), row=row, name="places")
         return self._closest(places.double().numpy())
 
-    def _interpolation(
-        self, places: Float[Tensor, "contacts 3"]
-    ) -> tuple[Int[Tensor, "contacts 6"], Float64[Tensor, "contacts 6"]]:
-        """Return the nodes of the nearest triangle, and the second-order shape functions in the nearest point of it."""
+    def _interpolated(self, places: Float[Tensor, "contacts 3"], part: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return the part of the shapes in the nearest points of the surface, by the second-order shape functions."""
         found = self._nearest(places)
-        return self.triangles[torch.from_numpy(found.rows)], torch.from_numpy(_quadratic(found))
+        rows, weights = self.triangles[torch.from_numpy(found.rows)], torch.from_numpy(_quadratic(found))
+        total = torch.zeros((), dtype=torch.float64)
+        # A node at a time: the shapes of all six at once would be six times the result.
+        for row, weight in zip(rows.T, weights.T, strict=True):
+            each = part(self.shapes[row])
+            total = total + weight.reshape(-1, *[1] * (each.ndim - 1)) * each
+        return total
 
     @cached_property
     def points(self) -> Float64[Tensor, "points 3"]:

@@ -64,20 +64,12 @@ def count_crowded_edges(mesh: Trimesh) -> int:
 def weld(surface: Surface) -> Trimesh:
     """Return a surface's triangles with vertices in one place made one, without those that have no area.
 
-    Raises SimulationError for points without triangles, coordinates that are not finite, triangles that name vertices
-    which are not there, and where no triangle has an area.
+    Raises SimulationError for points without triangles, and where no triangle has an area.
     """
     points, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     if not len(faces):
         got = f"{len(points)} points without triangles"
         raise SimulationError.expected("a mesh", 0, got=got, name="faces", advice="make a mesh of the points")
-    unfit = faces[(faces < 0) | (faces >= len(points))]
-    if len(unfit):
-        wanted = f"corners of triangles from 0 to {len(points) - 1}"
-        raise SimulationError.expected(wanted, int(unfit[0]), name="faces", advice="export the mesh again")
-    if not np.isfinite(points).all():
-        row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise SimulationError.expected("finite coordinates in meters", points[row].tolist(), row=row, name="vertices")
     places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
     pairs = cKDTree(places).query_pairs(TOLERANCES.weld_ratio * size, output_type="ndarray")

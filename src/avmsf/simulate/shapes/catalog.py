@@ -88,15 +88,12 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
 
 def _sized(kind: str, seed: int, size: float | None, wall: float | None) -> tuple[Draft, float]:
     """Return a draft and the factor that brings it to its size and walls."""
-    scale = 1.0
     draft = KINDS[kind](_chance(kind, seed, "form"), wall if size is None else None)
-    if size is None:
-        return draft, scale
-    for _ in range(1 if wall is None else _MAX_DRAFTS):
-        scale = size / draft.body.extent
-        if wall is not None:
-            # Walls are drawn to the scale of the draft, whose size they change a little.
-            draft = KINDS[kind](_chance(kind, seed, "form"), wall / scale)
+    if size is None or wall is None:
+        return draft, 1.0 if size is None else size / draft.body.extent
+    for _ in range(_MAX_DRAFTS):
+        # Walls are drawn to the scale of the draft, whose size they change a little.
+        draft = KINDS[kind](_chance(kind, seed, "form"), wall / (size / draft.body.extent))
     return draft, size / draft.body.extent
 
 
