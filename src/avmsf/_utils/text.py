@@ -37,8 +37,7 @@ def changes_repr(config: Any) -> str:
     usual = type(config)()
     pairs = ((each.name, getattr(config, each.name)) for each in fields(config))
     changed = [f"{name}={value!r}" for name, value in pairs if value != getattr(usual, name)]
-    more = [f"and {len(changed) - _MAX_CHANGES} more"] if len(changed) > _MAX_CHANGES else []
-    return f"{type(config).__name__}({', '.join(changed[:_MAX_CHANGES] + more)})"
+    return f"{type(config).__name__}({listed(changed, most=_MAX_CHANGES)})"
 
 
 def printable(text: str) -> str:
@@ -80,10 +79,10 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     return text.getvalue()
 
 
-def listed(names: Sequence[str], *, most: int = 5) -> str:
-    """Return the first names and how many more there are."""
+def listed(names: Sequence[str], *, most: int = 5, separator: str = ", ") -> str:
+    """Return the first names or sentences and how many more there are."""
     more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+    return separator.join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -35,9 +35,8 @@ def check_contacts(impacts: Sequence[Impact], settings: CaptureSettings) -> list
         places[tuple(round(value, 6) for value in label)].append(impact.line)
     repeated = [lines for lines in places.values() if len(lines) > 1]
     if repeated:
-        shown = "; ".join(listed(list(map(str, lines))) for lines in repeated[:5])
-        more = " and more" * (len(repeated) > 5)
-        message = f"{TABLE}: rows at the same contact: {shown}{more}; used as repeated impacts"
+        shown = listed([listed(list(map(str, lines))) for lines in repeated], separator="; ")
+        message = f"{TABLE}: rows at the same contact: {shown}; used as repeated impacts"
         remarks.append(CaptureWarning(message, file=TABLE, row=repeated[0][1], value=repeated))
     across = float(np.linalg.norm(np.ptp([impact.contact for impact in impacts], axis=0))) if impacts else 0.0
     if across > WIDEST or 0 < across < NARROWEST:

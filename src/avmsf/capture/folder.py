@@ -15,7 +15,7 @@ from avmsf.capture.audio import Recording, read_recording, wav_bytes
 from avmsf.capture.checks import check_contacts, check_surface, find_surface
 from avmsf.capture.filenames import files_in, number_key
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.issues import Issues, RecordingReport, shared_problems, shortened
+from avmsf.capture.issues import Issues, RecordingReport, shared_problems
 from avmsf.capture.preprocess import check_levels, preprocess
 from avmsf.capture.settings import SETTINGS, TABLE, CaptureSettings, settings_of
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, Impact, in_folder, is_inside, present_impacts, read_impacts
@@ -90,7 +90,7 @@ def read_capture(folder: str | Path, settings: CaptureSettings | None = None) ->
     assert impacts is not None
     if wrong := [report for report in issues.reports if report.problems]:
         found = f"{len(wrong)} of {len(issues.reports)} recordings {'looks' if len(wrong) == 1 else 'look'} wrong"
-        message = f"{found}: {shortened(shared_problems(wrong))}. `avmsf check {folder}` shows all"
+        message = f"{found}: {listed(shared_problems(wrong), separator='; ')}. `avmsf check {folder}` shows all"
         issues.warnings.append(CaptureWarning(message, file=folder, value=[report.file for report in wrong]))
     for warning in issues.warnings:
         warnings.warn(warning, stacklevel=2)

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from avmsf._utils.text import listed
 from avmsf.capture.settings import TABLE
 from avmsf.errors import CaptureError, CaptureWarning
 
@@ -76,12 +77,7 @@ def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
     for problem, files in places.items():
         where = f"{files[0]}: "
         if len(files) > 1:
-            where = f"{len(files)} recordings ({', '.join(files[:3])}{', …' * (len(files) > 3)}): "
+            where = f"{len(files)} recordings ({listed(files, most=3)}): "
         # Errors of the table's reader say which rows they are about.
         sentences.append(problem if problem.startswith(TABLE) else f"{where}{problem}")
     return sentences
-
-
-def shortened(sentences: Sequence[str], *, most: int = 5) -> str:
-    """Return the first messages, and how many more there are."""
-    return "; ".join([*sentences[:most], *([f"and {len(sentences) - most} more"] if len(sentences) > most else [])])

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import soundfile
 
+from avmsf._utils.text import listed
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.issues import Issues, shared_problems, shortened
+from avmsf.capture.issues import Issues, shared_problems
 from avmsf.capture.placement import check_placement
 from avmsf.capture.preprocess import preprocess
 from avmsf.capture.settings import CaptureSettings
@@ -52,7 +53,7 @@ def build_capture(
     remarks += map(str, issues.warnings)
     remarks += _repeated(impacts) + _misplaced(impacts, surface, origin=origin)
     if remarks:
-        message = f"{origin}: {shortened(remarks)}"
+        message = f"{origin}: {listed(remarks, separator='; ')}"
         warnings.warn(CaptureWarning(message, name=origin, value=tuple(remarks)), stacklevel=3)
     return Capture(name, impacts, surface)
 
@@ -60,9 +61,8 @@ def build_capture(
 def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
     """Raise DatasetError with the reasons where fewer than two recordings can be used."""
     if count < MIN_RECORDINGS:
-        raise DatasetError.expected(
-            f"at least {MIN_RECORDINGS} usable recordings with contacts", count, name=origin, advice=shortened(reasons)
-        )
+        wanted, advice = f"at least {MIN_RECORDINGS} usable recordings with contacts", listed(reasons, separator="; ")
+        raise DatasetError.expected(wanted, count, name=origin, advice=advice)
 
 
 def check_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetError | None:
@@ -94,7 +94,7 @@ def _repeated(impacts: Impacts) -> list[str]:
     for name, contact in zip(impacts.names, impacts.contacts.tolist(), strict=True):
         places.setdefault(tuple(round(value, 6) for value in contact), []).append(name)
     repeated = [", ".join(names) for names in places.values() if len(names) > 1]
-    return [f"impacts at the same contact: {' and '.join(repeated[:5])}"] if repeated else []
+    return [f"impacts at the same contact: {listed(repeated, separator='; ')}"] if repeated else []
 
 
 def _misplaced(impacts: Impacts, surface: Surface | None, *, origin: str) -> list[str]:
