@@ -13,8 +13,8 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, TypeVar
+from types import MappingProxyType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from avmsf.errors import AvmsfError
 
@@ -30,6 +30,8 @@ _HIDDEN = [*range(0x20), 0x7F, *range(0x80, 0xA0), *range(0x202A, 0x202F), *rang
 """Control characters of terminals (C0, DEL, C1), and those that reverse the direction of what follows."""
 _ESCAPES = {code: chr(code).encode("unicode_escape").decode() for code in _HIDDEN if chr(code) not in "\n\t"}
 _Record = TypeVar("_Record")
+OTHER: Any = object()
+"""Stands for a value of another type."""
 
 
 def changes_repr(config: Any) -> str:
@@ -158,6 +160,24 @@ def record_of(example: _Record, values: Any, name: str, *, added: Mapping[str, A
 def without_defaults(values: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
     """Return a record's values for a file, which `record_of` reads: those of `added` fields only where they differ."""
     return {name: value for name, value in values.items() if name not in added or value != added[name]}
+
+
+def as_type(value: Any, hint: Any) -> Any:
+    """Return a plain value as a type, or `OTHER` where it is none of that type."""
+    kind, arguments = get_origin(hint), get_args(hint)
+    if kind in (Union, UnionType):
+        return next((each for part in arguments if (each := as_type(value, part)) is not OTHER), OTHER)
+    if kind is Literal:
+        return value if value in arguments else OTHER
+    if kind is tuple and isinstance(value, list):
+        parts = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
+        found = tuple(map(as_type, value, parts)) if len(parts) == len(value) else (OTHER,)
+        return OTHER if OTHER in found else found
+    if hint is float and type(value) is int and abs(value) <= sys.float_info.max:
+        return float(value)
+    if hint is Path and isinstance(value, str):
+        return Path(value)
+    return value if isinstance(hint, type) and type(value) is hint else OTHER
 
 
 def like(value: Any, example: Any, name: str) -> Any:

@@ -1,14 +1,13 @@
 """What a capture's owner knows about its recordings: the contents of `capture.toml`, every key optional."""
 
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_args
 
-from avmsf._utils.text import read_toml
+from avmsf._utils.text import OTHER, as_type, read_toml
 from avmsf.errors import CaptureError
 
 SETTINGS, TABLE = "capture.toml", "impacts.csv"
@@ -18,6 +17,7 @@ OBJECT_SIZES = (0.01, 5.0)
 """Meters across of objects whose impacts are recorded."""
 USUAL_SECONDS = 3.0
 TIME_ZEROS = ("onset", "peak")
+_POINTS = "a list of points [x, y, z], such as [[0, 0, 0], [0.3, 0, 0]]"
 NORMALIZATIONS = ("auto", "peak", "deconvolve", "none", "done")
 
 
@@ -72,11 +72,11 @@ class CaptureSettings:
     def __post_init__(self) -> None:
         units, positive, channel = f"one of {', '.join(METRES)}", "a number above 0", "a channel from 1 on"
         response, force = self.response_channel, self.force_channel
-        _points(self.held)
         for key, valid, expected in (
             ("unit", self.unit in METRES, units),
             ("surface_unit", self.surface_unit in (None, *METRES), units),
             ("views_unit", self.views_unit in METRES, units),
+            ("held", all(len(each) == 3 and all(map(math.isfinite, each)) for each in self.held), _POINTS),
             ("seconds", self.seconds is None or 0 < self.seconds < math.inf, positive),
             ("playback_speed", 0 < self.playback_speed < math.inf, positive),
             ("regularization", 0 < self.regularization < math.inf, positive),
@@ -156,15 +156,15 @@ class CaptureSettings:
     @classmethod
     def of(cls, values: Mapping[str, Any], *, name: str, file: Path | None = None) -> "CaptureSettings":
         """Return settings of these keys' plain values; `CaptureError` gives `name`, the key and what was expected."""
-        known = {field.name: get_args(field.type) or (field.type,) for field in fields(cls)}
+        known = {field.name: field.type for field in fields(cls)}
         try:
             return cls(**{key: _typed(key, value, known) for key, value in values.items()})
         except CaptureError as error:
             raise CaptureError(f"{name}: {error}", file=file, name=error.name, value=error.value) from error
 
 
-def _typed(key: str, value: Any, known: Mapping[str, tuple[object, ...]]) -> Any:
-    """Return the value as one of its key's types; whole numbers serve as numbers, and `true` as neither.
+def _typed(key: str, value: Any, known: Mapping[str, Any]) -> Any:
+    """Return the value as its key's type; whole numbers serve as numbers, and `true` as neither.
 
     The `value` of the error of an unknown key is the most similar known one, if any.
     """
@@ -173,27 +173,13 @@ def _typed(key: str, value: Any, known: Mapping[str, tuple[object, ...]]) -> Any
         advice = "" if similar is None else f"did you mean {similar}?"
         wanted, got = f"keys among {', '.join(known)}", "another one"
         raise CaptureError.expected(wanted, similar, got=got, name=key, advice=advice)
-    if key == "held":
-        return _points(value)
-    if float in known[key] and type(value) is int and abs(value) <= sys.float_info.max:
-        return float(value)
-    if type(value) not in known[key]:
+    found = as_type(value, known[key])
+    if found is OTHER:
+        kinds = get_args(known[key]) or (known[key],)
         names = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
-        expected = " or ".join(name for kind, name in names.items() if kind in known[key])
+        expected = " or ".join(name for kind, name in names.items() if kind in kinds) or _POINTS
         raise CaptureError.expected(expected, value, name=key)
-    return value
-
-
-def _points(value: Any) -> tuple[tuple[float, ...], ...]:
-    """Return lists of numbers as points. Raises CaptureError for anything else."""
-    listed = isinstance(value, list | tuple) and all(isinstance(each, list | tuple) for each in value)
-    if not listed or any(
-        len(each) != 3 or any(type(number) not in (int, float) or not math.isfinite(number) for number in each)
-        for each in value
-    ):
-        advice = "such as [[0, 0, 0], [0.3, 0, 0]]"
-        raise CaptureError.expected("a list of points [x, y, z]", value, name="held", advice=advice)
-    return tuple(tuple(float(number) for number in each) for each in value)
+    return found
 
 
 def unit_named(meters: float) -> str | None:

@@ -11,19 +11,18 @@ from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from types import MappingProxyType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from types import MappingProxyType
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
 
+from avmsf._utils.text import OTHER, as_type
 from avmsf.cli.paths import Existing, InputError, arg
 
 T = TypeVar("T")
 Assignments = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg("NAME=VALUE", name="set")]
 """Settings, one for each time that the option is given."""
 SettingsTable = Annotated[Path | None, arg("FILE"), Existing("settings, as --print-config writes them")]
-_OTHER: Any = object()
-"""Stands for a value of another type."""
 _WIDTH = 100
 """Columns of the comments of a file of settings."""
 
@@ -134,8 +133,8 @@ def _full_name(name: str, known: Mapping[str, Any], file: Path | None) -> str:
 def _parsed(name: str, value: Any, hint: Any) -> Any:
     """Return a value, or what a text spells, as a type; several numbers are separated by commas. Raises InputError."""
     for candidate in _readings(value) if isinstance(value, str) else [value]:
-        found = _as_type(candidate, hint)
-        if found is not _OTHER:
+        found = as_type(candidate, hint)
+        if found is not OTHER:
             return found
     kind = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
     raise InputError.expected(f"a value of the type {kind}", value, name=name.removeprefix("scene."))
@@ -149,24 +148,6 @@ def _readings(text: str) -> Iterator[Any]:
         with suppress(ValueError):
             yield json.loads(words)
     yield text
-
-
-def _as_type(value: Any, hint: Any) -> Any:
-    """Return a plain value as a type, or `_OTHER` where it is none of that type."""
-    kind, arguments = get_origin(hint), get_args(hint)
-    if kind in (Union, UnionType):
-        return next((each for part in arguments if (each := _as_type(value, part)) is not _OTHER), _OTHER)
-    if kind is Literal:
-        return value if value in arguments else _OTHER
-    if kind is tuple and isinstance(value, list):
-        parts = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
-        found = tuple(map(_as_type, value, parts)) if len(parts) == len(value) else (_OTHER,)
-        return _OTHER if _OTHER in found else found
-    if hint is float and type(value) is int:
-        return float(value)
-    if hint is Path and isinstance(value, str):
-        return Path(value)
-    return value if isinstance(hint, type) and type(value) is hint else _OTHER
 
 
 def _changed(config: T, given: Mapping[str, Any], owner: str = "") -> T:
