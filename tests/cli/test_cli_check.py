@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.filenames import pictures_in
+from avmsf.capture.filenames import expect_views, pictures_in
 from avmsf.capture.settings import METRES
 from avmsf.cli import main
 from avmsf.errors import SceneError
@@ -23,9 +23,6 @@ from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import read_camera_file, write_frames
-from avmsf.pipeline.config import SceneConfig
-from avmsf.pipeline.scene import SceneStages
-from avmsf.pipeline.stages import StageFolder
 from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced
 from factories.capture_folder import RATE, fill, ring
 from factories.plate_capture import fill_plate
@@ -132,10 +129,6 @@ def test_every_command_names_the_unit_of_the_mesh_and_writes_nothing(command, tm
     assert [each.name for each in tmp_path.iterdir()] == ["plate"]
 
 
-def stages_of(folder: Path) -> SceneStages:
-    return SceneStages(folder, StageFolder(folder / "stages"), SceneConfig(), settings=CaptureSettings())
-
-
 def found(folder: Path) -> VisualInputs:
     visual = inputs(folder, CaptureSettings())
     assert visual is not None
@@ -174,9 +167,9 @@ def test_photographs_with_cameras_and_masks(case: str, tmp_path: Path) -> None:
 def test_an_empty_folder_of_images_is_refused_unless_a_mesh_shows_the_object(tmp_path: Path) -> None:
     (tmp_path / "images").mkdir()
     with raises(SceneError, file=tmp_path):
-        stages_of(tmp_path).expect_any()
+        expect_views(tmp_path, CaptureSettings())
     (tmp_path / "surface.obj").touch()
-    stages_of(tmp_path).expect_any()
+    expect_views(tmp_path, CaptureSettings())
 
 
 def test_images_of_a_cache_are_no_photographs(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import CaptureError
+from avmsf.errors import CaptureError, SceneError
 
 SURFACE_FILES = ("surface.obj", "surface.ply", "surface.glb", "surface.stl")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
@@ -88,6 +88,23 @@ def shows_object(folder: Path, settings: CaptureSettings) -> bool:
         return True
     shown = (*PICTURE_SUFFIXES, *VIDEO_SUFFIXES)
     return any(path.name in _OF_VIEWS or path.suffix.lower() in shown for path in folder.iterdir())
+
+
+def expect_views(folder: Path, settings: CaptureSettings) -> None:
+    """Raise `SceneError` for a folder none of whose files, by their names alone, shows the object."""
+    if not folder.is_dir():
+        raise SceneError.expected("a folder with photographs, a video or a mesh", file=folder, advice="check the name")
+    if settings.surface is None and not shows_object(folder, settings):
+        raise no_views(folder)
+
+
+def no_views(folder: Path) -> SceneError:
+    """Return the error of a folder that shows nothing of the object."""
+    return SceneError(
+        f"{folder}: expected photographs (transforms.json, a COLMAP model or a folder images/), a video, a mesh "
+        "(surface.obj, .ply, .glb, .stl) or Gaussians (splats.ply), got none",
+        file=folder,
+    )
 
 
 def similar_name(name: str, names: Iterable[str]) -> str | None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from avmsf._utils.text import format_number, listed
+from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings
 from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import (
@@ -161,7 +162,7 @@ class Options(Configured, Many):
     def _check_capture(self) -> None:
         """Raise for a capture that is not there, or not whole."""
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
-            read_settings(self.capture, self.settings)
+            expect_views(self.capture, read_settings(self.capture, self.settings))
         elif self.material is None:
             if not self.capture.is_dir():
                 wanted, advice = "a capture folder", "--material NAME computes a field of a mesh without recordings"

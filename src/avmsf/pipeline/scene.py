@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from avmsf._utils.progress import ProgressListener
 from avmsf._utils.text import counted
+from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import SceneError
 from avmsf.features.encoder import Encoder
@@ -76,11 +77,7 @@ class SceneStages(Pipeline):
     def expect_any(self) -> None:
         """Raise SceneError, before anything is written, where the folder shows nothing of the object."""
         if not self:
-            wanted = (
-                "photographs (transforms.json, a COLMAP model or a folder images/), a video, a mesh (surface.obj, "
-                ".ply, .glb, .stl) or Gaussians (splats.ply)"
-            )
-            raise SceneError.expected(wanted, file=self.source_folder)
+            raise no_views(self.source_folder)
 
     @property
     def features(self) -> Kept:
