@@ -72,6 +72,15 @@ def test_nearest_and_means_are_those_of_a_full_search():
         assert torch.allclose(gains, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
+def test_means_of_more_than_there_are_are_of_all_and_of_none_are_refused():
+    train, test = split(plate_impacts(), 0.2)
+    mean = MeanWaveform(train, count=len(train) + 1)
+    assert mean.report == {"neighbors": len(train)}
+    assert torch.allclose(mean.render(test.contacts), train.sounds.mean(0).expand(len(test), -1), atol=1e-6)
+    with raises(EvaluationError, name="count", value=0):
+        MeanWaveform(train, count=0).render(test.contacts)
+
+
 def test_mean_gains_have_both_phases():
     train, _ = split(plate_impacts(), 0.2)
     extraction = true_extraction(train)

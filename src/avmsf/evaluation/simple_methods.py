@@ -51,7 +51,9 @@ class _Neighbors:
 
     @property
     def neighbors(self) -> int:
-        """How many are averaged: all where there are fewer than `count`."""
+        """How many are averaged: all where there are fewer than `count`. Raises EvaluationError for none."""
+        if self.count < 1:
+            raise EvaluationError.expected("1 or more training impacts", self.count, name="count")
         return min(self.count, len(self.train))
 
     @property
