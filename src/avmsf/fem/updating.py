@@ -27,7 +27,6 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.perturbation import Perturbations
 
 
 @dataclass(frozen=True)
@@ -79,11 +78,9 @@ def update(
     impacts at `points` (meters) along `directions` (unit vectors); modes that are not `usable`, silent or doubled ones,
     say nothing of the body. `match` weighs a body, known at least at the points, against the other families.
     """
-    assert modes.perturbations is not None
     local = modes.near(points)
     known = local.gains(points, directions).numpy()
-    measured = frequency[usable].numpy(), values[:, usable].numpy()
-    problem = _Problem(modes.frequency.numpy(), modes.perturbations, known, *measured)
+    problem = _Problem(modes, known, frequency[usable].numpy(), values[:, usable].numpy())
     theta, spread, best = np.zeros(len(problem.deviation)), TOLERANCES.frequency_std, None
     found = match(local)
     nominal = highest = found.evidence
@@ -104,16 +101,16 @@ class _Problem:
 
     def __init__(
         self,
-        nominal: Float64[np.ndarray, " shapes"],
-        perturbations: Perturbations,
+        nominal: ElasticModes,
         known: Float64[np.ndarray, "contacts shapes"],
         frequency: Float64[np.ndarray, " modes"],
         values: Float64[np.ndarray, "contacts modes"],
     ) -> None:
         self.known, self.frequency, self.values = known, frequency, values
-        self.squares = np.square(2.0 * np.pi * nominal)
-        self.forces = np.concatenate([perturbations.stiffness, TOLERANCES.poisson_step * perturbations.poisson[None]])
-        self.masses = perturbations.mass
+        self.squares, changes = np.square(2.0 * np.pi * nominal.frequency.numpy()), nominal.perturbations
+        assert changes is not None
+        self.forces = np.concatenate([changes.stiffness, TOLERANCES.poisson_step * changes.poisson[None]])
+        self.masses = changes.mass
         self.deviation = np.repeat(
             [TOLERANCES.stiffness_std, TOLERANCES.poisson_std, TOLERANCES.density_std],
             [len(self.forces) - 1, 1, len(self.masses)],

@@ -114,10 +114,6 @@ def _elastic(recipe: ObjectRecipe, solid: Solid, legs: Float64[Tensor, "legs 3"]
 def _scale(recipe: ObjectRecipe, vertices: Tensor) -> float:
     """Return what makes the longest side of the bounding box as long as the recipe has it."""
     longest = float((vertices.amax(0) - vertices.amin(0)).max())
-    if not longest > 0.0:
-        raise SimulationError.expected(
-            "a mesh with an extent", longest, got="one point", file=recipe.mesh, name="size", advice="export it again"
-        )
     if recipe.size is None and longest > _MAX_EXTENT_M:
         advice = f"if it is in millimeters, give --size {longest / 1000:g}, else its length by --size"
         wanted, got = f"a mesh of at most {_MAX_EXTENT_M:g} m", f"{longest:g} m"

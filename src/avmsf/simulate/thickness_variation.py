@@ -51,12 +51,12 @@ def _factors(
     field: Float64[np.ndarray, " points"], share: Float64[np.ndarray, " points"], part: float
 ) -> Float64[np.ndarray, " points"]:
     """Return positive factors of mean 1 and this root mean square deviation that rise with a field."""
-    strength = 0.0
+    strength = part
     for _ in range(50):
-        factor = np.exp((strength or part) * (field - field.mean()))
+        factor = np.exp(strength * (field - field.mean()))
         factor /= np.average(factor, weights=share)
         found = float(np.sqrt(np.average((factor - 1.0) ** 2, weights=share)))
-        strength = (strength or part) * part / found
+        strength = strength * part / found
     return factor
 
 

@@ -112,7 +112,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     height = depth * radius
     corners = [(0.0, 0.0, 1.2), (0.8, 0.0, 1.2), (0.9, 0.15, 1.0), (1.0, 1.0, 1.0)]
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=760, crowd=_CROWDING)
-    ring = _ring_at(turned, 0.6 * height, _BANDS)
+    ring = _ring_at(turned, 0.6 * height)
     patch = turned.side_patch(range(ring, ring + _BANDS + 1), _HALF_WIDTH)
     middle = patch.places.mean(axis=0)
     far = length * radius
@@ -135,7 +135,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
 
 def _add_handle(turned: Turned, low: float, high: float, reach: float, random: np.random.Generator) -> None:
     """Add an ear at angle 0 between two heights that stands out by `reach`, meters."""
-    above, below = _ring_at(turned, high, _BANDS), _ring_at(turned, low, _BANDS)
+    above, below = _ring_at(turned, high), _ring_at(turned, low)
     if (above + below + _BANDS) % 2:
         # The diagonals of the upper patch, upside down, are the lower one's only every second band.
         below += 1
@@ -161,8 +161,8 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
     leaving.grow(swept(curve, widths, heights, leaving.places, arriving.places), end=arriving)
 
 
-def _ring_at(turned: Turned, height: float, bands: int) -> int:
+def _ring_at(turned: Turned, height: float) -> int:
     """Return the lowest ring of a patch whose middle lies at a height on the wall."""
     heights = turned.sheet.middle[turned.rings.starts[:-1], 2]
     # Beyond the bottom, where heights rise.
-    return int(np.argmin(np.abs(heights - height))) - bands // 2
+    return int(np.argmin(np.abs(heights - height))) - _BANDS // 2
