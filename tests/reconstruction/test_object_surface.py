@@ -15,6 +15,7 @@ from avmsf.reconstruction import ObjectShape, object_surface
 from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.hull_distance import Outline, hull_distance
+from avmsf.reconstruction.object_shape import ShapeReport
 from factories.looked_at import HEIGHT, RADIUS, ball, cup, cup_volume, depth_of, mesh_of, tube, views_of
 
 CELLS, COARSE = 64, 48
@@ -67,6 +68,15 @@ def test_depth_that_errs_beside_a_cavity_dents_no_wall() -> None:
     points = mesh_of(shape.solid()).vertices
     radii = np.linalg.norm(points[np.abs(points[:, 2] - 0.03) < 0.005, :2], axis=1)
     assert float(np.median(radii)) == pytest.approx(RADIUS, abs=0.0007)
+
+
+def test_a_cup_of_which_depth_shows_half_of_the_cavity_is_open_in_all_of_its_mouth() -> None:
+    mesh = cup(wall=WALL)
+    half = trimesh.creation.box(bounds=[(-1, 0, -1), (1, 1, 1)])
+    filled = trimesh.boolean.union([mesh, trimesh.boolean.intersection([mesh.convex_hull, half])])
+    shape = object_surface(views_of(mesh), depth_of(filled), cells=CELLS)
+    assert mesh_of(shape.as_seen()).volume > 0.6 * mesh.convex_hull.volume
+    assert mesh_of(shape.shell(WALL)).volume == pytest.approx(cup_volume(WALL), rel=0.05)
 
 
 @pytest.mark.parametrize("wall", [0.0007, 0.002, 0.004, 0.008])
@@ -127,6 +137,22 @@ def test_views_that_alone_look_through_a_channel_keep_their_masks() -> None:
     shape = _shape(trimesh.util.concatenate(boxes))
     assert shape.report.rejected == ()
     assert mesh_of(shape.solid()).volume < 0.6 * length * width * (height + WALL)
+
+
+def test_a_lid_that_is_bent_reaches_all_of_its_rims() -> None:
+    # An angle bar of which only the middle of the inner faces is known to be a lid.
+    legs, deep, wall, cell = (0.06, 0.04, 0.04), 0.01, 0.003, 0.001
+    grid = Grid(np.full(3, -3.5 * cell), cell, tuple(round(each / cell) + 7 for each in legs))
+    x, y, z = np.moveaxis(grid.centers(np.indices(grid.shape).reshape(3, -1).T), 1, 0).reshape(3, *grid.shape)
+    ends = [low for at, leg in zip((x, y, z), legs, strict=True) for low in (at, leg - at)]
+    outer = np.minimum(np.min(ends, axis=0), np.maximum(deep - y, deep - z)).astype(np.float32)
+    known = (np.minimum(y, z) > deep - cell) & (np.min(ends, axis=0) > 0.006)
+    hollow = ((outer > 0) & (outer < cell) & known).astype(np.int32)
+    shape = ObjectShape(grid, outer, outer, hollow, True, float(np.linalg.norm(legs)), ShapeReport((), 0.0, 0.0))
+    leg, inner = legs[1], legs[1] - 2 * wall
+    solid, cavity = deep * (2 * leg - deep), (deep - wall) * (2 * inner - deep + wall)
+    true = legs[0] * solid - (legs[0] - 2 * wall) * cavity
+    assert mesh_of(shape.shell(wall)).volume == pytest.approx(true, rel=0.03)
 
 
 def test_a_shallow_dome_is_as_thin_at_its_rim_as_in_the_middle() -> None:

@@ -18,7 +18,7 @@ from avmsf.reconstruction.distance import depth_in_convex_hull
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.hull_distance import Outline, hull_distance
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
-from avmsf.reconstruction.object_shape import ObjectShape, ShapeReport, closed_surface
+from avmsf.reconstruction.object_shape import LID_BLUR, ObjectShape, ShapeReport, closed_surface, facing_alike
 
 _COARSE_CELLS = 48
 """Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
@@ -80,10 +80,9 @@ def object_surface(views: Sequence[View], depth_map: DepthMap, *, cells: int = 1
     seen, bound, unseen = _closed(hull, seen, view_counts, grid)
     hollow = _hollows(bound, seen, grid, diagonal)
     supposed = not hollow.any()
-    if supposed:
-        hollow = _unobserved_cavities(seen, untouched > _MIN_TOUCH_DISTANCE * diagonal)
     # Beside cavities that were seen, what depth carves is its scatter.
     outer = seen if supposed else bound
+    hollow = _opened(hollow, outer, untouched > _MIN_TOUCH_DISTANCE * diagonal, LID_BLUR * diagonal / grid.spacing)
     rejected = tuple(view.name for view, each in zip(masked, right, strict=True) if not each)
     shape = ObjectShape(grid, outer, seen, hollow, supposed, diagonal, ShapeReport(rejected, offset, unseen))
     if supposed and _seen_through(hollow, seen > 0, cameras, grid):
@@ -131,21 +130,31 @@ def _box(
     return grid.box(inside)
 
 
-def _unobserved_cavities(seen: Float32[np.ndarray, "x y z"], untouched: Bool[np.ndarray, "x y z"]) -> np.ndarray:
-    """Return cavities, numbered, right below the largest faces that no outline touches, as deep as a cell.
+def _opened(
+    hollow: Int[np.ndarray, "x y z"],
+    outer: Float32[np.ndarray, "x y z"],
+    untouched: Bool[np.ndarray, "x y z"],
+    blur: float,
+) -> Int[np.ndarray, "x y z"]:
+    """Return the numbers of cavities in all of the faces that they open in, a cell deep.
 
-    Outlines do not say whether such a face is there, or only its edge.
+    No outline touches such a face: outlines do not say whether it is there, or only its edge. Where no view saw into a
+    cavity, one is supposed behind each of the largest faces.
     """
-    inside = seen > 0
-    shallow = inside & ~ndimage.binary_erosion(inside)
-    skin = shallow & untouched
-    label, count = ndimage.label(skin, np.ones((3, 3, 3)))
-    sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]
-    least = max(_MIN_AREA_RATIO * sizes.max(initial=0), _MIN_FACE_RATIO * int(shallow.sum()))
-    large = np.flatnonzero(sizes >= least) + 1
-    numbers = np.zeros(count + 1, dtype=np.int32)
-    numbers[large] = np.arange(1, len(large) + 1)
-    return numbers[label]
+    inside = outer > 0
+    skin = inside & ~ndimage.binary_erosion(inside)
+    label, count = ndimage.label(skin & untouched, np.ones((3, 3, 3)))
+    if hollow.any():
+        numbers = ndimage.maximum(hollow, label, np.arange(count + 1))
+        # Between the touches of few views a face runs over its edge.
+        alike, _, nearest = facing_alike(outer, (hollow > 0) & (label > 0), blur)
+        label *= alike & (label == label[nearest])
+    else:
+        sizes = np.bincount(label[skin], minlength=count + 1)
+        sizes[0] = 0
+        large = sizes >= max(_MIN_AREA_RATIO * sizes.max(), _MIN_FACE_RATIO * int(skin.sum()))
+        numbers = np.where(large, large.cumsum(), 0)
+    return np.where((hollow > 0) | (label == 0), hollow, numbers[label]).astype(np.int32)
 
 
 def _seen_through(
