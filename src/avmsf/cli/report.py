@@ -55,6 +55,12 @@ def describe(field: SoundField) -> dict[str, Any]:
     }
 
 
+def _levels_words(levels: Sequence[float] | None) -> str:
+    """Return the range of the levels by which recordings without forces were divided, if they were."""
+    decibels = [20.0 * math.log10(each) for each in levels or ()]
+    return f", their forces as their gains say: {min(decibels):+.1f} to {max(decibels):+.1f} dB" if decibels else ""
+
+
 def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list[str]:
     """Return lines on a field in the file `path`: what it is and how good it is; all with `settings`."""
     values = describe(field)
@@ -64,7 +70,7 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
     rows = [
         ("modes", f"{modes}, {report.get('damping', 'shared')} damping{reason}"),
         ("gains", _gains_words(values["gain_field"])),
-        ("fitted to", counted(len(values["trained_on"]), "recording")),
+        ("fitted to", counted(len(values["trained_on"]), "recording") + _levels_words(report.get("levels"))),
     ]
     if settings:
         extent = ", ".join(

@@ -91,8 +91,7 @@ def fit(
         Origin(capture, train.names, train.forces is not None, config, report, settings),
         modes.alignment,
     )
-    used = train.take(fitted.used)
-    return _with_quality(_with_noise(field, used), used, advise=features.on_surface)
+    return _with_quality(_with_noise(field, fitted.train), fitted.train, advise=features.on_surface)
 
 
 def fingerprint(data: GainData, estimator: GainEstimator) -> str:

@@ -15,6 +15,7 @@ from torch.optim.adamw import adamw
 
 from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.device import TRAINABLE, steps_between_losses, without_denormals
+from avmsf.capture.impacts import Impacts
 from avmsf.errors import FieldFileError, FitError
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import GainModel, Gains
@@ -355,8 +356,8 @@ class FittedGains:
     """Its modes are in the `order` of the run."""
     run: TrainingRun
     """With the frequencies, dampings and noise as trained."""
-    used: Sequence[int]
-    """Rows of the recordings that the model was fitted to."""
+    train: Impacts
+    """The recordings that the model was fitted to, over the levels that were found of those without forces."""
     report: dict[str, Any]
     """What was chosen and found, as plain values."""
 

@@ -1,5 +1,6 @@
 """What gain models are given, and their fields scaled, refined and held."""
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -15,7 +16,7 @@ from avmsf.fem.supports import EndPatch, Place, Support, patches_about
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
-from avmsf.field.gains.data import gain_data, orientation_signs
+from avmsf.field.gains.data import GainData, gain_data, orientation_signs
 from avmsf.field.gains.estimator import MixtureEstimator, RefinedGains
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import off_surface, off_surface_gains, points_on_object
@@ -360,3 +361,20 @@ def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypat
     assert model.report["credibility"]["credible"]
     assert not model.report["supports_tried"]
     assert asked == []
+
+
+def test_levels_of_recordings_without_forces_are_found():
+    even = known_gains(elastic_modes(block(SIDES, (9, 6, 1)), NOMINAL, count=12))[0]
+    levels = torch.exp(2.4 * draw(len(even.train), seed=7))
+    levels /= levels.log().mean().exp()
+    uneven = even.divided(1.0 / levels)
+    of_unknown_forces = replace(uneven, train=replace(uneven.train, forces=None))
+
+    def levels_of(data: GainData) -> list[float]:
+        return MixtureEstimator(bodies=Plate()).solve(data)[0].report["levels"]
+
+    off = (torch.tensor(levels_of(of_unknown_forces), dtype=torch.float64) / levels).log().abs()
+    # Two contacts are so close to edges that the others do not predict them.
+    assert int((off < 0.2).sum()) == 10
+    assert levels_of(even) == []
+    assert levels_of(uneven) == []

@@ -6,10 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from avmsf.field.gains import mixture as module
 from avmsf.field.gains.fitting import active_series
 from avmsf.field.gains.mixture import (
+    LEVEL_DEVIATION,
     NOISE_SHARES,
     SCALE_SHAPE,
     Hypotheses,
@@ -150,6 +152,29 @@ def test_the_prior_of_the_scale_is_integrated_over():
         )  # fmt: skip
     difference = found[:, 1].numpy() - integrals
     assert difference == pytest.approx(np.tile(difference[:1], (KERNELS, 1)), abs=1e-6)
+
+
+def test_levels_maximize_the_textbook_posterior():
+    values, floor, _ = drawn()
+    counted = [0, 1, 4]
+
+    def cost(logs: np.ndarray) -> float:
+        total = 0.5 * float(np.square(logs / LEVEL_DEVIATION).sum()) + len(counted) * logs.sum()
+        for series in counted:
+            terms = [
+                np.log(float(weight))
+                + oracle.log_evidence(kernel, q + floor[series], values[:, series] * np.exp(-logs))
+                - oracle.log_evidence(kernel, q + floor[series], values[:, series])
+                for kernel, row in zip(mixture().kernels.numpy(), mixture().weights[..., series], strict=True)
+                for q, weight in zip(NOISE_SHARES, row, strict=True)
+                if weight > 0
+            ]
+            total -= np.logaddexp.reduce(terms)
+        return total
+
+    expected = minimize(cost, np.zeros(CONTACTS)).x
+    assert np.abs(expected).max() > 0.2
+    assert mixture().take(torch.tensor(counted)).levels().log().numpy() == pytest.approx(expected, abs=1e-3)
 
 
 def test_mean_magnitude_is_that_of_draws_from_the_hypotheses():

@@ -189,7 +189,7 @@ class Attention(GainEstimator):
         report = self._validated(data, trainer)
         network, rows = self.start(data, report["damping"])
         run = trainer.run("fit", network, data, rows, warmup=data.config.warmup_steps, steps=data.config.steps)
-        return FittedGains(network.finished(run.order), run, range(len(data.train)), report)
+        return FittedGains(network.finished(run.order), run, data.train, report)
 
     def _validated(self, data: GainData, trainer: Trainer) -> dict[str, Any]:
         """Return the form of the dampings, and how it was decided."""

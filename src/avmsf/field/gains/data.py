@@ -45,6 +45,13 @@ class GainData:
         """The extracted gains: amplitudes along each mode's phase, and a quarter of a period ahead of it."""
         return along_phase(self.modes.gains, self.phase)
 
+    def divided(self, levels: Float64[Tensor, " contacts"]) -> "GainData":
+        """Return the data of the recordings over levels, which take the place of their forces."""
+        by = levels[:, None].to(self.train.sounds)
+        train = replace(self.train, sounds=self.train.sounds / by, forces=levels.to(by))
+        modes = replace(self.modes, gains=self.modes.gains / by.to(self.modes.gains.real))
+        return replace(self, train=train, modes=modes, gains=self.gains / by)
+
     def take(self, rows: Sequence[int]) -> "GainData":
         """Return the data of some of the recordings, with the same modes and phases."""
         return replace(self, train=self.train.take(rows), modes=self.modes.take(rows), gains=self.gains[rows])

@@ -132,6 +132,8 @@ class MixtureEstimator(GainEstimator):
     def fit(self, data: GainData, trainer: Trainer) -> FittedGains:
         """Return the gain model, refined end to end, with its noise as measured by the refined modes."""
         refined, rows = self.start(data)
+        if levels := refined.model.report["levels"]:
+            data = data.divided(torch.tensor(levels, dtype=torch.float64))
         used = torch.nonzero(rows >= 0).flatten()
         # A recording of another position than its label would pull the others' gains to its sound.
         run = trainer.run("fit", refined, data.take(used.tolist()), rows[used], warmup=0, steps=data.config.steps)
@@ -140,7 +142,7 @@ class MixtureEstimator(GainEstimator):
         reason = "as set" if data.config.damping == SHARED else "the only form of this gain model"
         damping = {"damping": SHARED, "validated": False, "damping_reason": reason}
         model = refined.finished(order, measured[used])
-        return FittedGains(model, run, used.tolist(), model.report | damping)
+        return FittedGains(model, run, data.train.take(used.tolist()), model.report | damping)
 
     def solve(self, data: GainData) -> tuple[MixtureGains, Int[Tensor, " used"]]:
         """Return the gain model as it follows from the data's gains, and the rows of the contacts it is fitted to.
@@ -150,8 +152,9 @@ class MixtureEstimator(GainEstimator):
         The thickness of a wall that is not known is searched for. Of several coarse bodies the most probable one is
         computed with finer elements, and the model is fitted again, until the most probable one is fine. Where it
         predicts little it is tried whether the object was held. Contacts that the others contradict are left out where
-        these are predicted better from each other without them. Last, the most probable body with its stiffness and
-        density updated becomes one more hypothesis.
+        these are predicted better from each other without them. Recordings without forces are divided by the levels
+        that make their gains most probable, where that predicts better what they are. Last, the most probable body with
+        its stiffness and density updated becomes one more hypothesis.
         """
         bodies, missing = self._usable_bodies(data)
         given, every = data.train.directions, torch.arange(len(data.train))
@@ -184,6 +187,9 @@ class MixtureEstimator(GainEstimator):
             fewer = fit(rows, found.bodies)
             if predicts_better(fewer.model.leave_one_out(), found.model.leave_one_out()[rows], fit.measured.take(rows)):
                 found = fewer
+        levels = list[float]()
+        if data.train.forces is None:
+            fit, found, levels = _leveled(fit, found)
         if found.best is not None and self.update:
             updated = fit.updated(found.rows, found.best)
             if updated is not None:
@@ -193,6 +199,7 @@ class MixtureEstimator(GainEstimator):
         report["unavailable"] = missing
         report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
         report["supports_tried"] = tried
+        report["levels"] = levels
         report["support_evidence"] = evidence
         report["thickness"] = None if thickness is None else asdict(thickness)
         report["advice"] = None if assessment.informative else fit.advice(found.bodies)
@@ -268,3 +275,17 @@ def estimator_for(
         if log is not None:
             log(f"no elastic mode shapes: {error}")
         return MixtureEstimator(kinds, missing=str(error), symmetries=symmetries())
+
+
+def _leveled(fit: Regression, found: Solution) -> tuple[Regression, Solution, list[float]]:
+    """Return the fit and gain model of the recordings over their most probable levels, and these; none if no better."""
+    measured = fit.measured.take(found.rows)
+    levels = torch.ones(len(fit.sites), dtype=torch.float64)
+    levels[found.rows] = found.model.mixture.take(torch.nonzero(measured.informative).flatten()).levels()
+    levels /= levels[found.rows].log().mean().exp()
+    over = replace(fit, data=fit.data.divided(levels))
+    leveled = over(found.rows, found.bodies)
+    # Of recordings as they are: a sound of unknown force is rendered at level one.
+    if predicts_better(leveled.model.leave_one_out(), found.model.leave_one_out(), measured):
+        return over, leveled, levels.tolist()
+    return fit, found, []

@@ -31,8 +31,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int
+from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -42,6 +44,8 @@ evidence takes what it cannot predict for noise, and smooths through clean gains
 SCALE_SHAPE = 1.0
 """Shape a of the prior of s^2: its logarithm has a standard deviation of 1.3, so levels one of 5.6 dB. Chosen on
 simulated objects with 1 to 8 impacts, one of them of sim-20 (docs/decisions/few-impacts.md)."""
+LEVEL_DEVIATION = 0.36
+"""Prior standard deviation of the logarithm of an impact's force: 3.2 dB, that of 74 impacts by hand on an aircraft."""
 _ROUNDS = 5
 """Of expectation maximization."""
 _PSEUDO_COUNT = 0.1
@@ -149,6 +153,29 @@ class KernelMixture:
             shrunk = pairs.weight[:, None] * values * pairs.inverse
             found.append(torch.einsum("pcn,pdn->cd", vectors * shrunk[:, None], vectors))
         return torch.stack(found)
+
+    def levels(self) -> Float64[Tensor, " contacts"]:
+        """Return the most probable factors of the contacts, each on the values of all series there.
+
+        The log evidence of values divided by factors exp(t) is that of the quotients less t for each value, and t is
+        normal with `LEVEL_DEVIATION`. Kernels and noise shares keep the prior that their weights were made with. The
+        factor of a contact without any values is one.
+        """
+        pairs, (count, series) = self._pairs, self.values.shape
+        prior = pairs.weight.log() + 0.5 * count * pairs.quadratic.log()
+        heard = series * self.values.any(1).double()
+
+        def cost(factors: np.ndarray) -> tuple[float, np.ndarray]:
+            logs = torch.from_numpy(factors).requires_grad_()
+            projected = (self.eigen[1].mT @ (self.values * torch.exp(-logs)[:, None]))[pairs.kernel, :, pairs.series]
+            joint = prior - 0.5 * count * (projected.square() * pairs.inverse).sum(1).log()
+            highest = torch.full((series,), -torch.inf, dtype=torch.float64)
+            highest.scatter_reduce_(0, pairs.series, joint.detach(), "amax")
+            evidence = highest + self._summed((joint - highest[pairs.series]).exp()).log()
+            off = 0.5 * (logs / LEVEL_DEVIATION).square().sum() + heard @ logs - evidence.sum()
+            return float(off.detach()), torch.autograd.grad(off, logs)[0].numpy()
+
+        return torch.from_numpy(np.exp(minimize(cost, np.zeros(count), jac=True, method="L-BFGS-B").x))
 
     def leave_out(self, groups: Int[Tensor, " contacts"]) -> Predictions:
         """Return what the values of all other groups predict of each value.
