@@ -34,7 +34,7 @@ def exports(settings: Settings) -> Iterator[Record]:
     Over the loudest sample of each impact, the worst of several. A field of 128 modes from 80 Hz to 15 kHz that ring
     for .1 to 1 s, drawn at random at 1000 points (Faust: 64, wavs: 16), 44.1 kHz, 3 s; sines and no noise for glTF and
     the demo, whose formats hold no other, phases and noise for Faust. glTF and the demo hold frequencies as float32,
-    which is most of their error; Faust compiled in double precision, single: as it compiles unless told otherwise. The
+    which is most of their error; Faust compiled in double precision, single: as it compiles by default. The
     demo plays every mode as a cosine: its error is against the field with cosines of the same size, its waveform error
     against the field as it is.
     """

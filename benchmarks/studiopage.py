@@ -36,7 +36,7 @@ _LISTEN = """() => {
 def page(settings: Settings) -> Iterator[Record]:
     """Load the page with 20,000 Gaussians, as many contacts and 128 modes, and click it; medians, and worst.
 
-    interactive_seconds: from the navigation's start until the object is drawn and can be struck, three and spark from
+    interactive_seconds: from the navigation's start until the object is drawn and can be excited, three and spark from
     this machine's disk, headless Chromium without a graphics processor, fresh browser profiles. click_to_sample_ms:
     from the pointer's release to the message that carries the impact to the sound's thread, and from there to its first
     sample, by the sound's own clock, the 1.5 ms by which the limiter looks ahead counted: our own code, without the

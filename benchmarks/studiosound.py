@@ -42,8 +42,8 @@ def sound(settings: Settings) -> Iterator[Record]:
     """The page's modal bank, rendered in an OfflineAudioContext by headless Chromium, with dampings shared or not.
 
     error: largest difference from the field's own render, over the loudest sample. speed: seconds of sound a second of
-    wall time, one core, of 128 modes an impact that all ring to the end (nothing is culled), struck within a tenth of a
-    second, with noise; best of three. voices: impacts at once that keep up with real time. quick: 60 impacts a second,
+    wall time, one core, of 128 modes an impact that all ring to the end (nothing is culled), excited within .1 s,
+    with noise; best of three. voices: impacts at once that keep up with real time. quick: 60 impacts a second,
     each to ring for longer than it takes, so that all but the last 64 have to make room.
     """
     with chromium() as browser:

@@ -32,7 +32,7 @@ SIM20_OBJECTS = ("plate-ceramic", "mug-ceramic", "bracket-steel", "blob-polycarb
 def _aircraft(settings: Settings) -> Iterator[Record]:
     """Relative STFT error, mean over one of 3 recordings, drawn with seed 0, of which no way learns.
 
-    All kernel families, no steps end to end, modes extracted and the field fitted anew for every number of impacts. All
+    All kernel families, no steps end to end, modes extracted and the field fitted for every number of impacts. All
     ways begin with the same 6 impacts, spread as far apart as they go; then some more at a time, of those recorded:
     those that suggest names, the farthest from all others, or any (seed: the start's number). ratio: mean error of
     suggested contacts over that of farthest ones, all numbers and starts together.

@@ -53,7 +53,7 @@ class Shape:
 def symmetry(settings: Settings) -> Iterator[Record]:
     """Found axes and planes of 17 made shapes and 6 scans: right ones of those found, and of the true ones.
 
-    8000 points drawn from each surface, turned, scaled and shifted by chance, anew for every condition and pose. An
+    8000 points drawn from each surface, turned, scaled and shifted at random for every condition and pose. An
     axis counts as found if the order is right, to within 5 degrees and 5 % of the diagonal. A continuous axis stands
     for the planes that contain it and for the half turns across it. noise: 1 % of the diagonal, normal, on every
     coordinate. thinned: 30 % dropped, next to none at one end and most at the other.

@@ -20,7 +20,7 @@ _MIN_HALF_THICKNESS = 0.03
 """Half the thickness beyond the wall's, over the diagonal, below which a part is solid unless seen to be hollow:
 handles are. By trial: .06 for the thickness (mugs, jugs, pans)."""
 _MIN_LID_COSINE = 0.8
-"""Cosine of the angle to a lid's normal within which the rim beside it belongs to the lid."""
+"""Cosine of the angle to a lid's normal within which the rim next to it belongs to the lid."""
 _LID_GROWTH = 0.6
 """How far a lid grows over the rim, and over floors that were not seen to lie below it, over the radius of a disc of
 its area."""
@@ -135,15 +135,15 @@ class ObjectShape:
         """Cells inside the outer side at whose surface it only covers a cavity."""
         inside = self.outer > 0
         skin = inside & ~ndimage.binary_erosion(inside)
-        beside = ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
-        lids = skin & ((self.hollow > 0) | (beside & (self.seen <= 0)))
+        adjacent = ndimage.binary_dilation(self.hollow > 0, np.ones((3, 3, 3)))
+        lids = skin & ((self.hollow > 0) | (adjacent & (self.seen <= 0)))
         label, _ = ndimage.label(lids, np.ones((3, 3, 3)))
         sizes = np.bincount(label.ravel())
         sizes[0] = 0
         lids = (sizes > 0.02 * lids.sum())[label]
         # A lid need not be flat.
-        alike, away, nearest = facing_alike(self.outer, lids, LID_BLUR * self.diagonal / self.grid.spacing)
-        rim = skin & alike & (away <= _LID_GROWTH * np.sqrt(sizes / np.pi)[label[nearest]])
+        similar, away, nearest = facing_similarly(self.outer, lids, LID_BLUR * self.diagonal / self.grid.spacing)
+        rim = skin & similar & (away <= _LID_GROWTH * np.sqrt(sizes / np.pi)[label[nearest]])
         grown: Bool[np.ndarray, "x y z"] = ndimage.binary_propagation(lids, np.ones((3, 3, 3)), mask=lids | rim)
         return grown
 
@@ -199,7 +199,7 @@ class ObjectShape:
         return content_digest(self.grid, self.supposed, self.diagonal, self.outer, self.seen, self.hollow)
 
 
-def facing_alike(
+def facing_similarly(
     outer: Float32[np.ndarray, "x y z"], part: Bool[np.ndarray, "x y z"], blur: float
 ) -> tuple[Bool[np.ndarray, "x y z"], Float64[np.ndarray, "x y z"], tuple[Int[np.ndarray, "x y z"], ...]]:
     """Return which cells face the way that the nearest of a part of them do, and the distance and indices of that.

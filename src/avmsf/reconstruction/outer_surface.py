@@ -18,7 +18,7 @@ from avmsf.reconstruction.distance import depth_in_convex_hull
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.hull_distance import Outline, hull_distance
 from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
-from avmsf.reconstruction.object_shape import LID_BLUR, ObjectShape, ShapeReport, closed_surface, facing_alike
+from avmsf.reconstruction.object_shape import LID_BLUR, ObjectShape, ShapeReport, closed_surface, facing_similarly
 
 _COARSE_CELLS = 48
 """Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
@@ -147,8 +147,8 @@ def _opened(
     if hollow.any():
         numbers = ndimage.maximum(hollow, label, np.arange(count + 1))
         # Between the touches of few views a face runs over its edge.
-        alike, _, nearest = facing_alike(outer, (hollow > 0) & (label > 0), blur)
-        label *= alike & (label == label[nearest])
+        similar, _, nearest = facing_similarly(outer, (hollow > 0) & (label > 0), blur)
+        label *= similar & (label == label[nearest])
     else:
         sizes = np.bincount(label[skin], minlength=count + 1)
         sizes[0] = 0

@@ -163,7 +163,7 @@ class KernelMixture:
         """
         pairs, (count, series) = self._pairs, self.values.shape
         prior = pairs.weight.log() + 0.5 * count * pairs.quadratic.log()
-        heard = series * self.values.any(1).double()
+        nonzero = series * self.values.any(1).double()
 
         def cost(factors: np.ndarray) -> tuple[float, np.ndarray]:
             logs = torch.from_numpy(factors).requires_grad_()
@@ -172,7 +172,7 @@ class KernelMixture:
             highest = torch.full((series,), -torch.inf, dtype=torch.float64)
             highest.scatter_reduce_(0, pairs.series, joint.detach(), "amax")
             evidence = highest + self._summed((joint - highest[pairs.series]).exp()).log()
-            off = 0.5 * (logs / LEVEL_DEVIATION).square().sum() + heard @ logs - evidence.sum()
+            off = 0.5 * (logs / LEVEL_DEVIATION).square().sum() + nonzero @ logs - evidence.sum()
             return float(off.detach()), torch.autograd.grad(off, logs)[0].numpy()
 
         return torch.from_numpy(np.exp(minimize(cost, np.zeros(count), jac=True, method="L-BFGS-B").x))
