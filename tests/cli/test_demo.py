@@ -127,6 +127,13 @@ def test_the_body_is_named_with_the_ratio_of_stiffness_to_density_and_what_it_ex
     assert "1.8 per mode" in line
 
 
+def test_levels_that_were_found_are_named_and_so_is_what_quality_means_then() -> None:
+    found = [field_lines(field_with({"levels": each}), Path("f"), settings=False) for each in ([], [0.5, 1.0, 2.0])]
+    before, after = (next(line for line in lines if "fitted to" in line) for lines in found)
+    assert "levels" not in before
+    assert "-6.0 to +6.0 dB; quality is at these" in after
+
+
 def test_an_outlier_says_what_was_done_and_has_figures_only_for_verbose(monkeypatch: pytest.MonkeyPatch) -> None:
     figures = {"place": [0.046, -0.003, 0.1], "ratio": -1.9, "place_ratio": 1.6, "distance": 0.0086, "reversed": False}
     report: dict[str, object] = {

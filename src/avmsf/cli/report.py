@@ -58,7 +58,9 @@ def describe(field: SoundField) -> dict[str, Any]:
 def _levels_words(levels: Sequence[float] | None) -> str:
     """Return the range of the levels by which recordings without forces were divided, if they were."""
     decibels = [20.0 * math.log10(each) for each in levels or ()]
-    return f", their forces as their gains say: {min(decibels):+.1f} to {max(decibels):+.1f} dB" if decibels else ""
+    if not decibels:
+        return ""
+    return f", over levels found from their gains, {min(decibels):+.1f} to {max(decibels):+.1f} dB; quality is at these"
 
 
 def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list[str]:
