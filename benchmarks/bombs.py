@@ -14,7 +14,7 @@ import soundfile
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
-from tests.factories.valid_files import RATE
+from tests.factories.capture_folder import RATE
 
 Bomb = Callable[[Path], tuple[str, Path]]
 
@@ -36,14 +36,14 @@ def _click(height: float) -> Bomb:
     def put(folder: Path) -> tuple[str, Path]:
         samples = np.zeros(RATE)
         samples[0] = height
-        soundfile.write(folder / "capture" / "1.wav", samples, RATE, subtype="DOUBLE")
-        return "wav", folder / "capture" / "1.wav"
+        soundfile.write(folder / "capture" / "b.wav", samples, RATE, subtype="DOUBLE")
+        return "wav", folder / "capture" / "b.wav"
 
     return put
 
 
 def _compressed_sound(folder: Path) -> tuple[str, Path]:
-    path = folder / "capture" / "1.wav"
+    path = folder / "capture" / "b.wav"
     with soundfile.SoundFile(path, "w", 48_000, 8, subtype="PCM_16", format="FLAC") as file:
         # Two hours of silence, a minute at a time.
         for _ in range(120):

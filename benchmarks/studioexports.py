@@ -21,7 +21,7 @@ from avmsf.export.samples import write_grid
 from avmsf.export.uff import write_universal
 from benchmarks.processes import processor_seconds
 from benchmarks.records import REPOSITORY, Record, Settings, records
-from tests.factories.demo_layout import read_arrays
+from tests.factories.made_tables import read_arrays
 
 DRIVER = REPOSITORY / "tests" / "export" / "faust_driver.c"
 _MODES, _RATE = 128, 44100.0

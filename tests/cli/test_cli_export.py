@@ -26,8 +26,8 @@ from avmsf.modal.modes import ModalBank
 from factories.believing_field import ELASTIC, bar, bar_points
 from factories.capture_folder import fill
 from factories.clouds import random_cloud
-from factories.demo_layout import read_arrays
 from factories.made_fields import BANK, SIDES, directional, positional, saved, sounding
+from factories.made_tables import read_arrays
 from factories.raising import raises
 from factories.verbs import run_verb
 

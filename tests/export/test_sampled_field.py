@@ -29,8 +29,9 @@ from avmsf.modal.residual_noise import Residual
 from factories.clouds import random_cloud
 from factories.looked_at import surface_of
 from factories.made_fields import BANK, FIELDS, elastic, places, plate, positional
+from factories.made_tables import STRUCK_RATE as RATE
+from factories.made_tables import struck_table
 from factories.raising import raises
-from factories.struck_table import RATE, struck_table
 
 SAMPLES = 3000
 

@@ -18,8 +18,7 @@ from avmsf.export.samples import Layer, hertz_layers, write_grid
 from avmsf.gaussians.ply import read_splats
 from avmsf.modal.modes import ForcePulse
 from factories.clouds import random_cloud
-from factories.demo_layout import read_arrays
-from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, summed, table
+from factories.made_tables import MODES, POINTS, RATE, SAMPLES, apart, read_arrays, summed, table
 from factories.raising import raises
 
 LAYERS = (Layer(0.25, 0.002), Layer(1.0, 0.0005), Layer(3.0))

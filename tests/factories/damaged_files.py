@@ -46,26 +46,14 @@ def damage_bytes(content: bytes, chance: random.Random) -> bytes:
     """Return a file's bytes with one to four random changes: cut, moved, repeated, overwritten by extreme numbers."""
     data = bytearray(content)
     for _ in range(chance.randint(1, 4)):
-        place = chance.randrange(len(data) + 1)
         # Headers are where damage does most.
-        if chance.random() < 0.5:
-            place = min(place, chance.randrange(200))
-        length = min(chance.choice((1, 2, 4, 8, 64)), len(data) - place)
-        match chance.randrange(6):
-            case 0:
-                data[place : place + length] = chance.randbytes(length)
-            case 1:
-                del data[place : place + length]
-            case 2:
-                data[place:place] = data[place : place + length]
-            case 3:
-                extreme = chance.choice((b"\xff" * 4, b"\xff\xff\xff\x7f", bytes(4), struct.pack("<d", float("nan"))))
-                data[place : place + len(extreme)] = extreme
-            case 4:
-                if chance.random() < 0.3:
-                    del data[place:]
-            case _:
-                data[place:place] = chance.randbytes(length)
+        place = min(chance.randrange(len(data) + 1), chance.choice((chance.randrange(200), len(data))))
+        end = min(place + chance.choice((1, 2, 4, 8, 64)), len(data))
+        noise = chance.randbytes(end - place)
+        extreme = chance.choice((b"\xff" * 4, b"\xff\xff\xff\x7f", bytes(4), struct.pack("<d", float("nan"))))
+        data[place:end] = chance.choice((noise, b"", 2 * data[place:end], noise + data[place:end], extreme, extreme))
+        if chance.random() < 0.05:
+            del data[place:]
     return bytes(data)
 
 
@@ -74,20 +62,16 @@ def damage_text(content: bytes, chance: random.Random) -> bytes:
     if chance.random() < 0.15:
         return damage_bytes(content, chance)
     for _ in range(chance.randint(1, 3)):
-        numbers = list(_NUMBER.finditer(content))
-        lines = content.split(b"\n")
-        row = chance.randrange(len(lines))
-        match chance.randrange(5):
-            case 0 | 1 if numbers:
-                found = chance.choice(numbers)
-                content = content[: found.start()] + chance.choice(_WORDS) + content[found.end() :]
-            case 2:
-                content = b"\n".join([*lines[:row], *lines[row + 1 :]])
-            case 3:
-                content = b"\n".join([*lines[:row], *[lines[row]] * chance.choice((2, 50)), *lines[row + 1 :]])
-            case _:
-                place = chance.randrange(len(content) + 1)
-                content = content[:place] + chance.choice(_WORDS) + content[place:]
+        if chance.random() < 0.4:
+            lines = content.split(b"\n")
+            row = chance.randrange(len(lines))
+            lines[row : row + 1] = [lines[row]] * chance.choice((0, 0, 2, 50))
+            content = b"\n".join(lines)
+        else:
+            place = chance.randrange(len(content) + 1)
+            numbers = [found.span() for found in _NUMBER.finditer(content)]
+            start, end = chance.choice([(place, place), chance.choice(numbers or [(place, place)])])
+            content = content[:start] + chance.choice(_WORDS) + content[end:]
     return content
 
 
@@ -95,18 +79,15 @@ def damage_json(document: Any, chance: random.Random) -> str:
     """Return a document as text with one to three of its values replaced, removed or repeated."""
     document = json.loads(json.dumps(document))
     for _ in range(chance.randint(1, 3)):
-        holders = [each for each in _holders(document) if each]
-        if not holders:
-            break
         # Values near the top as likely as those in long lists.
-        holder = chance.choice(holders[: chance.choice((1, 3, len(holders)))])
-        key = chance.choice(list(holder)) if isinstance(holder, dict) else chance.randrange(len(holder))
-        match chance.randrange(6):
-            case 0:
+        if holders := [each for each in _holders(document) if each]:
+            holder = chance.choice(holders[: chance.choice((1, 3, len(holders)))])
+            key = chance.choice(list(holder)) if isinstance(holder, dict) else chance.randrange(len(holder))
+            if chance.random() < 0.2:
                 del holder[key]
-            case 1 if isinstance(holder, list):
+            elif isinstance(holder, list) and chance.random() < 0.2:
                 holder.extend([holder[key]] * 3)
-            case _:
+            else:
                 holder[key] = deepcopy(chance.choice(_VALUES))
     return json.dumps(document)
 
@@ -118,6 +99,26 @@ def _holders(value: Any) -> list[Any]:
     return found + [each for one in inner for each in _holders(one)]
 
 
+def _damage_document(content: bytes, chance: random.Random) -> bytes:
+    if chance.random() < 0.3:
+        return damage_text(content, chance)
+    return damage_json(json.loads(content), chance).encode()
+
+
+def _damage_field(content: bytes, chance: random.Random) -> bytes:
+    """Damage the record in the header, or one tensor, or any bytes."""
+    if chance.random() < 0.3:
+        return damage_bytes(content, chance)
+    size = int.from_bytes(content[:8], "little")
+    metadata, tensors = json.loads(content[8 : 8 + size])["__metadata__"], from_bytes(content)
+    if chance.random() < 0.3:
+        flat = tensors[chance.choice(sorted(tensors))].flatten()
+        flat[chance.randrange(len(flat))] = chance.choice((float("nan"), 1e38, -1e38, 0.0, -1.0, 1e-38))
+    else:
+        metadata["avmsf"] = damage_json(json.loads(metadata["avmsf"]), chance)
+    return to_bytes(tensors, metadata)
+
+
 @dataclass(frozen=True)
 class Family:
     """One kind of file: which seed is damaged, how, and what reads it."""
@@ -125,7 +126,7 @@ class Family:
     seeds: tuple[str, ...]
     """Files below the folder of seeds."""
     damage: Callable[[bytes, random.Random], bytes]
-    read: Callable[[Path, Path], None]
+    read: Callable[[Path, Path], Any]
     """Reads the damaged file in the copied folder of seeds; raises `AvmsfError` for a refusal."""
 
 
@@ -164,53 +165,26 @@ def _field(folder: Path, path: Path) -> None:
     run_verb("render", str(path), "--position", "0.05", "0.05", "0.002", "--output", str(output))
 
 
-def _splats(_: Path, path: Path) -> None:
-    read_splats(path)
+def _seeds(folder: str, *names: str) -> tuple[str, ...]:
+    return tuple(f"{folder}/{name}" for name in names)
 
 
-def _damage_document(content: bytes, chance: random.Random) -> bytes:
-    if chance.random() < 0.3:
-        return damage_text(content, chance)
-    return damage_json(json.loads(content), chance).encode()
-
-
-def _damage_field(content: bytes, chance: random.Random) -> bytes:
-    """Damage the record in the header, or one tensor, or any bytes."""
-    if chance.random() < 0.3:
-        return damage_bytes(content, chance)
-    size = int.from_bytes(content[:8], "little")
-    metadata, tensors = json.loads(content[8 : 8 + size])["__metadata__"], from_bytes(content)
-    if chance.random() < 0.3:
-        flat = tensors[chance.choice(sorted(tensors))].flatten()
-        flat[chance.randrange(len(flat))] = chance.choice((float("nan"), 1e38, -1e38, 0.0, -1.0, 1e-38))
-    else:
-        metadata["avmsf"] = damage_json(json.loads(metadata["avmsf"]), chance)
-    return to_bytes(tensors, metadata)
-
-
-_MODEL = "sparse/0"
 FAMILIES = {
-    "wav": Family(("capture/0.wav", "capture/1.wav", "capture/2.wav"), damage_bytes, _check),
+    "wav": Family(_seeds("capture", "a.wav", "b.wav", "c.wav"), damage_bytes, _check),
     "csv": Family(("capture/impacts.csv",), damage_text, _check),
     "toml": Family(("capture/capture.toml",), damage_text, _check),
     "transforms": Family(("transforms/transforms.json",), _damage_document, _views),
     "pictures": Family(
-        (*tuple(f"transforms/images/{name}" for name in ("0.png", "1.jpg", "2.webp")), "transforms/masks/0.png"),
-        damage_bytes,
-        _views,
+        _seeds("transforms", "images/0.png", "images/1.jpg", "images/2.webp", "masks/0.png"), damage_bytes, _views
     ),
-    "colmap text": Family(
-        tuple(f"colmap/{_MODEL}/{name}.txt" for name in ("cameras", "images", "points3D")), damage_text, _views
-    ),
-    "colmap binary": Family(
-        tuple(f"colmap_binary/{_MODEL}/{name}.bin" for name in ("cameras", "images", "points3D")), damage_bytes, _views
-    ),
+    "colmap text": Family(_seeds("colmap", "cameras.txt", "images.txt", "points3D.txt"), damage_text, _views),
+    "colmap binary": Family(_seeds("colmap_binary", "cameras.bin", "images.bin", "points3D.bin"), damage_bytes, _views),
     **{suffix[1:]: Family((f"surface{suffix}",), damage_bytes, _surface) for suffix in SURFACES},
     "ply text": Family(("surface_text.ply",), damage_text, _surface),
     "obj": Family(("surface.obj",), damage_text, _surface),
     "off": Family(("surface.off",), damage_text, _surface),
     "gltf": Family(("surface.gltf",), _damage_document, _surface),
-    "splats": Family(("splats.ply",), damage_bytes, _splats),
+    "splats": Family(("splats.ply",), damage_bytes, lambda _, path: read_splats(path)),
     "field": Family(("attention.safetensors", "mixture.safetensors"), _damage_field, _field),
 }
 

@@ -15,10 +15,9 @@ import soundfile
 
 from avmsf.field.store import save
 
-from .capture_folder import fill
+from .capture_folder import RATE, fill, ring
 from .made_fields import elastic, sounding
 
-RATE = 8000
 _BODY_BYTES = 1 << 18
 _NUMBERS = (
     *("NaN", "Infinity", "1e400", "1e308", "-1e308", "5e-324", "0", "-0.0", "-1", "1e-3", "1e3", "999.9", "1.5"),
@@ -35,8 +34,10 @@ _PATHS = (
     *("edit", "save", "locate"),
 )
 _METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE")
-
-Ask = Callable[["Request"], tuple[int, bytes]]
+_FORMATS = (
+    *(("WAV", "FLOAT"), ("WAV", "DOUBLE"), ("WAV", "PCM_16"), ("WAV", "PCM_U8"), ("FLAC", "PCM_16")),
+    *(("OGG", "VORBIS"), ("AU", "DOUBLE"), ("W64", "FLOAT"), ("AIFF", "FLOAT")),
+)
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,24 @@ class Fuzzer:
 
     def requests(self) -> Iterator[Request]:
         """Yield requests, one kind after another."""
-        kinds = (self._edit, self._upload, self._edit, self._strike, self._other, self._damaged, self._path)
+        choose = self._choose
         while True:
-            for kind in kinds:
-                yield kind()
+            yield Request("POST", "edit", self._edit())
+            yield Request("POST", choose(("locate", "capture/check")), self._recording())
+            yield Request("POST", "edit", self._edit())
+            places = (choose(("0.01", "-0.02", "0", "nan", "inf", "1e308", "101", "x")) for _ in range(7))
+            names = ("x", "y", "z", "nx", "ny", "nz", "newtons")
+            query = "&".join(map("=".join, zip(names, places, strict=True)))
+            yield Request("POST", f"capture/strikes?{query}", self._recording())
+            yield Request("PUT", "capture/strikes/a.wav", self._recording())
+            words = choose(({"base": self.base}, {"base": self.base, "name": choose(_NAMES)}))
+            yield Request("POST", choose(("save", "edit", "undo")), json.dumps(words).encode())
+            size = int(self.random.integers(1, _BODY_BYTES))
+            long = b'{"base":1,"law":"' + b"w" * size + b'"}'
+            bodies = (b"[" * size, b'{"base":' * (size // 8), b"\xff" * size, long, b"")
+            yield Request("POST", choose(("edit", "undo", "save", "lead?base=x")), choose(bodies))
+            headers = {"if-match": choose(_NAMES[:3]), "last-event-id": choose(("1", "-1", "9" * 30, "x"))}
+            yield Request(choose(_METHODS), choose(_PATHS), None, headers)
 
     def _choose(self, values: Any) -> Any:
         return values[int(self.random.integers(len(values)))]
@@ -70,72 +85,34 @@ class Fuzzer:
     def _chance(self, part: float) -> bool:
         return bool(self.random.random() < part)
 
-    def _object(self, *names: str) -> str:
-        kept = [name for name in names if self._chance(0.5)]
-        return "{" + ",".join(f"{json.dumps(name)}:{self._choose(_NUMBERS)}" for name in kept) + "}"
+    def _members(self, *names: str) -> str:
+        return ",".join(f"{json.dumps(name)}:{self._choose(_NUMBERS)}" for name in names if self._chance(0.5))
 
-    def _edit(self) -> Request:
-        parts = [f'"base":{self.base}', self._object("size", "pitch", "decay", "brightness")[1:-1]]
-        if self._chance(0.5):
-            rows = [self._object("mode", "db", "pitch", "decay") for _ in range(int(self.random.integers(8)))]
-            rows += [f'{{"mode":{k},"pitch":{self._choose(_NUMBERS)}}}' for k in range(int(self.random.integers(4)))]
-            parts.append(f'"modes":[{",".join(rows)}]')
-        if self._chance(0.3):
-            names = {key: self._choose(_NAMES) for key in ("from", "to")}
-            parts.append(f'"material":{json.dumps(names)}')
-        if self._chance(0.2):
-            parts.append(f'"law":{json.dumps(self._choose(_NAMES))}')
-        if self._chance(0.1):
-            parts.append(f"{json.dumps(self._choose(_NAMES))}:{self._choose(_NUMBERS)}")
-        return Request("POST", "edit", ("{" + ",".join(filter(None, parts)) + "}").encode())
-
-    def _other(self) -> Request:
-        if self._chance(0.5):
-            return Request("POST", "undo", json.dumps({"base": self.base}).encode())
-        words = {"base": self.base, "name": self._choose(_NAMES)}
-        return Request("POST", self._choose(("save", "edit", "undo")), json.dumps(words).encode())
-
-    def _damaged(self) -> Request:
-        size = int(self.random.integers(1, _BODY_BYTES))
-        bodies = (
-            b"[" * size,
-            b'{"base":' * (size // 8),
-            b"\xff" * size,
-            b'{"base":1,"law":"' + b"w" * size + b'"}',
-            b"",
-        )
-        return Request("POST", self._choose(("edit", "undo", "save", "lead?base=x")), self._choose(bodies))
-
-    def _path(self) -> Request:
-        headers = {"if-match": self._choose(_NAMES[:3]), "last-event-id": self._choose(("1", "-1", "9" * 30, "x"))}
-        return Request(self._choose(_METHODS), self._choose(_PATHS), None, headers)
-
-    def _upload(self) -> Request:
-        return Request("POST", self._choose(("locate", "capture/check")), self._recording())
-
-    def _strike(self) -> Request:
-        if self._chance(0.2):
-            return Request("PUT", "capture/strikes/a.wav", self._recording())
-        values = [self._choose(("0.01", "-0.02", "0", "nan", "inf", "1e308", "101", "x")) for _ in range(7)]
-        query = "&".join(
-            f"{key}={value}" for key, value in zip(("x", "y", "z", "nx", "ny", "nz", "newtons"), values, strict=True)
-        )
-        return Request("POST", f"capture/strikes?{query}", self._recording())
+    def _edit(self) -> bytes:
+        modes = ",".join(f"{{{self._members('mode', 'db', 'pitch', 'decay')}}}" for _ in range(self._choose(range(8))))
+        modes = self._choose((modes, f'{{"mode":{self._choose(range(4))},"pitch":{self._choose(_NUMBERS)}}}'))
+        names = {key: self._choose(_NAMES) for key in ("from", "to")}
+        others = {
+            f'"modes":[{modes}]': 0.5,
+            f'"material":{json.dumps(names)}': 0.3,
+            f'"law":{json.dumps(self._choose(_NAMES))}': 0.2,
+            f"{json.dumps(self._choose(_NAMES))}:{self._choose(_NUMBERS)}": 0.1,
+        }
+        parts = [f'"base":{self.base}', self._members("size", "pitch", "decay", "brightness")]
+        parts += [text for text, part in others.items() if self._chance(part)]
+        return ("{" + ",".join(filter(None, parts)) + "}").encode()
 
     def _recording(self) -> bytes:
         """Return a sound file, whole, of hostile samples, or damaged."""
-        frames = int(self._choose((1, 2, 30, 900, 4000)))
-        times = np.arange(frames) / RATE
-        sound = np.exp(-20 * times) * np.sin(2 * math.pi * 850 * times) + 1e-4 * self.random.standard_normal(frames)
+        sound = ring(self._choose((1, 2, 30, 900, 4000)) / RATE)
         sound *= self._choose((1.0, 1.0, 1.0, 0.0, 1e-12, 1e16, 1e308, -1.0))
         if self._chance(0.1):
-            sound[frames // 2] = self._choose((math.nan, math.inf, 1e300))
-        kinds = (("WAV", "FLOAT"), ("WAV", "DOUBLE"), ("WAV", "PCM_16"), ("WAV", "PCM_U8"), ("FLAC", "PCM_16"))
-        kind, subtype = self._choose((*kinds, ("OGG", "VORBIS"), ("AU", "DOUBLE"), ("W64", "FLOAT"), ("AIFF", "FLOAT")))
+            sound[len(sound) // 2] = self._choose((math.nan, math.inf, 1e300))
+        kind, subtype = self._choose(_FORMATS)
         if subtype not in ("FLOAT", "DOUBLE"):
             sound = np.clip(np.nan_to_num(sound), -1, 1)
-        memory = io.BytesIO()
         channels = np.repeat(sound[:, None], int(self._choose((1, 1, 1, 2, 8))), axis=1)
+        memory = io.BytesIO()
         with np.errstate(over="ignore"):
             soundfile.write(memory, channels, RATE, subtype=subtype, format=kind)
         content = bytearray(memory.getvalue())
@@ -145,34 +122,27 @@ class Fuzzer:
         return bytes(content[: int(self.random.integers(len(content)))] if self._chance(0.1) else content)
 
 
-def fuzz(ask: Ask, *, count: int, seed: int = 0) -> dict[str, float]:
+def fuzz(ask: Callable[[Request], tuple[int, bytes]], *, count: int, seed: int = 0) -> dict[str, float]:
     """Send so many requests and return what came of them.
 
     `server_errors` counts answers of 500 and above, `unanswered` requests whose connection broke; both must be 0.
     """
-    fuzzer = Fuzzer(seed)
-    errors = unanswered = 0
+    fuzzer, found = Fuzzer(seed), {"inputs": float(count), "server_errors": 0.0, "unanswered": 0.0}
     longest = worst = 0.0
     for _, request in zip(range(count), fuzzer.requests(), strict=False):
         begun = time.perf_counter()
         try:
             status, content = ask(request)
         except (http.client.HTTPException, OSError):
-            unanswered += 1
+            found["unanswered"] += 1
             continue
         worst = max(worst, time.perf_counter() - begun)
-        errors += status >= 500
+        found["server_errors"] += status >= 500
         if status >= 400:
             longest = max(longest, len(content))
         elif request.method == "POST":
             fuzzer.base = json.loads(content).get("revision", fuzzer.base)
-    return {
-        "inputs": float(count),
-        "server_errors": float(errors),
-        "unanswered": float(unanswered),
-        "worst_seconds": worst,
-        "longest_refusal_bytes": float(longest),
-    }
+    return found | {"worst_seconds": worst, "longest_refusal_bytes": float(longest)}
 
 
 def write_object(folder: Path) -> Path:

@@ -1,11 +1,20 @@
 """Tables of points whose sound is known in full, for the tests of exports."""
 
+import json
+import math
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from avmsf.export.sampled_field import SampledField
+from avmsf.modal.residual_noise import shape_noise
 
 RATE, SAMPLES, POINTS, MODES = 8000.0, 1600, 9, 4
+STRUCK_RATE = 16_000.0
+Array = NDArray[np.float64]
 
 
 def table(
@@ -36,7 +45,37 @@ def table(
     )
 
 
-def summed(gains, frequency, damping, *, samples=SAMPLES, rate=RATE) -> np.ndarray:
+def struck_table(*, shared: bool, modes: int = 40, points: int = 6, seconds: float = 3.0) -> SampledField:
+    """Return contacts on a ball whose many modes ring between some milliseconds and all of the time."""
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(*size: int) -> torch.Tensor:
+        return torch.rand(*size, dtype=torch.float64, generator=generator)
+
+    frequency = (60.0 * (0.45 * STRUCK_RATE / 60.0) ** drawn(modes)).sort().values
+    damping = 0.5 * 400.0 ** drawn(modes)
+    if not shared:
+        damping = damping * (0.5 + drawn(points, modes))
+    out = torch.nn.functional.normalize(drawn(points, 3) - 0.5, dim=1).float()
+    residual, samples = torch.linspace(1e-3, 1e-4, 65), round(seconds * STRUCK_RATE)
+    noise = shape_noise(residual, contacts=1, samples=samples, generator=generator)[0]
+    size = 0.1 / math.sqrt(modes)
+    gains = torch.complex(size * (drawn(points, modes) - 0.5), 0.3 * size * (drawn(points, modes) - 0.5))
+    gains = gains.to(torch.complex64)
+    return SampledField(0.1 * out, out, frequency, damping, gains, noise, STRUCK_RATE, per_newton=True, name="ball")
+
+
+def read_arrays(folder: Path) -> dict[str, torch.Tensor]:
+    """Return the arrays of a folder in the layout of the paper's demo, by its manifest's offsets, types and shapes."""
+    manifest = json.loads((folder / "manifest.json").read_text())
+    content, found = (folder / manifest["file"]).read_bytes(), {}
+    for name, record in manifest["arrays"].items():
+        values = np.frombuffer(content, record["dtype"], math.prod(record["shape"]), record["offset"])
+        found[name] = torch.from_numpy(values.reshape(record["shape"]).copy())
+    return found
+
+
+def summed(gains: Any, frequency: Any, damping: Any, *, samples: int = SAMPLES, rate: float = RATE) -> Array:
     """Return the sum of damped waves, one at a time: an oracle that shares nothing with the package."""
     times = np.arange(samples) / rate
     total = np.zeros(samples)
@@ -46,6 +85,6 @@ def summed(gains, frequency, damping, *, samples=SAMPLES, rate=RATE) -> np.ndarr
     return total
 
 
-def apart(heard, true) -> float:
+def apart(heard: Any, true: Any) -> float:
     heard, true = np.asarray(heard, dtype=np.float64), np.asarray(true, dtype=np.float64)
     return float(np.abs(heard - true).max() / np.abs(true).max())

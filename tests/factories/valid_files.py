@@ -1,19 +1,19 @@
 """Small valid files of every kind that the package reads, to be damaged: all within one folder, in a second."""
 
-import math
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import soundfile
-import torch
 import trimesh
 
 from avmsf.field.store import save
-from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import write_splats
 
+from .capture_folder import HEADER, RATE, fill
+from .capture_folder import ring as ringing
+from .clouds import random_cloud
 from .made_fields import attention, elastic, sounding
 from .views_folder import (
     HEIGHT,
@@ -26,50 +26,39 @@ from .views_folder import (
     write_transforms,
 )
 
-RATE = 8000
-CONTACTS = ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))
+SETTINGS = (
+    'name = "ball"\nunit = "m"\nseconds = 0.1\nplayback_speed = 1.0\nnormalize = "auto"\nhighpass = 20.0\n'
+    "align = true\nregularization = 1e-4\nresponse_channel = 1\n"
+)
 SURFACES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 
 
 def write_seeds(folder: Path) -> None:
     """Fill a folder: `capture` with a surface of each format beside it, `transforms`, `colmap`, and fields."""
-    write_capture_folder(folder / "capture")
+    _write_capture(folder / "capture")
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     colored = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=np.full((len(ball.vertices), 4), 200, np.uint8))
     for suffix in SURFACES:
         (folder / f"surface{suffix}").write_bytes(_exported(colored, suffix[1:]))
-    text = colored.export(file_type="ply", encoding="ascii")
-    (folder / "surface_text.ply").write_bytes(text if isinstance(text, bytes) else str(text).encode())
+    (folder / "surface_text.ply").write_bytes(_exported(colored, "ply", encoding="ascii"))
     _write_views(folder)
-    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
-    rotations = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(40, 1)
-    cloud = GaussianCloud(points, rotations, points - 4, points[:, 0], torch.zeros(40, 4, 3))
-    write_splats(cloud, folder / "splats.ply")
+    write_splats(random_cloud(40, degree=1), folder / "splats.ply")
     for name, gains in (("attention", attention()), ("mixture", elastic())):
         save(sounding(gains), folder / f"{name}.safetensors")
 
 
-def write_capture_folder(folder: Path) -> None:
+def _write_capture(folder: Path) -> None:
     """Write three recordings of a tenth of a second, their table and settings."""
-    folder.mkdir(parents=True)
-    rows = ["file,x,y,z,nx,ny,nz,force_newtons"]
-    times = np.arange(RATE // 10) / RATE
-    for number, contact in enumerate(CONTACTS):
-        sound = 0.4 * np.exp(-40 * times) * np.sin(2 * math.pi * (400 + 150 * number) * times)
-        noise = 1e-4 * np.random.default_rng(number).standard_normal(len(times))
-        subtype = ("PCM_16", "FLOAT", "DOUBLE")[number]
-        soundfile.write(folder / f"{number}.wav", sound + noise, RATE, subtype=subtype)
-        rows.append(f"{number}.wav,{','.join(map(str, contact))},0,0,1,{number + 1}")
-    (folder / "impacts.csv").write_text("\n".join([*rows, ""]))
-    (folder / "capture.toml").write_text(
-        'name = "ball"\nunit = "m"\nseconds = 0.1\nplayback_speed = 1.0\nnormalize = "auto"\nhighpass = 20.0\n'
-        "align = true\nregularization = 1e-4\nresponse_channel = 1\n"
-    )
+    rows = ("a.wav,0.1,0,0,0,0,1,1", "b.wav,0,0.1,0,0,0,1,2", "c.wav,0,0,0.1,0,0,1,3")
+    sounds: dict[str, Any] = {f"{name}.wav": ringing(0.1, seed=seed) for seed, name in enumerate("abc")}
+    fill(folder, header=f"{HEADER},nx,ny,nz,force_newtons", rows=rows, replace=sounds, settings=SETTINGS)
+    for name, subtype in (("a.wav", "PCM_16"), ("c.wav", "DOUBLE")):
+        soundfile.write(folder / name, sounds[name], RATE, subtype=subtype)
 
 
-def _exported(mesh: trimesh.Trimesh, kind: str) -> bytes:
+def _exported(mesh: trimesh.Trimesh, kind: str, **options: Any) -> bytes:
     # The buffers of a glTF are files of their own otherwise.
-    options: dict[str, Any] = {"embed_buffers": True} if kind == "gltf" else {}
+    options |= {"embed_buffers": True} if kind == "gltf" else {}
     content = mesh.export(file_type=kind, **options)
     if isinstance(content, dict):
         (content,) = content.values()
@@ -88,5 +77,5 @@ def _write_views(folder: Path) -> None:
     settings = {"camera_model": "OPENCV", "k1": 0.01, "ply_file_path": "../surface.ply"}
     write_transforms(folder / "transforms", rows, images=False, **settings)
     lens = ("OPENCV", (40.0, 40.0, 16.0, 16.0, 0.01, 0.0, 0.0, 0.0))
-    write_colmap_text(folder / "colmap" / "sparse" / "0", cameras, names, lens)
-    write_colmap_binary(folder / "colmap_binary" / "sparse" / "0", cameras, names, lens)
+    write_colmap_text(folder / "colmap", cameras, names, lens)
+    write_colmap_binary(folder / "colmap_binary", cameras, names, lens)

@@ -15,7 +15,8 @@ from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
-from factories.struck_table import RATE, struck_table
+from factories.made_tables import STRUCK_RATE as RATE
+from factories.made_tables import struck_table
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
