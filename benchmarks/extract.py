@@ -67,12 +67,8 @@ def _consensus(settings: Settings) -> Iterator[Record]:
         peaks = onsets.delayed(onsets.sounds.abs().argmax(1).double())
         modes = truth_at(truth, onsets.names)
         audible = torch.nonzero(modes.frequency < onsets.sample_rate / 2).flatten()
-        expected = PlateModes(
-            modes.frequency[audible],
-            modes.damping[audible],
-            modes.gains[:, audible].abs(),
-            torch.zeros(len(audible), 2, dtype=torch.int64),
-        )
+        frequency, damping, gains = modes.frequency[audible], modes.damping[audible], modes.gains[:, audible].abs()
+        expected = PlateModes(frequency, damping, gains)
         for start, impacts in (("onset", onsets), ("peak", peaks)):
             bank = extract_modes(impacts, METHODS["stft"]).bank
             matched = _match(bank, expected)

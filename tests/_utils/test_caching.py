@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save as to_bytes
 
 from avmsf._utils import caching, checkpoint
 from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.files import write_whole
 from avmsf._utils.headers import FileKind
-from avmsf._utils.tensor_files import expect_tensors
+from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from factories.raising import raises, warns
 
@@ -136,12 +137,37 @@ def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path: Path, kind: str) ->
     assert path.read_bytes() == before
 
 
-KIND = FileKind("kind", "a file", "make it again", FieldFileError)
+KIND = FileKind("kind", "a file", "make it again", FieldFileError, formats=(1,))
 SKELETON = {
     "places": torch.empty(4, 3, dtype=torch.float64, device="meta"),
     "rows": torch.empty(4, dtype=torch.int64, device="meta"),
 }
 PLACES, ROWS = torch.zeros(4, 3, dtype=torch.float64), torch.zeros(4, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        *(lambda whole, kept=kept: whole[:kept] for kept in (0, 5, 9, 100, -1)),
+        lambda whole: b"a long text about bowls\n" * 9,
+        lambda whole: bytes(200),
+        lambda whole: b"RIFF" + bytes(2000),
+        lambda whole: to_bytes({"places": PLACES}),
+        lambda whole: to_bytes({"places": PLACES}, {"format": "pt"}),
+        *(
+            lambda whole, words=words: to_bytes({"places": PLACES}, {"kind": words})
+            for words in ("", "[]", "[" * 100_000, "{", '"kind"', '{"format": 1}', '{"format": 2, "version": "9.9"}')
+        ),
+    ],
+)
+def test_a_file_cut_short_or_of_another_kind_is_refused_as_a_missing_one_and_a_folder(tmp_path, damaged):
+    path = tmp_path / "file"
+    write_tensors(path, {"places": PLACES}, KIND.to_text({"a": 1}, path, name="record"), KIND)
+    assert KIND.parse(read_tensors(path, KIND)[0], path)["a"] == 1
+    path.write_bytes(damaged(path.read_bytes()))
+    for wrong in (path, tmp_path / "nowhere", tmp_path):
+        with raises(FieldFileError, file=wrong):
+            KIND.parse(read_tensors(wrong, KIND)[0], wrong)
 
 
 @pytest.mark.parametrize(

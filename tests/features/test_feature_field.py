@@ -187,19 +187,6 @@ def test_a_changed_record_is_refused(tmp_path, changes, name, value):
         load_features(path)
 
 
-def test_other_files_are_refused(tmp_path):
-    path = tmp_path / "f"
-    save_features(field(box(20)), path)
-    whole = path.read_bytes()
-    save_file(TENSORS, path)
-    for content, name in ((None, None), (b"ply\n", None), (whole[:-10], None), (path.read_bytes(), "avmsf_features")):
-        path.unlink(missing_ok=True)
-        if content is not None:
-            path.write_bytes(content)
-        with raises(SceneError, file=path, name=name):
-            load_features(path)
-
-
 SIXFOLD = RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double(), 6, 0.0)
 ROUND = RotationalSymmetry(SIXFOLD.axis, SIXFOLD.point, None, 0.0)
 UPRIGHT = MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.zeros(3).double(), 0.0)

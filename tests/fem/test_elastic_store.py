@@ -37,19 +37,6 @@ def test_modes_are_used_where_they_cannot_be_kept(modes, tmp_path):
         assert modes_once(tmp_path / "blocked" / "modes.safetensors", lambda: modes, log=print) is modes
 
 
-def test_files_that_hold_no_modes(modes, tmp_path):
-    path = tmp_path / "modes.safetensors"
-    with raises(SimulationError, file=path, value=None):
-        load_modes(path)
-    save_modes(modes, path)
-    path.write_bytes(path.read_bytes()[:300])
-    with raises(SimulationError, file=path, value="a truncated or damaged file"):
-        load_modes(path)
-    save_file({"frequency": torch.ones(3)}, path)
-    with raises(SimulationError, file=path, name="avmsf_elastic", value=[]):
-        load_modes(path)
-
-
 @pytest.mark.parametrize(
     ("name", "change"),
     [

@@ -97,35 +97,6 @@ def changed(tmp_path: Path, change: Change) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    "damaged",
-    [
-        *(lambda whole, kept=kept: whole[:kept] for kept in (0, 5, 9, 100, 3000, -1)),
-        lambda whole: b"a long text about bowls\n" * 9,
-        lambda whole: bytes(200),
-        lambda whole: b"RIFF" + bytes(2000),
-        lambda whole: to_bytes({"bank.frequency": torch.ones(3)}),
-        lambda whole: to_bytes({"bank.frequency": torch.ones(3)}, {"format": "pt"}),
-        *(
-            lambda whole, words=words: to_bytes(from_bytes(whole), {"avmsf": words})
-            for words in ("", "[]", "[" * 100_000, "{", '"avmsf"', f'{{"format": {FORMAT}}}')
-        ),
-    ],
-)
-def test_a_file_cut_short_or_of_another_kind_is_refused(tmp_path, damaged):
-    path = tmp_path / "plate.safetensors"
-    save(field(), path)
-    path.write_bytes(damaged(path.read_bytes()))
-    with raises(FieldFileError, file="plate.safetensors"):
-        load(path)
-
-
-def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    for path in (tmp_path / "nowhere", tmp_path):
-        with raises(FieldFileError, file=path):
-            load(path)
-
-
 @pytest.mark.parametrize("number", [7, FORMAT + 1])
 def test_another_format_is_refused_by_its_number(tmp_path, number):
     def change(_: dict, record: dict) -> None:

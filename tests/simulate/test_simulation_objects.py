@@ -301,16 +301,10 @@ def test_a_sheet_without_a_wall_is_told_to_have_one(recipe: ObjectRecipe, tmp_pa
         simulate_object(replace(recipe, mesh=flat, thickness=None))
 
 
-def test_truths_that_are_damaged_or_of_something_else_are_refused(simulation: Simulation, tmp_path: Path) -> None:
+def test_truths_of_another_format_or_of_something_else_are_refused(simulation: Simulation, tmp_path: Path) -> None:
     path = tmp_path / TRUTH
-    with raises(SimulationError, file=path, value=None):
-        read_truth(tmp_path)
     write_truth(simulation.truth, path)
-    content = path.read_bytes()
-    path.write_bytes(content[:-100])
-    with raises(SimulationError, file=path, value="a truncated or damaged file"):
-        read_truth(path)
-    path.write_bytes(content.replace(b'\\"format\\": 2', b'\\"format\\": 9'))
+    path.write_bytes(path.read_bytes().replace(b'\\"format\\": 2', b'\\"format\\": 9'))
     with raises(SimulationError, file=path, name="format", value=9):
         read_truth(path)
     short = replace(simulation.truth, names=simulation.truth.names[1:])
