@@ -87,7 +87,7 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
         made = values["pipeline"]
         if "extraction" in made and "guess" not in report:
             rows.append(("extraction", f"{made['extraction']}, {made['modes']} modes at most"))
-            rows.append(("gain model", f"{made['gain_model']}, {counted(made['fit']['steps'], 'step')} end to end"))
+            rows.append(("gain model", made["gain_model"]))
     if field.body is not None:
         rows.append(("body", f"{field.body} (the most probable one{_gained(report)})"))
         rows += [("warning", field.body.warning)] if field.body.warning else []

@@ -78,7 +78,7 @@ class FitConfig:
     warmup_weights: Literal["energy", "equal"] = "energy"
     """Weights of the modes' squared errors: the energy of a unit gain over time, or all equal (paper)."""
     steps: int = 150
-    """Steps end to end on spectra (paper, eq. 14)."""
+    """Steps end to end on spectra (paper, eq. 14); a Gaussian process takes a third of them, three times as long."""
     fft_sizes: tuple[int, ...] = (2048, 1024, 512, 256)
     """Resolutions of the spectral loss, samples at 44.1 and 48 kHz; other rates scale them in octaves."""
     hop: int = 0

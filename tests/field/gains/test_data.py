@@ -261,11 +261,11 @@ def test_a_shift_reads_as_the_model_of_the_moved_values():
     assert torch.allclose(read(gains), mean_at_contacts(finished), rtol=1e-4, atol=1e-3)
 
 
-def test_a_shift_of_one_two_hundredth_moves_a_value_by_its_standard_error():
+def test_a_shift_of_one_six_hundredth_moves_a_value_by_its_standard_error():
     gains = refined()
     with torch.no_grad():
-        gains.shift[1, 6] = 1.0 / 200.0
-        gains.shift[MODES + 3, 2] = -1.0 / 200.0
+        gains.shift[1, 6] = 1.0 / 600.0
+        gains.shift[MODES + 3, 2] = -1.0 / 600.0
     moved = torch.view_as_real(gains.finished(torch.arange(MODES)).values - model().values)
     expected = torch.zeros_like(moved)
     expected[6, 1, 0], expected[2, 3, 1] = model().noise()[1, 0], -model().noise()[3, 1]
@@ -280,7 +280,7 @@ def test_a_shift_costs_its_squares_by_the_modes_energy():
     with torch.no_grad():
         # The second mode has nearly all of the energy.
         gains.shift[[1, MODES + 1]] = 0.0
-    squares = (200.0 * gains.shift.detach().double()).square().reshape(2, MODES, -1).mean((0, 2))
+    squares = (600.0 * gains.shift.detach().double()).square().reshape(2, MODES, -1).mean((0, 2))
     assert float(gains.penalty().detach()) == pytest.approx(float(0.05 * (squares * share).sum()), rel=1e-5)
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -39,7 +40,10 @@ errors between 0.4 % smaller and 1.7 % larger without a body, and changed nothin
 _PREDICTS = 1.4
 """Nats per mode that a free body has to add, below which supports are tried. A plate clamped at an edge and taken for
 free adds .5, a free one 2.3; mugs add 1.1 (held at the base) and 1.5, an aircraft .8 to 1.3."""
-_STEP = 200.0
+_PACE = 3
+"""Steps of a network's training that one step here stands for, in all rates: gains start where they were solved. See
+docs/decisions/network-training.md."""
+_STEP = 600.0
 """Standard errors that a parameter of one stands for: a learning rate made for networks then moves gains in time."""
 _STRENGTH = 0.1
 """Spectral loss that gains are worth which are off by one standard error each: about what it measures of them."""
@@ -135,8 +139,10 @@ class MixtureEstimator(GainEstimator):
         if levels := refined.model.report["levels"]:
             data = data.divided(torch.tensor(levels, dtype=torch.float64))
         used = torch.nonzero(rows >= 0).flatten()
+        rates = {name: _PACE * getattr(data.config, name) for name in ("correction_rate", "noise_rate")}
         # A recording of another position than its label would pull the others' gains to its sound.
-        run = trainer.run("fit", refined, data.take(used.tolist()), rows[used], warmup=0, steps=data.config.steps)
+        taken = replace(data.take(used.tolist()), config=replace(data.config, **rates))
+        run = trainer.run("fit", refined, taken, rows[used], warmup=0, steps=math.ceil(data.config.steps / _PACE))
         order, rate = run.order, data.train.sample_rate
         measured = along_phase(fit_gains(data.train.sounds, run.trained, sample_rate=rate), data.phase[order])
         reason = "as set" if data.config.damping == SHARED else "the only form of this gain model"
