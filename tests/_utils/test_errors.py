@@ -1,7 +1,6 @@
 """What errors hold, texts of others, names of the hub, progress and compiled loops."""
 
 import errno
-import io
 import math
 import os
 import threading
@@ -15,7 +14,6 @@ import torch
 
 from avmsf._utils.compiled import compiled
 from avmsf._utils.files import model_folder
-from avmsf._utils.progress import ProgressDisplay
 from avmsf._utils.text import MAX_TOML_BYTES, format_number, parse_json, read_json, read_text, read_toml
 from avmsf.errors import CaptureError, SceneError, download_failure, lacks_memory
 from factories.raising import raises
@@ -104,20 +102,9 @@ def test_json_and_toml_have_bounded_depth(tmp_path: Path) -> None:
         read_toml(tmp_path / "x.toml")
 
 
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        (None, "–"),
-        (math.nan, "–"),
-        (0.0, "0"),
-        (0.01234, "0.0123"),
-        (1.53e-4, "1.53e-04"),
-        (8.5, "8.50"),
-        (1234.5, "1234"),
-    ],
-)
-def test_numbers_have_three_significant_digits(value: float | None, words: str) -> None:
-    assert format_number(value) == words
+def test_numbers_have_three_significant_digits() -> None:
+    words = {None: "–", math.nan: "–", 0.0: "0", 0.01234: "0.0123", 1.53e-4: "1.53e-04", 8.5: "8.50", 1234.5: "1234"}
+    assert {value: format_number(value) for value in words} == words
 
 
 class Gate(BaseHTTPRequestHandler):
@@ -155,40 +142,6 @@ def test_an_owner_and_a_model_are_a_name_and_a_path_is_none(tmp_path: Path) -> N
     for path in paths:
         with raises(SceneError, file=Path(path).expanduser(), name="source", value=str(path)):
             model_folder(path, "a model", raising=SceneError)
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-@pytest.mark.parametrize(
-    ("stream", "options", "count"),
-    [
-        (io.StringIO, {"shown": False}, 1),
-        (io.StringIO, {}, 4),
-        (io.StringIO, {"verbose": True}, 5),
-        (Terminal, {}, None),
-    ],
-)
-def test_a_stage_is_a_line_quiet_leaves_notes_and_verbose_adds_parts(stream, options, count, monkeypatch) -> None:
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr("sys.stderr", stderr := stream())
-    display = ProgressDisplay(**options)
-    # Names that would be markup or a control sequence.
-    for _ in range(2):
-        with display:
-            display.listener.log("reading [bold]mug\x1b]0;title\x07")
-            display.listener.step("splat", 1, 2, "loss [red]1")
-            display.listener.ready("splat", 2.0)
-            display.listener.ready("modes", None)
-            display.objects()("mug", 1, 1)
-            display.listener.note("few recordings")
-    lines = stderr.getvalue().splitlines()
-    assert count is None or len(lines) == 2 * count
-    assert options or any(line.endswith("2.0 s") and "splat" in line for line in lines)
-    assert "\x07" not in stderr.getvalue()
-    assert ("[red]1" in stderr.getvalue()) == (stream is Terminal)
 
 
 def twice(value: float) -> float:

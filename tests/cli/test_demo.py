@@ -11,15 +11,11 @@ import torch
 
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import demo, main
-from avmsf.cli.output import display
 from avmsf.cli.paths import OutputError
-from avmsf.cli.report import field_lines, outlier_words, quality_words
 from avmsf.errors import FitError
-from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
-from factories.made_fields import positional, sounding
 from factories.plate_capture import TINY, fill_plate
 from factories.raising import raises
 from factories.verbs import results_of, run_verb
@@ -102,52 +98,6 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path
         run_verb("suggest", str(field), "--output", str(blocked))
     with raises(FitError, name="--unseen"):
         run_verb("suggest", str(field), "--unseen", "--candidates", str(tmp_path))
-
-
-FOUND = {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "next_contact": [0.02, -0.01, 0.08], "next_distance": 0.041}
-
-
-def field_with(report: dict[str, object]) -> SoundField:
-    return sounding(positional(), noise=1e-3, samples=400, origin=Origin(report=report))
-
-
-def test_a_field_without_a_verdict_gets_no_words_and_one_with_advice_names_the_command() -> None:
-    for report in ({}, {"quality": FOUND, "edits": [{"edit": "x"}]}):
-        assert quality_words(field_with(report), Path("f")) == []
-    assert "avmsf suggest f" in quality_words(field_with({"quality": FOUND}), Path("f"))[0]
-
-
-def test_the_body_is_named_with_the_ratio_of_stiffness_to_density_and_what_it_explains() -> None:
-    # Frequencies are half of aluminum's: a quarter of its 26 MJ/kg.
-    body = {"body": "shape", "wall_thickness": None, "frequency_factor": 0.5, "support": "free"}
-    report = {"bodies": [body], "credibility": {"credible": True, "with_body": 2.5, "without_body": 0.75}}
-    lines = field_lines(field_with(report), Path("f"), settings=False)
-    (line,) = [each for each in lines if each.split()[0] == "body"]
-    assert "6.5 MJ/kg" in line
-    assert "1.8 per mode" in line
-
-
-def test_levels_that_were_found_are_named_and_so_is_what_quality_means_then() -> None:
-    found = [field_lines(field_with({"levels": each}), Path("f"), settings=False) for each in ([], [0.5, 1.0, 2.0])]
-    before, after = (next(line for line in lines if "fitted to" in line) for lines in found)
-    assert "levels" not in before
-    assert "-6.0 to +6.0 dB; quality is at these" in after
-
-
-def test_an_outlier_says_what_was_done_and_has_figures_only_for_verbose(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = {"place": [0.046, -0.003, 0.1], "ratio": -1.9, "place_ratio": 1.6, "distance": 0.0086, "reversed": False}
-    report: dict[str, object] = {
-        "outliers": {"a.wav": "a.wav contradicts", "b.wav": "b.wav contradicts"},
-        "outlier_figures": {"a.wav": figures},
-        "excluded": ["a.wav"],
-    }
-    left_out, used = outlier_words(field_with(report))
-    assert (left_out.split()[0], used.split()[0], "1.9" in left_out) == ("left", "used", False)
-    monkeypatch.setattr(display, "verbose", True)
-    left_out, used = outlier_words(field_with(report))
-    assert "-1.9" in left_out
-    assert "(0.046, -0.003, 0.1) m" in left_out
-    assert used.endswith("contradicts")
 
 
 NETWORK = ("--gain-model", "network", "--without-shape", *TINY)

@@ -18,7 +18,6 @@ from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.paths import Existing, InputError
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
-from avmsf.evaluation.registry import METHODS, PROTOCOLS
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
 from avmsf.simulate.recipe import named_recipe
 from factories.plate_capture import TINY, fill_plate
@@ -45,17 +44,6 @@ def test_a_help_fits_on_one_screen(verb: str, capsys: Streams, monkeypatch: pyte
     with pytest.raises(SystemExit, match="0"):
         main([verb, "edit", "--help"])
     assert capsys.readouterr().out.endswith(out)
-
-
-def test_the_help_of_a_protocol_begins_with_what_it_does_and_its_methods(capsys: Streams) -> None:
-    with pytest.raises(SystemExit, match="0"):
-        main(["evaluate", "edit", "data", "--help"])
-    title, methods = capsys.readouterr().out.split("\n\n")[:2]
-    assert " ".join(title.split()) == f"edit: {PROTOCOLS['edit'].title}"
-    named = {*re.findall(r"[-\w]+", methods)}
-    assert {name for name in METHODS if name in named} == {"unedited", "generation"} | {
-        f"edit-{each}" for each in ("independent", "published", "hierarchical", "searched", "physics")
-    }
 
 
 @pytest.mark.parametrize(

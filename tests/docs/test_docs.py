@@ -139,14 +139,3 @@ def test_a_number_has_three_digits_and_a_column_that_no_shown_row_has_is_of_dash
     assert {value: pages.in_digits(value) for value in numbers} == numbers
     table = pages.markdown([pages.Record("gains.sim20.mean.error", 0.5, "", "lower")], ["error", "gone"])
     assert table.splitlines() == ["|  | error ↓ | gone |", "|---|---|---|", "| mean | .500 | – |"]
-
-
-def test_a_method_without_results_has_no_column_and_its_part_is_named(pages, monkeypatch):
-    found = {"gains.sim20": (pages.Record("gains.sim20.mean.mixture", 0.5),)}
-    monkeypatch.setattr(pages, "_records", lambda part: found.get(part, ()))
-    text = pages.written("<!-- measured: results -->\n<!-- end -->")
-    assert "|   | **avmsf's default** |\n| --- | --- |\n| 20 simulated objects, 8 | .500 |" in text
-    missing = text.partition("No records yet of:")[2]
-    assert "align --parts errors" in missing
-    assert "captures" in missing
-    assert "--parts sim20 " not in missing

@@ -99,13 +99,7 @@ def done() -> set[tuple[str, str]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_step_of_a_page_runs(
-    page,
-    done,
-    request,
-    tmp_path,
-    monkeypatch,
-):
+def test_every_step_of_a_page_runs(page, done, request, tmp_path, monkeypatch):
     for folder, text in parts(page).items():
         assert steps(text)
         monkeypatch.chdir(shutil.copytree(request.getfixturevalue(folder), tmp_path / folder))

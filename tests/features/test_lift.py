@@ -249,20 +249,6 @@ def test_a_gaussians_reach_is_its_deviation_along_the_view():
     torch.testing.assert_close(depth_reach(cloud, camera).double(), expected, rtol=1e-5, atol=0)
 
 
-def test_a_surfaces_depth_is_along_the_axis():
-    # A wide plate across the axis, half a meter away: every pixel sees the same depth, however long its ray.
-    corners = torch.tensor([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
-    plate = Surface(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]))
-    camera = camera_at([0, 0, 1])
-    depth = depth_of_surface(plate)(camera)
-    # Embree works in float32: a micrometer in half a meter.
-    torch.testing.assert_close(depth, torch.full_like(depth, DISTANCE), rtol=0, atol=2e-6)
-    smaller = Surface(0.001 * corners, plate.faces)
-    partly = depth_of_surface(smaller)(camera)
-    # 18 mm at half a meter are 18 pixels of 500 a meter's meter.
-    assert int((partly > 0).sum()) == pytest.approx(18 * 18, abs=2 * 18)
-
-
 def test_the_encoder_never_sees_the_background():
     mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
     mask[50:150, 60:180] = 255

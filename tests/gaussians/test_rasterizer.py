@@ -298,11 +298,8 @@ def spoilt(name: str, row: int, value: float) -> GaussianCloud:
         ),
     ],
 )
-def test_clouds_that_cannot_be_rendered_are_refused(make, attributes: dict) -> None:
+def test_clouds_and_backgrounds_that_cannot_be_rendered_are_refused(make, attributes: dict) -> None:
     with raises(SceneError, **attributes):
         image_of(make(), camera_of())
-
-
-def test_a_background_of_another_type_is_refused() -> None:
     with raises(SceneError, name="background", value=["float64", "cpu"]):
         NumbaRasterizer()(cloud_of(5), camera_of(), background=BACKGROUND.double())

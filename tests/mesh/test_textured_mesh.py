@@ -125,15 +125,6 @@ def test_fewer_triangles_are_still_the_ball() -> None:
     assert np.quantile(off(surface), 0.95) < 3e-4
 
 
-def test_a_ring_keeps_its_hole() -> None:
-    x, y, z = np.moveaxis(places() - MIDDLE, -1, 0)
-    depth = 0.015 - np.hypot(np.hypot(x, y) - 0.035, z)
-    values = np.clip(0.5 + depth / (4 * SPACING), 0, 1).astype(np.float32)
-    mesh = mesh_of(enclose(values, 0.5, lowest=LOWEST, spacing=SPACING))
-    assert mesh.is_watertight
-    assert mesh.euler_number == 0
-
-
 def test_specks_beside_the_body_are_left_out() -> None:
     values = np.zeros((40, 20, 20), dtype=np.float32)
     values[5:15, 5:15, 5:15] = 1.0
