@@ -251,9 +251,7 @@ def test_the_papers_method_is_the_preset_with_one_damping(name: str, damping: An
     assert (field.visual_input, field.published) == ("paper", True)
 
 
-def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(
-    monkeypatch,
-):
+def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(monkeypatch):
     def missing(*_: Any, **__: Any) -> DinoEncoder:
         raise SceneError("facebook/dinov2-base: no weights", value="facebook/dinov2-base")
 

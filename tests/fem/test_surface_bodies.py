@@ -162,9 +162,7 @@ def coarse() -> CandidateBody:
 
 
 @pytest.mark.parametrize("error", [None, MemoryError(), SimulationError("badly shaped")])
-def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory_or_fails(
-    monkeypatch: pytest.MonkeyPatch, coarse: CandidateBody, error: Exception | None
-):
+def test_a_body_stays_coarse_where_a_finer_one_does_not_fit_into_the_memory_or_fails(monkeypatch, coarse, error):
     def fail(*solid: object, **settings: object) -> None:
         assert error is not None
         raise error
@@ -210,9 +208,7 @@ def normal(true: float, deviation: float) -> Callable[[float], float]:
     # The last is thinner than all walls given.
     [(0.0029, 0.07), (0.0029, 0.2), (0.0018, 0.1), (0.55 * GRID[0], 0.1)],
 )
-def test_the_posterior_of_a_normal_evidence_is_normal_with_the_variance_of_shapes_added(
-    true: float, deviation: float
-) -> None:
+def test_the_posterior_of_a_normal_evidence_is_normal_with_the_variance_of_shapes_added(true, deviation):
     found, thickness, _ = searched(normal(true, deviation), walls=(None, *GRID))
     assert thickness.median == pytest.approx(true, rel=0.03)
     both = math.hypot(deviation, 0.2)

@@ -283,9 +283,7 @@ BROWSER += "Path(sys.argv[1]).write_text(f'{path.stat().st_mode & 0o777:o} {path
 
 
 @pytest.mark.slow
-def test_the_command_serves_until_it_is_told_to_end_and_tells_no_browsers_command_line_its_secret(
-    tmp_path,
-):
+def test_the_command_serves_until_it_is_told_to_end_and_tells_no_browsers_command_line_its_secret(tmp_path):
     opened, seen, script = open_plate(tmp_path / "opened"), tmp_path / "seen", tmp_path / "browser.py"
     script.write_text(BROWSER)
     command = [sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())", "studio"]
