@@ -3,20 +3,19 @@
 import math
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar
 
 import torch
 
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
-from factories.made_fields import sounding
+from factories.made_fields import StandIn, sounding
 from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
 
 PLATE = Plate()
@@ -25,7 +24,7 @@ DIAGONAL = math.hypot(PLATE.length, PLATE.width)
 
 
 @dataclass(frozen=True, eq=False)
-class TrueGains(GainModel):
+class TrueGains(StandIn):
     """The plate's own gains, in closed form."""
 
     points: torch.Tensor
@@ -33,27 +32,12 @@ class TrueGains(GainModel):
     factor: float | None = None
     plate: Plate = PLATE
     highest: float = HIGHEST
-    kind: ClassVar[str] = "true"
 
     def predict(self, points: torch.Tensor, directions: torch.Tensor | None = None) -> Gains:
         gains = plate_modes(self.plate, points, highest=self.highest).gains.float()
         shape = gains.shape
         damping = None if self.factor is None else 1.0 + self.factor * torch.linspace(0, 1, shape[1]).expand(shape)
         return Gains(gains + 0.4j * gains.roll(1, 1) if self.turned else gains, damping=damping)
-
-    def record(self):
-        return {"modes": len(bank()), "points": len(self.points)}
-
-    def tensors(self):
-        return {"points": self.points}
-
-    @classmethod
-    def skeleton(cls, record):
-        return {"points": torch.empty(record["points"], 3, device="meta")}
-
-    @classmethod
-    def restore(cls, record, tensors):
-        return cls(**tensors)
 
 
 @cache

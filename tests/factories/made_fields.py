@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 
@@ -23,6 +24,20 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 
 from .made_modes import sliding_plate
+
+
+class StandIn(GainModel):
+    """Gains of a formula, which no file brings back."""
+
+    kind: ClassVar[str] = "formula"
+    skeleton = restore = None  # type: ignore[assignment]
+
+    def record(self) -> dict[str, Any]:
+        return {}
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        return {name: each for name, each in vars(self).items() if isinstance(each, torch.Tensor)}
+
 
 SIDES = (0.24, 0.17, 0.004)
 SIZE = float(torch.tensor(SIDES, dtype=torch.float64).norm())

@@ -1,14 +1,14 @@
 """A field that sounds the same wherever it is struck, so that one recording is its whole truth."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 
-from avmsf.field.gains.model import GainModel, Gains
+from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
-from factories.made_fields import sounding
+from factories.made_fields import StandIn, sounding
 
 RATE = 8000.0
 FREQUENCY = (310.0, 565.0, 905.0, 1420.0, 1990.0, 2710.0)
@@ -17,33 +17,14 @@ GAINS = (1.0, -0.8, 0.9, 0.6, -0.7, 0.4)
 
 
 @dataclass(frozen=True, eq=False)
-class SameGains(GainModel):
+class SameGains(StandIn):
     """Gains that do not depend on the place."""
 
     gains: torch.Tensor
-
-    kind: ClassVar[str] = "same"
-
-    @property
-    def points(self) -> torch.Tensor:
-        return torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
+    points: ClassVar[torch.Tensor] = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 
     def predict(self, points, directions=None) -> Gains:
         return Gains(self.gains.expand(len(points), -1))
-
-    def record(self) -> dict[str, Any]:
-        return {"modes": len(self.gains)}
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        return {"gains": self.gains}
-
-    @classmethod
-    def skeleton(cls, record):
-        return {"gains": torch.empty(record["modes"], device="meta")}
-
-    @classmethod
-    def restore(cls, record, tensors):
-        return cls(tensors["gains"])
 
 
 def ringing_field(*, pitch: float = 1.0, damping: float = 1.0, seconds: float = 0.5, level: float = 1.0) -> SoundField:

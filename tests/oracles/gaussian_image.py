@@ -4,10 +4,10 @@ Written from the definitions of 3D Gaussian Splatting (Kerbl et al. 2023); it sh
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avmsf.gaussians.cloud import GaussianCloud
@@ -20,8 +20,7 @@ _CUT = 2e-4
 """How near a cut, relative, rounding may decide on which side a number lies."""
 
 
-@dataclass(frozen=True, eq=False)
-class Splats:
+class Splats(NamedTuple):
     """A cloud's Gaussians in one image."""
 
     screen: Float[Tensor, "points 2"]
@@ -32,16 +31,6 @@ class Splats:
     colors: Float[Tensor, "points 3"]
     depths: Float[Tensor, " points"]
     """Along the optical axis, meters."""
-
-    def take(self, chosen: Int[Tensor, " chosen"]) -> "Splats":
-        """Return the Gaussians of the given rows."""
-        return Splats(
-            self.screen[chosen],
-            self.covariances[chosen],
-            self.opacities[chosen],
-            self.colors[chosen],
-            self.depths[chosen],
-        )
 
 
 def splats(cloud: GaussianCloud, camera: Camera) -> Splats:
@@ -88,8 +77,8 @@ def render_everywhere(
     every = splats(cloud, camera)
     spread = 4 * every.covariances[:, 1, 1].sqrt()
     near = (every.screen[:, 1] + spread > rows.start) & (every.screen[:, 1] - spread < rows.stop)
-    seen = every.take(torch.nonzero(near).flatten())
-    seen = seen.take(torch.argsort(seen.depths, stable=True))
+    order = torch.argsort(every.depths, stable=True)
+    seen = Splats(*(each[order][near[order]] for each in every))
     down, across = torch.meshgrid(torch.tensor(rows), torch.arange(camera.width), indexing="ij")
     pixels = torch.stack([across.flatten(), down.flatten()], 1).to(every.screen) + 0.5
     covered = _coverage(seen, pixels)
@@ -103,15 +92,8 @@ def render_everywhere(
     alpha = 1 - torch.where(goes_on, left, 1.0).amin(0)
     color = weights.T @ seen.colors + (1 - alpha)[:, None] * background.to(pixels)
     depth = torch.where(alpha > 0, weights.T @ seen.depths / alpha.clamp(min=1e-10), 0.0)
-    shape = len(rows), camera.width
-    rendering = Rendering(
-        color.reshape(*shape, 3),
-        alpha.reshape(shape),
-        depth.reshape(shape),
-        every.screen,
-        torch.zeros_like(every.depths),
-    )
-    return rendering, undecided.reshape(shape)
+    color, alpha, depth, undecided = (each.unflatten(0, (len(rows), -1)) for each in (color, alpha, depth, undecided))
+    return Rendering(color, alpha, depth, every.screen, torch.zeros_like(every.depths)), undecided
 
 
 def _coverage(seen: Splats, pixels: Float[Tensor, "pixels 2"]) -> Float[Tensor, "points pixels"]:

@@ -13,6 +13,7 @@ from avmsf.fem.solid import Solid
 from avmsf.simulate.shapes import KINDS, Shape, make_shape
 from avmsf.simulate.shapes.revolution import Profile, Turned
 from avmsf.simulate.thickness_variation import vary_thickness
+from factories.looked_at import mesh_of
 from factories.raising import raises
 
 HANDLES = {"mug": 1, "jug": 1, "bracket": 2, "tube": 1}
@@ -52,19 +53,13 @@ def misfit(places: np.ndarray, motion: np.ndarray, *, every: int = 1) -> float:
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_surfaces_are_closed_and_turned_outwards(kind: str) -> None:
     shape = made(kind)
-    faces = shape.surface.faces.numpy()
-    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    numbers = sides[:, 0] * len(shape.surface.vertices) + sides[:, 1]
-    back = sides[:, 1] * len(shape.surface.vertices) + sides[:, 0]
-    # Each edge is run along once in either direction.
-    assert len(np.unique(numbers)) == len(numbers)
-    np.testing.assert_array_equal(np.sort(numbers), np.sort(back))
-    used = np.unique(faces)
-    np.testing.assert_array_equal(used, np.arange(len(shape.surface.vertices)))
-    # Euler's formula: vertices - edges + faces = 2 - 2 holes.
-    assert len(used) - len(numbers) // 2 + len(faces) == 2 - 2 * HANDLES.get(kind, 0)
-    # By the divergence theorem; single precision of vertices, some 1e-8 m of walls of 2 mm.
-    assert np.linalg.det(vertices(shape)[faces]).sum() / 6.0 == pytest.approx(shape.solid.volume, rel=1e-5)
+    mesh = mesh_of(shape.surface)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.referenced_vertices.all()
+    assert mesh.euler_number == 2 - 2 * HANDLES.get(kind, 0)
+    # Single precision of vertices, some 1e-8 m of walls of 2 mm.
+    assert mesh.volume == pytest.approx(shape.solid.volume, rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
