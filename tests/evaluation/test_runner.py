@@ -127,14 +127,6 @@ def test_changed_wavs_are_scored_again_and_no_others(plates: Path, tmp_path: Pat
     assert errors[0] < 1e-3 < errors[1]
 
 
-def test_an_interruption_keeps_all_before_it(plates: Path, tmp_path: Path) -> None:
-    results = ResultsFolder(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        run_objects(planned(plates, "knn3", failing(KeyboardInterrupt()), "nearest"), ("a", "b"), results)
-    (record,) = results.records()
-    assert [each.method for each in record.outcomes] == ["knn3"]
-
-
 def test_an_object_that_cannot_be_read_or_shows_nothing_is_a_failure(tmp_path: Path) -> None:
     folder = fill_plates(tmp_path / "data", ("a", "b"))
     (folder / "b" / "03.wav").unlink()

@@ -4,14 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from avmsf.errors import EvaluationError
-from avmsf.evaluation.results import IDENTITY, ResultsFolder
-from avmsf.pipeline.stages import Stage, StageFolder
 from factories import damaged_files as files
 from factories.valid_files import write_seeds
-
-NESTED = "[" * 100_000
-"""Far deeper than any reader's own."""
 
 
 @pytest.fixture(scope="module")
@@ -27,23 +21,3 @@ def test_damage_is_refused_or_harmless(tmp_path: Path, seeds: Path, family: str)
     results = {name: files.outcome_of(read) for _, name, read in inputs}
     assert len(results) == 4
     assert not {name: said for name, (result, said) in results.items() if result not in ("read", "refused")}
-
-
-def test_nested_results_are_refused(tmp_path: Path) -> None:
-    (tmp_path / IDENTITY).write_text(NESTED)
-    with pytest.raises(EvaluationError):
-        ResultsFolder(tmp_path).identity()
-
-
-def test_a_stage_whose_record_is_nested_runs_again(tmp_path: Path) -> None:
-    made: list[Path] = []
-
-    def make(path: Path) -> None:
-        made.append(path)
-        path.write_text("made")
-
-    for _ in range(2):
-        StageFolder(tmp_path).keep(Stage("stage", make))
-        (record,) = tmp_path.glob("*.json")
-        record.write_text(NESTED)
-    assert len(made) == 2
