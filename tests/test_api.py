@@ -5,7 +5,6 @@ import math
 import re
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 from functools import cache
 from operator import attrgetter
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import soundfile
 import torch
-import trimesh
 
 import avmsf
 from avmsf.capture import Impacts
@@ -24,7 +22,6 @@ from avmsf.errors import (
     ArrayError,
     AvmsfError,
     CaptureError,
-    CaptureWarning,
     EditError,
     EvaluationError,
     ExportError,
@@ -34,7 +31,6 @@ from avmsf.errors import (
 )
 from avmsf.evaluation import score
 from avmsf.field import FitConfig, SoundField
-from avmsf.photographs.cameras import Camera, View
 from avmsf.pipeline import PipelineConfig
 from factories.plate_capture import fill_plate
 from factories.plate_field import RATE, plate_impacts
@@ -46,7 +42,6 @@ NAMES = {
     *("edit", "evaluate", "extract_modes", "fit", "load", "locate", "read", "split", "suggest", "write"),
 }
 CONTACT = [0.05, 0.06, 0.0]
-CAMERA = Camera(torch.eye(4, dtype=torch.float64), (1.0, 1.0), (2.5, 2.0), 5, 4)
 
 
 @cache
@@ -180,29 +175,6 @@ def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
     assert scores[0] < unaligned
 
 
-@pytest.mark.parametrize(
-    "made",
-    [
-        capture,
-        lambda: capture().impacts,
-        field,
-        lambda: field().bank,
-        lambda: avmsf.extract_modes(capture()),
-        lambda: avmsf.locate(field(), capture().impacts.sounds[0]),
-        lambda: field().posterior([CONTACT]),
-        lambda: field().origin,
-        lambda: avmsf.evaluate(field(), capture()),
-        lambda: View("a.png", torch.zeros(4, 5, 3, dtype=torch.uint8), CAMERA),
-        lambda: avmsf.Surface(torch.zeros(4, 3), torch.zeros(2, 3, dtype=torch.long)),
-    ],
-    ids=["capture", "impacts", "field", "bank", "modes", "map", "posterior", "origin", "scores", "view", "surface"],
-)
-def test_what_is_printed_is_a_line_or_two(made):
-    text = repr(made())
-    assert len(text) < 240
-    assert text.count("\n") <= 1
-
-
 def test_impacts_and_surfaces_are_made_of_arrays(tmp_path):
     given = capture().impacts
     made = Impacts.of(given.contacts.tolist(), given.sounds.numpy(), RATE, forces=given.forces.tolist())
@@ -290,22 +262,6 @@ def test_values_that_cannot_be_meant_are_refused_by_name(call, kind, attributes)
         call()
 
 
-def test_contacts_between_the_vertices_of_a_coarse_mesh_are_on_the_object():
-    contacts = capture().impacts.contacts.numpy()
-    margin = np.array([0.01, 0.01, 0.0])
-    low, high = contacts.min(0) - margin - [0.0, 0.0, 0.01], contacts.max(0) + margin
-    box = trimesh.creation.box(bounds=np.stack([low, high]))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CaptureWarning)
-        fitted = avmsf.fit(
-            replace(capture(), surface=avmsf.Surface.of(box.vertices, box.faces)),
-            gain_model="thin-plate",
-            config=PipelineConfig(modes=4),
-            progress=False,
-        )
-    assert fitted.origin.trained_on == capture().impacts.names
-
-
 def test_a_position_near_the_object_gives_a_warning():
     points = field().gain_field.points
     size = float((points.amax(0) - points.amin(0)).norm())
@@ -329,12 +285,3 @@ def test_a_field_is_written_in_the_format_of_its_ending(tmp_path):
     assert (tmp_path / "plate.glb").read_bytes().startswith(b"glTF")
     avmsf.write(field(), tmp_path / "samples", to="wavs", contacts=3)
     assert len(list((tmp_path / "samples").rglob("*.wav"))) == 3
-
-
-def test_a_field_written_at_fewer_contacts_than_it_has_says_so_unless_they_are_asked_for(tmp_path):
-    held = len(field().gain_field.points)
-    said = [
-        avmsf.write(field(), tmp_path / str(contacts), to="wavs", contacts=contacts).remarks for contacts in (None, 3)
-    ]
-    said = [[each for each in remarks if "of the field's" in each] for remarks in said]
-    assert said == [[f"written: 16 of the field's {held} contacts; `contacts` sets the number"], []]
