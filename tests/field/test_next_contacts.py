@@ -24,6 +24,7 @@ from factories.believing_field import (
     PERTURBATION,
     REMAINDER,
     SIZE,
+    WIDTH,
     bar_contacts,
     bar_points,
     cosines,
@@ -200,7 +201,17 @@ both = pytest.mark.parametrize("access", [by_mesh, by_points])
 
 @both
 @pytest.mark.parametrize("hollow", [0.09, 0.07])
-def test_nothing_inside_a_closed_shell_can_be_struck(access, hollow):
+def test_nothing_inside_a_closed_shell_can_be_struck(access, hollow) -> None:  # type: ignore[no-untyped-def]
+    outer, inner = trimesh.creation.icosphere(4, 0.1), trimesh.creation.icosphere(4, hollow)
+    inner.invert()
+    shell = trimesh.util.concatenate([outer, inner])
+    assert not access(shell, np.array(inner.vertices)[::10]).any()
+    # Points leave their surface less sure than triangles do.
+    assert access(shell, np.array(outer.vertices)[::10]).mean() > (0.99 if access is by_mesh else 0.95)
+
+
+@pytest.mark.parametrize("inner", [0.03, 0.05])
+def test_a_wall_inside_is_struck_over_the_opposite_rim_alone(inner: float) -> None:
     """A rod that leans 45 degrees from a vertical wall rises as far as it goes across, to the opposite rim."""
     height = 6 * inner
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
@@ -248,7 +259,20 @@ def test_a_place_within_a_wall_is_moved_onto_its_surface_and_one_far_off_is_none
 
 
 @pytest.mark.parametrize("made", [elastic_field, positional_field])
-def test_points_within_the_object_are_not_suggested(made):
+def test_points_within_the_object_are_not_suggested(made) -> None:  # type: ignore[no-untyped-def]
+    contacts = bar_contacts(6)
+    gains = made(contacts, drawn_gains(contacts, seed=1))
+    surface = gains.points
+    # A second face below, and points between the two.
+    below, between = surface - torch.tensor([0, 0, 0.04]), surface - torch.tensor([0, 0, 0.02])
+    field = sound_field(replace(gains, points=torch.cat([surface, between, below])))
+    found = suggest(field, 20)
+    middle = (found.contacts - torch.tensor([LENGTH / 2, WIDTH / 2, -0.02])).abs()
+    assert not bool((middle < torch.tensor([LENGTH / 2 - 0.02, WIDTH / 2 - 0.02, 0.005])).all(1).any())
+    assert found.unreachable > 0
+
+
+def test_an_object_that_cannot_be_struck_is_refused() -> None:
     contacts = bar_contacts(6)
     gains = elastic_field(contacts, drawn_gains(contacts, seed=1))
     with pytest.raises(FitError):
