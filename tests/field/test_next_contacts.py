@@ -34,6 +34,7 @@ from factories.believing_field import (
     positional_field,
     sound_field,
 )
+from factories.looked_at import cup
 from factories.made_fields import BANK as MODES
 from factories.made_fields import attention
 from factories.raising import raises
@@ -174,16 +175,6 @@ def test_one_place_says_nothing_of_how_gains_vary() -> None:
 WALL = 0.003
 
 
-def cup(inner: float, height: float) -> trimesh.Trimesh:
-    """Return a round cup that is open above, with this inner radius, meters."""
-    outer = inner + WALL
-    profile = [(0, 0), (outer, 0), (outer, height), (inner, height), (inner, WALL), (0, WALL)]
-    mesh = trimesh.creation.revolve(np.array(profile), sections=64)
-    assert mesh.is_watertight
-    assert mesh.volume > 0
-    return mesh
-
-
 def struck_on(mesh: trimesh.Trimesh, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return reached_on_mesh(np.array(mesh.vertices), np.array(mesh.faces), places)
 
@@ -220,7 +211,7 @@ def test_a_wall_inside_is_struck_over_the_opposite_rim_alone(inner: float) -> No
     def wall(depth: float) -> np.ndarray:
         return np.stack([inner * np.cos(angle), inner * np.sin(angle), np.full(40, height - depth)], axis=1)
 
-    open_cup = cup(inner, height)
+    open_cup = cup(radius=inner + WALL, height=height, wall=WALL)
     # Turns are tried 30 degrees apart, so that the steepest may miss the rim's middle by 15; the rod is thick.
     assert by_mesh(open_cup, wall(0.5 * reach * np.cos(np.radians(15)) - HAMMER_DIAMETER)).all()
     assert not by_mesh(open_cup, wall(1.05 * reach)).any()
@@ -231,7 +222,7 @@ def test_the_axis_of_a_hammer_lies_clear_and_is_the_nearest_to_the_normal() -> N
     inner, height = 0.03, 0.18
     # The outer wall is struck straight on, the inner one over the opposite rim, 60 mm away.
     places = np.array([[inner + WALL, 0.0, 0.1], [inner, 0.0, height - 0.02], [inner, 0.0, height - 0.04]])
-    struck, _, axes = struck_on(cup(inner, height), places)
+    struck, _, axes = struck_on(cup(radius=inner + WALL, height=height, wall=WALL), places)
     assert struck.all()
     assert axes[0] == pytest.approx([1.0, 0.0, 0.0], abs=0.06)
     tilt = np.degrees(np.arccos(-axes[1:, 0]))
