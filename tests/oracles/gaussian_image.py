@@ -92,8 +92,9 @@ def render_everywhere(
     alpha = 1 - torch.where(goes_on, left, 1.0).amin(0)
     color = weights.T @ seen.colors + (1 - alpha)[:, None] * background.to(pixels)
     depth = torch.where(alpha > 0, weights.T @ seen.depths / alpha.clamp(min=1e-10), 0.0)
-    color, alpha, depth, undecided = (each.unflatten(0, (len(rows), -1)) for each in (color, alpha, depth, undecided))
-    return Rendering(color, alpha, depth, every.screen, torch.zeros_like(every.depths)), undecided
+    shape = len(rows), camera.width
+    color, alpha, depth = color.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape)
+    return Rendering(color, alpha, depth, every.screen, torch.zeros_like(every.depths)), undecided.reshape(shape)
 
 
 def _coverage(seen: Splats, pixels: Float[Tensor, "pixels 2"]) -> Float[Tensor, "points pixels"]:
