@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from avmsf.evaluation.objects import roughened
 from avmsf.evaluation.splits import split
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, STEEL
@@ -77,7 +76,7 @@ def _variants(case: objects.SplitCase, settings: Settings) -> Iterator[tuple[str
     yield "positions alone", case.error(case.fit(MixtureEstimator((Smooth.kind, ThinPlate.kind))))
     yield "positions and symmetry", case.error(case.fit(MixtureEstimator(symmetries=case.symmetries)))
     if case.surface is not None:
-        rough = objects.bodies_of(roughened(case.surface, objects.ROUGH, seed=0), settings)
+        rough = objects.bodies_of(objects.roughened(case.surface, objects.ROUGH, seed=0), settings)
         yield "noisy mesh", case.error(case.fit(MixtureEstimator(bodies=rough)))
 
 

@@ -9,7 +9,6 @@ import torch
 
 from avmsf.capture import Impacts
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample
-from avmsf.evaluation.objects import roughened
 from avmsf.evaluation.scores import evaluate, score
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import split
@@ -106,7 +105,7 @@ def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterat
         capture, truth = objects.simulated(name, settings, objects.TIDY if condition == "tidy" else None)
         surface: Surface | ObjectShape = objects.surface_of(capture)
         if condition == "noisy":
-            surface = roughened(objects.surface_of(capture), objects.ROUGH, seed=0)
+            surface = objects.roughened(objects.surface_of(capture), objects.ROUGH, seed=0)
         elif condition in {"photographs", "offset"}:
             views, cloud = objects.views_and_gaussians(name, settings)
             surface = shape_of_cloud(cloud, views)

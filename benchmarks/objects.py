@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from statistics import NormalDist
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -274,6 +275,17 @@ class SplitCase:
         within = (torch.view_as_real(gains) - known.parts).abs() <= NormalDist().inv_cdf(0.95) * spread
         energy = torch.view_as_real(model.values).square().mean(0) / field.bank.damping[:, None]
         return float(within.double().mean()), float((within * energy).sum(0).sum() / (len(within) * energy.sum()))
+
+
+def roughened(surface: Surface, part: float, *, seed: int) -> Surface:
+    """Return a surface whose vertices are displaced at random, by `part` of its size (standard deviation, each axis).
+
+    The size is the diagonal of the box around it: what a bad scan does to a shape.
+    """
+    generator = np.random.default_rng(seed)
+    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
+    moved = surface.vertices.double().numpy() + part * size * generator.standard_normal(surface.vertices.shape)
+    return Surface(torch.from_numpy(moved).to(surface.vertices.dtype), surface.faces)
 
 
 def splits_of(capture: Capture, count: int, bodies: CandidateBodies | None, settings: Settings) -> Iterator[SplitCase]:

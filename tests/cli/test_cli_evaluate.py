@@ -162,11 +162,11 @@ def test_settings_and_the_device_reach_the_evaluation(plates, tmp_path, monkeypa
         *CHEAP,
         "--output",
         str(tmp_path / "results"),
-        *sets("body.wall=0 geometry=noisy"),
+        *sets("body.wall=0 geometry=gaussians"),
     ]
     assert main(["evaluate", *words, "--device", "cpu"]) == 130
     inputs = asked[0].inputs
-    assert (inputs.body.wall, inputs.geometry, inputs.device) == (0.0, "noisy", "cpu")
+    assert (inputs.body.wall, inputs.geometry, inputs.device) == (0.0, "gaussians", "cpu")
     # Figures of another wall are not these.
     assert asked[0].settings["body"]["wall"] == 0.0
 

@@ -51,7 +51,7 @@ def test_a_help_fits_on_one_screen(verb: str, capsys: Streams, monkeypatch: pyte
     [
         (FitOptions, ["mug"], "--preset paper --set time_zero=null --set modes=5 --seed 3 --set fft_sizes=512,256"),
         (SimulateOptions, [], "--set noise_db=None --set mesh=a.obj -o x mug-ceramic --impacts 5 --set hammer.mass=1"),
-        (EvaluateOptions, ["farthest", "data"], "--set geometry=noisy --set body.wall=0"),
+        (EvaluateOptions, ["farthest", "data"], "--set geometry=gaussians --set body.wall=0"),
         (EditOptions, ["field", "-o", "new"], "--set prompt.generated=x.wav --set model_seconds=Infinity"),
     ],
 )

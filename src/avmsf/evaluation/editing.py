@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf.capture.audio import Recording
@@ -38,6 +38,7 @@ from avmsf.evaluation.methods import FieldMethod, method_named
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.evaluation.registry import EditProtocolSettings
+from avmsf.evaluation.simple_methods import RandomImpact
 from avmsf.evaluation.splits import Case
 from avmsf.evaluation.task import Contacts, Sounds, Task
 from avmsf.fem.material import material_named
@@ -208,54 +209,25 @@ class EditTask(Task):
 
 
 @dataclass(frozen=True, eq=False)
-class Edited:
-    """A renderer of an edited field."""
-
-    field: SoundField
-
-    @property
-    def sample_rate(self) -> float:
-        """Samples per second, Hz."""
-        return self.field.sample_rate
-
-    def modes(self, contacts: Contacts) -> ModalBank:
-        """Return the modes that are audible at contacts."""
-        return audible_modes(self.field.bank, self.field.complex_gains(contacts), sample_rate=self.sample_rate)
-
-    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
-        """Return the field's sounds."""
-        return self.field.render(contacts, directions=directions)
-
-
-@dataclass(frozen=True, eq=False)
-class Generated:
-    """One sound for all contacts, made without an object, and the modes found in it."""
+class Generated(RandomImpact):
+    """A sound that was made without an object."""
 
     bank: ModalBank
-    sound: Float[Tensor, " samples"]
-    sample_rate: float
-
-    def modes(self, contacts: Contacts) -> ModalBank:
-        """Return its audible modes."""
-        return self.bank
-
-    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
-        """Return the sound, once for each contact."""
-        return self.sound.expand(len(contacts), -1)
+    """The audible modes that were found in it."""
 
 
-def unedited(task: EditTask) -> Edited:
+def unedited(task: EditTask) -> SoundField:
     """Return the object as it was: what an edit has to better."""
-    return Edited(task.original)
+    return task.original
 
 
-def physics(task: EditTask) -> Edited:
+def physics(task: EditTask) -> SoundField:
     """Edit by the laws of elasticity with both materials' constants. Raises SimulationError for an unknown one."""
     old, new = (material_named(name) for name in (task.source, task.target))
-    return Edited(change_material(task.original, old, new))
+    return change_material(task.original, old, new)
 
 
-def guided(task: EditTask, *, parameters: str) -> Edited:
+def guided(task: EditTask, *, parameters: str) -> SoundField:
     """Edit towards the prompt or the reference, with the parameters of this name. Raises as `edit_towards`."""
     edits, field, prompt = task.edits, task.original, task.prompt
     guide: Guide | None = task.reference
@@ -266,7 +238,7 @@ def guided(task: EditTask, *, parameters: str) -> Edited:
     if edits.clap is not None and prompt is not None:
         config = replace(config, preview_every=edits.settings.guide.preview_every)
         score = edits.clap.of_previews(prompt, field.sample_rate)
-    return Edited(edit_towards(field, guide, config=config, parameters=PARAMETERIZATIONS[parameters], score=score))
+    return edit_towards(field, guide, config=config, parameters=PARAMETERIZATIONS[parameters], score=score)
 
 
 def generation(task: EditTask) -> Generated:
@@ -283,7 +255,7 @@ def generation(task: EditTask) -> Generated:
     recording = Recording(f"generated from {task.prompt!r}", made[None].numpy(), rate, "FLOAT")
     sound = torch.from_numpy(np.array(prepare(recording, CaptureSettings()).sound))
     modes = extract_sounds(sound[None], sample_rate=rate, method=edits.finder)
-    return Generated(audible_modes(modes.bank, modes.gains), sound.float(), rate)
+    return Generated(sound.float(), rate, audible_modes(modes.bank, modes.gains))
 
 
 def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = math.inf) -> ModalBank:
@@ -300,11 +272,16 @@ def audible_modes(bank: ModalBank, amplitudes: Tensor, *, sample_rate: float = m
 
 
 def score_edit(
-    edited: Edited | Generated, sounds: Sounds, contacts: Contacts, task: EditTask
+    edited: SoundField | Generated, sounds: Sounds, contacts: Contacts, task: EditTask
 ) -> tuple[dict[str, tuple[float | None, ...]], dict[str, float], dict[str, Any]]:
     """Return an edit's values for each sound, those of the whole, and what figures are drawn of, as plain values."""
     spaces, clap = task.edits.spaces, task.edits.clap
-    places = {name: space.place(edited.modes(contacts)) for name, space in spaces.items()}
+    if isinstance(edited, Generated):
+        modes, record = edited.bank, dict[str, Any]()
+    else:
+        modes = audible_modes(edited.bank, edited.complex_gains(contacts), sample_rate=edited.sample_rate)
+        record = edited.origin.report.get(EDITS, [{}])[-1]
+    places = {name: space.place(modes) for name, space in spaces.items()}
     figures = {name: space.distance(places[name], task.target) for name, space in spaces.items()}
     values: dict[str, tuple[float | None, ...]] = {}
     report: dict[str, Any] = {"source": task.source, "target": task.target, "prompt": task.prompt}
@@ -314,7 +291,6 @@ def score_edit(
         values["spectral"] = tuple(distance.tolist())
     if clap is not None and task.prompt is not None:
         values["clap"] = tuple(clap.score(sounds, [task.prompt], sample_rate=edited.sample_rate).tolist())
-        record = edited.field.origin.report.get(EDITS, [{}])[-1] if isinstance(edited, Edited) else {}
         if CLAP in record:
             report[CLAP] = list(zip(record[CLAP]["steps"], record[CLAP]["scores"], strict=True))
     return values, figures, report

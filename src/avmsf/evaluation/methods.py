@@ -25,6 +25,7 @@ from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_publis
 from avmsf.baselines.sonicgauss.small import SmallWeights, fit_small
 from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
+from avmsf.capture.filenames import files_in
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.evaluation.metrics import envelope_distance
@@ -180,8 +181,7 @@ class RecordedMethod:
     def digest(self, name: str) -> str:
         """Return a digest of an object's wavs, which decide its figures."""
         folder = self.path / name
-        wavs = (each for each in folder.rglob("*") if each.suffix.lower() == ".wav" and each.is_file())
-        return digest_files(wavs, root=folder)
+        return digest_files([each for each in files_in(folder) if each.suffix.lower() == ".wav"], root=folder)
 
     def fit(self, task: Task) -> "Recorded":
         """Find the object's folder. Raises EvaluationError where there is none."""

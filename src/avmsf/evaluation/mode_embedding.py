@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -27,8 +26,6 @@ _MIN_OBJECTS = 6
 """Objects that UMAP has anything to arrange of."""
 _NEIGHBORS, _MIN_DISTANCE = 8, 0.1
 """Objects that each one's place is decided by, and how close points may come; all else is umap-learn's default."""
-_PACKAGES = ("umap-learn", "numba", "numpy", "scipy", "scikit-learn", "avmsf")
-"""Those that an embedding depends on, down to its last digits."""
 
 
 def pitches(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
@@ -130,20 +127,11 @@ class MaterialSpace:
         """Return how far a place is from a material's center, in UMAP's units."""
         return float(np.linalg.norm(place - self.center(material)))
 
-    def nearest_neighbor_accuracy(self) -> float:
-        """Return the part of objects whose nearest other object, by the plain vectors, is of their own material."""
-        apart = np.linalg.norm(self.vectors[:, None] - self.vectors[None], axis=2)
-        np.fill_diagonal(apart, np.inf)
-        materials = np.array(self.materials)
-        return float((materials == materials[apart.argmin(axis=1)]).mean())
-
     def record(self) -> dict[str, Any]:
-        """Return all that the scores rest on, as JSON holds it: settings, versions, vectors and the embedding."""
+        """Return all that the scores rest on, as JSON holds it: settings, vectors and the embedding."""
         return {
             "features": self.features,
             "umap": {"neighbors": _NEIGHBORS, "min_distance": _MIN_DISTANCE, "seed": self.seed},
-            "versions": {name: version(name) for name in _PACKAGES},
-            "neighbor_accuracy": self.nearest_neighbor_accuracy(),
             "materials": list(self.materials),
             "names": list(self.names),
             "vectors": self.vectors.tolist(),

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -37,9 +36,6 @@ from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
 from avmsf.pipeline.stages import StageFolder
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate import recipe
-
-_NOISE_RATIO = 0.02
-"""Displacement of a noisy mesh's vertices over the object's size."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ class ObjectInputs:
         surface = self.dataset.capture(identifier).surface
         if surface is None or not len(surface.faces):
             raise SceneError.expected("a mesh in the dataset", name=identifier, advice="take geometry from Gaussians")
-        return surface if self.geometry == "mesh" else roughened(surface, _NOISE_RATIO, seed=0)
+        return surface
 
     @property
     def _best_views(self) -> SceneConfig:
@@ -139,17 +135,6 @@ class ObjectInputs:
         )
         with stages.folder.lock("avmsf evaluate", wait=NO_LIMIT):
             yield stages
-
-
-def roughened(surface: Surface, part: float, *, seed: int) -> Surface:
-    """Return a surface whose vertices are displaced at random, by `part` of its size (standard deviation, each axis).
-
-    The size is the diagonal of the box around it: what a bad scan does to a shape.
-    """
-    generator = np.random.default_rng(seed)
-    size = float((surface.vertices.amax(0) - surface.vertices.amin(0)).norm())
-    moved = surface.vertices.double().numpy() + part * size * generator.standard_normal(surface.vertices.shape)
-    return Surface(torch.from_numpy(moved).to(surface.vertices.dtype), surface.faces)
 
 
 def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, seed: int) -> Float[Tensor, " samples"]:

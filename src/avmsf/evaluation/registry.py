@@ -358,8 +358,7 @@ class EvaluationSettings:
     """What methods share."""
 
     geometry: Geometry = "mesh"
-    """Shape that finite elements use. mesh: the object's mesh. gaussians: the surface of Gaussians fitted to its views.
-    noisy: its mesh with vertices displaced by 2 % of its size."""
+    """Shape that finite elements use: the object's mesh, or the surface of Gaussians fitted to its views."""
     amplitude_scale: AmplitudeScale = "full-scale"
     """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
     values of different objects can be averaged. raw: in the recordings' unit."""

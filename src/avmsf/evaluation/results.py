@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -134,10 +135,12 @@ class ResultsFolder:
         known = self.identity() if path.exists() else {**wanted, "methods": {}}
         stored = known.pop("methods")
         shared = {name: dict(methods[name]) for name in methods if name in stored}
-        asked, found = {**wanted, "methods": shared}, {**known, "methods": {name: stored[name] for name in shared}}
-        if asked != found:
-            name, ours, theirs = _first_difference(asked, found)
-            made, got = f"results of {name} {_brief(ours)}", _brief(theirs)
+        asked = _flat({**wanted, "methods": shared})
+        found = _flat({**known, "methods": {name: stored[name] for name in shared}})
+        name = next((each for each in (*asked, *found) if asked.get(each) != found.get(each)), None)
+        if name is not None:
+            theirs = found.get(name)
+            made, got = f"results of {name} {_brief(asked.get(name))}", _brief(theirs)
             if name == "source":
                 made, got = "results made by this version of avmsf", "those of another, whose code differs"
             advice = "give the same options, or choose another --output"
@@ -243,14 +246,12 @@ def natural(name: str) -> list[tuple[bool, int, str]]:
     return [(not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
 
 
-def _first_difference(wanted: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[str, Any, Any]:
-    """Return the first setting in which two sets of nested ones differ, as `outer.inner`, and its two values."""
-    name = next(key for key in (*wanted, *found) if wanted.get(key) != found.get(key))
-    ours, theirs = wanted.get(name), found.get(name)
-    if not (isinstance(ours, Mapping) and isinstance(theirs, Mapping)):
-        return name, ours, theirs
-    inner, ours, theirs = _first_difference(ours, theirs)
-    return f"{name}.{inner}", ours, theirs
+def _flat(values: Any, name: str = "") -> dict[str, Any]:
+    """Return nested settings by names such as `outer.inner`."""
+    if not isinstance(values, Mapping):
+        return {name: values}
+    parts = (_flat(each, f"{name}.{key}" if name else key) for key, each in values.items())
+    return dict(chain.from_iterable(part.items() for part in parts))
 
 
 def _brief(value: object) -> str:

@@ -18,7 +18,7 @@ from avmsf._utils.device import one_thread
 from avmsf._utils.parallel import run_tasks, workers_at
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, EvaluationError, WorkerError
-from avmsf.evaluation.editing import Edited, EditTask, Generated, score_edit
+from avmsf.evaluation.editing import EditTask, Generated, score_edit
 from avmsf.evaluation.localization import located, write_map
 from avmsf.evaluation.methods import FieldMethod, RecordedMethod, method_named
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
@@ -133,7 +133,7 @@ class CaseRun:
             render_seconds = time.perf_counter() - begun
             maps, report = dict[str, str](), report_of(renderer)
             figures: Mapping[str, float | None] = {}
-            if isinstance(task, EditTask) and isinstance(renderer, Edited | Generated):
+            if isinstance(task, EditTask) and isinstance(renderer, SoundField | Generated):
                 values, figures, report = score_edit(renderer, sounds, recordings.test.contacts, task)
             elif self.evaluation.protocol.scoring == "contacts":
                 values, maps = self._located(method.name, recordings, renderer, published)

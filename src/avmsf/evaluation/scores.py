@@ -14,7 +14,7 @@ from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf._utils.text import counted
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError, FitError, PositionWarning
+from avmsf.errors import EvaluationError, PositionWarning
 from avmsf.evaluation.cdpam import Cdpam
 from avmsf.evaluation.metrics import PerContact, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
@@ -118,18 +118,7 @@ def _made(make: Any, train: Impacts) -> Any:
         wanted, kind = "a class or function that makes a renderer of the training recordings", type(make).__name__
         advice = "leave out `train`, or give the class"
         raise EvaluationError.expected(wanted, kind, got=f"an object of {kind}", name="renderer", advice=advice)
-    try:
-        return make(train)
-    except FitError as error:
-        if error.name != "capture":
-            raise
-        raise EvaluationError.expected(
-            "a renderer made of recordings alone",
-            "SoundField",
-            got="a SoundField, whose fit needs the shape in a Capture",
-            name="renderer",
-            advice="give avmsf.fit(train), without `train`: it aligns the test recordings itself",
-        ) from error
+    return make(train)
 
 
 def score(sounds: ArrayLike, impacts: Impacts) -> Scores:

@@ -1,8 +1,6 @@
-"""Baselines made of the training recordings, and what an object's modes alone reach.
+"""Baselines made of the training recordings.
 
-Each baseline is a `Renderer`; nearest is by Euclidean distance, and of equally near contacts the first. What modes
-alone reach is computed from the test sounds, with the best gains and without noise. A field with noise can have less
-error in a spectrum.
+Each is a `Renderer`; nearest is by Euclidean distance, and of equally near contacts the first.
 """
 
 import zlib
@@ -25,7 +23,6 @@ from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites
 from avmsf.mesh.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import shape_noise
 from avmsf.modal.synthesis import synthesize
@@ -185,26 +182,16 @@ class MeanGains(_Neighbors, ModalBaseline):
 
 @dataclass(frozen=True, eq=False)
 class RandomImpact:
-    """One recording of another object, the same at every contact: what a listener makes of any struck thing."""
+    """One sound, such as a recording of another object, the same at every contact."""
 
     sound: Float[Tensor, " samples"]
-    """The other object's recording, in its own unit, as long as the sounds that it is compared with."""
+    """In its own unit, as long as the sounds that it is compared with."""
     sample_rate: float
     """Samples per second, Hz."""
 
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
-        """Return the recording for every contact."""
+        """Return the sound for every contact."""
         return self.sound.expand(len(contacts), -1)
-
-
-def floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:
-    """Return the test sounds as `bank` expresses them best: their own complex gains.
-
-    No gains that are predicted for the same modes come nearer in the squared error of the waveform.
-    """
-    rate, samples = test.sample_rate, test.sounds.shape[1]
-    gains = fit_gains(test.sounds, bank, sample_rate=rate)
-    return synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from avmsf.modal.config import ExtractionMethod
 
 Preset = Literal["default", "paper"]
 TimeZero = Literal["onset", "peak"]
-Geometry = Literal["mesh", "gaussians", "noisy"]
+Geometry = Literal["mesh", "gaussians"]
 DINO = "facebook/dinov2-base"
 DESCRIPTORS = "descriptors"
 AUTO = "auto"
