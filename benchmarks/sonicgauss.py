@@ -1,4 +1,7 @@
-"""The small SonicGauss: its training from scratch, by one command, on simulated objects, none of which is in sim-20."""
+"""The small SonicGauss: its training from scratch, by one command, on simulated objects, none of which is in sim-20.
+
+`python -m benchmarks.sonicgauss evaluate ...` is `avmsf evaluate ...` with the method `sonicgauss-small:FILE`.
+"""
 
 import sys
 import time
@@ -7,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from avmsf.baselines.sonicgauss.small import SmallConfig, object_tokens, train_small, visible
 from avmsf.baselines.sonicgauss.training import TrainingConfig
 from avmsf.capture.impacts import Impacts
+from avmsf.cli import main
 from avmsf.errors import EvaluationError, SceneError, SimulationError
 from avmsf.fem.material import MATERIALS
 from avmsf.gaussians.cloud import GaussianCloud
@@ -20,6 +23,7 @@ from avmsf.simulate.recipe import SIM20, ObjectRecipe
 from avmsf.simulate.shapes.catalog import KINDS
 from avmsf.simulate.simulation import simulate_object
 from benchmarks.records import MissingDataError, Record, Settings, records
+from benchmarks.small_sonicgauss import SmallConfig, object_tokens, train_small, visible
 
 OBJECTS = 40
 """Simulated objects, 32 recordings each."""
@@ -86,3 +90,7 @@ def training(settings: Settings) -> Iterator[Record]:
     for number, loss in enumerate(losses, 1):
         yield from records({"loss": loss}, group=f"{number / len(losses):.0%} of the steps")
     yield from records({"objects_seconds": made, "training_seconds": trained})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,48 +1,17 @@
-"""SonicGauss: what flow, conditioning, patches and points must obey, and the small generator as a whole."""
+"""SonicGauss: what flow and conditioning must obey."""
 
 import math
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 
 import pytest
 import torch
 
-from avmsf.baselines.sonicgauss import small
-from avmsf.baselines.sonicgauss.conditioning import ContactEncoding, Fusion, degree_one, first_nine, normalized
-from avmsf.baselines.sonicgauss.small import (
-    FFT,
-    HOP,
-    LATENTS,
-    PATCHES,
-    RATE,
-    PatchCodec,
-    SmallConfig,
-    SmallWeights,
-    fit_small,
-    log_magnitudes,
-    sounds_of,
-    spectra,
-    train_small,
-)
-from avmsf.baselines.sonicgauss.training import TrainingConfig, TunedRenderer, draw_times, flow_loss, integrate, train
+from avmsf.baselines.sonicgauss.conditioning import ContactEncoding, Fusion, first_nine, normalized
+from avmsf.baselines.sonicgauss.training import TrainingConfig, draw_times, flow_loss, integrate, train
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.methods import method_named
-from factories.clouds import SECONDS, cloud, impacts
+from factories.clouds import cloud
 from factories.raising import raises
-
-TINY = SmallConfig(width=16, heads=2, blocks=1, encoder_blocks=1, tokens=4), TrainingConfig(4, batch=4, rate=1e-3)
-
-
-@cache
-def weights(seed: int = 0) -> SmallWeights:
-    objects = [(cloud(seed=row), impacts(seed=row)) for row in range(2)]
-    return train_small(objects, *TINY, seed=seed)
-
-
-def tuned(level: float = 1.0, seed: int = 0) -> TunedRenderer:
-    config = TrainingConfig(steps=3, batch=4, rate=1e-3)
-    return replace(fit_small(weights(), cloud(), impacts(level=level), config, seed=seed), steps=2)
 
 
 def test_straight_paths_arrive_exactly_whatever_the_steps():
@@ -105,7 +74,7 @@ def test_times_have_the_published_distribution():
 def test_channels_do_not_change_where_the_object_lies_or_how_large_it_is():
     one = cloud(degree=2)
     other = replace(one, centers=3.0 * one.centers + 0.7, log_scales=one.log_scales + math.log(3.0))
-    here, there = (normalized(each, degree_one(each)) for each in (one, other))
+    here, there = (normalized(each, first_nine(each)) for each in (one, other))
     torch.testing.assert_close(here.features, there.features, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(
         here.places(one.centers.double()), there.places(other.centers.double()), rtol=1e-4, atol=1e-4
@@ -118,11 +87,11 @@ def test_channels_do_not_change_where_the_object_lies_or_how_large_it_is():
 def test_faint_gaussians_are_left_out_and_none_is_an_error():
     one = cloud(20)
     opacities = torch.where(torch.arange(20) < 5, 0.01, 0.5)
-    assert len(normalized(replace(one, logit_opacities=opacities), degree_one(one)).centers) == 15
+    assert len(normalized(replace(one, logit_opacities=opacities), first_nine(one)).centers) == 15
     with raises(EvaluationError, name="opacity", value=20):
-        normalized(replace(one, logit_opacities=torch.zeros(20)), degree_one(one))
+        normalized(replace(one, logit_opacities=torch.zeros(20)), first_nine(one))
     with raises(EvaluationError, name="centers", value=20):
-        normalized(replace(one, centers=torch.zeros(20, 3)), degree_one(one))
+        normalized(replace(one, centers=torch.zeros(20, 3)), first_nine(one))
 
 
 def test_the_published_rest_is_the_first_nine_of_a_file_of_degree_three():
@@ -130,7 +99,6 @@ def test_the_published_rest_is_the_first_nine_of_a_file_of_degree_three():
     # A file holds all 15 of red, then green, then blue.
     in_file = torch.cat([one.harmonics[:, 1:, color] for color in range(3)], dim=1)
     torch.testing.assert_close(first_nine(one), in_file[:, :9])
-    torch.testing.assert_close(degree_one(one), one.harmonics[:, 1:4].reshape(3, 9))
     assert bool((first_nine(cloud(3, degree=0)) == 0).all())
 
 
@@ -160,34 +128,6 @@ def test_fusion_keeps_the_objects_tokens_and_adds_those_of_the_contact():
     torch.testing.assert_close(added, added[:, :1].expand_as(added), rtol=1e-4, atol=1e-5)
 
 
-def test_patches_with_all_components_lose_nothing():
-    logs = log_magnitudes(spectra(impacts().sounds, 24_000.0), 100.0)
-    # As many sounds' patches as components, and fewer: they span no more than the codec keeps.
-    few = logs[:1, : PATCHES * 16]
-    few = torch.cat([few[:, :400], few[:, :1].expand(-1, 624, -1)], dim=1)
-    codec = PatchCodec.of([few], seed=0)
-    latents = codec.encode(few)
-    assert latents.shape == (1, PATCHES, LATENTS)
-    torch.testing.assert_close(codec.decode(latents), few, rtol=0, atol=1e-3)
-
-
-def test_true_magnitudes_and_phases_give_back_the_sound():
-    sounds = impacts().sounds
-    found = spectra(sounds, 24_000.0)
-    again = sounds_of(found.abs()[:1], found[0].angle(), sample_rate=24_000.0, samples=sounds.shape[1])
-    error = (again[0] - sounds[0]).square().mean().sqrt() / sounds[0].square().mean().sqrt()
-    # The two resamplings round the highest frequencies off.
-    assert float(error) < 0.05
-
-
-def test_spectra_are_of_two_seconds_at_the_rate_of_the_latents():
-    tone = torch.sin(2.0 * math.pi * 1000.0 * torch.arange(24_000) / 24_000.0)[None]
-    found = spectra(tone, 24_000.0).abs()
-    assert found.shape == (1, 1024, 126)
-    assert int(found[0, :, 20].argmax()) == round(1000.0 * FFT / RATE)
-    assert float(found[0, :, round(1.5 * RATE / HOP)].max()) < 1e-3
-
-
 def test_training_lowers_the_loss_and_a_seed_decides_it():
     def run(seed: int) -> tuple[list[float], torch.Tensor]:
         weight = torch.nn.Parameter(torch.zeros(3))
@@ -206,72 +146,3 @@ def test_training_lowers_the_loss_and_a_seed_decides_it():
     assert again[0] == losses
     assert torch.equal(again[1], found)
     assert run(1)[0] != losses
-
-
-def test_weights_come_back_from_their_file(tmp_path):
-    path = tmp_path / "small.safetensors"
-    weights().write(path)
-    again = SmallWeights.read(path)
-    assert again.report == weights().report
-    latents, times, tokens = torch.randn(2, PATCHES, LATENTS), torch.rand(2), torch.randn(2, 8, 16)
-    assert torch.equal(again.network(latents, times, tokens), weights().network(latents, times, tokens))
-    assert torch.equal(again.codec.decode(latents), weights().codec.decode(latents))
-
-
-def test_a_file_of_other_weights_is_refused_by_the_tensors_name(tmp_path):
-    path, (lacking, other) = tmp_path / "small.safetensors", (weights.__wrapped__() for _ in range(2))
-    del lacking.network.pooled
-    other.network.position = torch.nn.Parameter(torch.zeros(3, 16))
-    for made, name in ((lacking, "network.pooled.0.weight"), (other, "network.position")):
-        made.write(path)
-        with raises(EvaluationError, file=path) as caught:
-            SmallWeights.read(path)
-        assert name in str(caught.value)
-
-
-def test_the_contact_and_the_object_change_the_velocity_and_the_order_of_tokens_does_not():
-    network = weights.__wrapped__().network.requires_grad_(False)
-    # Gates, zero at the start of training, are open.
-    for layer in (network.output, network.modulation, *(block.modulation for block in network.blocks)):
-        torch.nn.init.normal_(layer.weight, generator=torch.Generator().manual_seed(0))
-    latents, times = torch.randn(1, PATCHES, LATENTS), torch.tensor([0.5])
-    features, place = torch.randn(1, 4, 23), torch.rand(1, 3)
-    base = network(latents, times, network.condition(features, place))
-    for other in (network.condition(features, place + 0.2), network.condition(features + 0.5, place)):
-        difference = network(latents, times, other) - base
-        assert float(difference.abs().max()) > 1e-3 * float(base.abs().max())
-    turned = network(latents, times, network.condition(features[:, [2, 0, 3, 1]], place))
-    torch.testing.assert_close(turned, base, rtol=0, atol=1e-4 * float(base.abs().max()))
-
-
-def test_a_sound_depends_on_its_contact_the_seed_and_the_level_alone(monkeypatch):
-    monkeypatch.setattr(small, "_ITERATIONS", 1)
-    renderer = tuned()
-    contacts = impacts(2, seed=3).contacts
-    together = renderer.render(contacts)
-    assert together.shape == (2, round(SECONDS * 24_000))
-    assert bool(torch.isfinite(together).all())
-    assert torch.equal(renderer.render(contacts[1:])[0], together[1])
-    assert torch.equal(tuned().render(contacts), together)
-    assert not torch.equal(tuned(seed=1).render(contacts), together)
-    assert renderer.render(contacts[:0]).shape == (0, together.shape[1])
-    loud = tuned(level=1000.0).render(contacts)
-    torch.testing.assert_close(loud, 1000.0 * together, rtol=0, atol=1e-2 * float(loud.abs().max()))
-
-
-def test_silence_is_refused():
-    with raises(EvaluationError, name="sounds", value=0.0):
-        fit_small(weights(), cloud(), replace(impacts(), sounds=torch.zeros(6, 12_000)))
-
-
-def test_the_method_names_the_command_where_there_are_no_weights(tmp_path):
-    for name in ("sonicgauss-small", "sonicgauss-small:", f"sonicgauss-small:{tmp_path / 'none'}"):
-        with raises(EvaluationError, name="method", value=name) as caught:
-            method_named(name)
-        assert "sonicgauss-training" in str(caught.value)
-    other = tmp_path / "other.safetensors"
-    other.write_bytes(b"something else")
-    method = method_named(f"sonicgauss-small:{other}")
-    assert method.name == f"sonicgauss-small:{other}"
-    weights().write(other)
-    assert repr(method_named(method.name)) != repr(method)

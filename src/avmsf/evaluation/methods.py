@@ -22,7 +22,6 @@ from avmsf._utils.device import usable_device
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
 from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published, folder_digest
-from avmsf.baselines.sonicgauss.small import SmallWeights, fit_small
 from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.capture.filenames import files_in
@@ -90,7 +89,7 @@ def method_named(name: str) -> Method:
     if entry.path:
         given = name.partition(":")[2]
         path = Path(given).expanduser()
-        if not given or not (path.is_dir() if entry.is_folder else path.is_file()):
+        if not given or not path.exists():
             wanted = f"{entry.path} after `{kind_of(name)}:`"
             raise EvaluationError.expected(wanted, name, file=path if given else None, name="method")
         # However it is written: results of one path are those of one method.
@@ -99,7 +98,7 @@ def method_named(name: str) -> Method:
         made: Method = resolve(entry.make)(name, **entry.settings, **settings)
         return made
     if entry.path:
-        weights = folder_digest(path) if entry.is_folder else digest_of(path)[:16]
+        weights = folder_digest(path) if path.is_dir() else digest_of(path)[:16]
     return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings, **settings), weights, entry.visual_input)
 
 
@@ -162,11 +161,6 @@ def sonicgauss(task: Task, *, path: Path) -> TunedRenderer:
     """Fine-tune the published architecture and weights in a folder, on CUDA where there is a GPU."""
     model = PublishedSonicGauss.load(path).to(usable_device(task.device, raising=EvaluationError))
     return fit_published(model, task.gaussians(), task.train, seed=task.seed)
-
-
-def sonicgauss_small(task: Task, *, path: Path) -> TunedRenderer:
-    """Fine-tune the small generator of a file, trained from scratch on simulated objects."""
-    return fit_small(SmallWeights.read(path), task.gaussians(), task.train, seed=task.seed)
 
 
 @dataclass(frozen=True)

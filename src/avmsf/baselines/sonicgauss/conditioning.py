@@ -69,12 +69,6 @@ def normalized(cloud: GaussianCloud, rest: Float[Tensor, "points 9"]) -> Normali
     return Normalized(centers, torch.cat(parts, dim=1).float(), 1.0 / extent, shift)
 
 
-def degree_one(cloud: GaussianCloud) -> Float[Tensor, "points 9"]:
-    """Return the three coefficients of degree 1 of red, green and blue; zeros where the cloud has none."""
-    rest = cloud.harmonics[:, 1:4]
-    return torch.nn.functional.pad(rest, (0, 0, 0, 3 - rest.shape[1])).flatten(1)
-
-
 def first_nine(cloud: GaussianCloud) -> Float[Tensor, "points 9"]:
     """Return what the published program takes for degree 1: the first nine of a file's 45 coefficients, all of red.
 

@@ -214,7 +214,7 @@ def _load(part: nn.Module, path: Path) -> None:
 
 
 def _diffusers() -> tuple[Any, Any]:
-    with from_extra("text", "diffusers", raising=EvaluationError, instead="take sonicgauss-small"):
+    with from_extra("text", "diffusers", raising=EvaluationError):
         from diffusers import AutoencoderOobleck, FluxTransformer2DModel
     return AutoencoderOobleck, FluxTransformer2DModel
 

@@ -2,7 +2,8 @@
 
 It generates latents of log spectrograms: patches of 16 bins (250 Hz) over all of 2 s at 32 kHz, 64 of which reach
 16 kHz, by principal components. Decays are smooth and lines sharp, so that few components of a patch keep both. Phases
-are found by Griffin and Lim's algorithm.
+are found by Griffin and Lim's algorithm. Importing this module adds the method `sonicgauss-small:FILE` to those of
+`avmsf evaluate`.
 """
 
 import copy
@@ -20,14 +21,7 @@ from torch import Tensor, nn
 from avmsf._utils.headers import FileKind
 from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf._utils.text import record_of
-from avmsf.baselines.sonicgauss.conditioning import (
-    CHANNELS,
-    ContactEncoding,
-    Fusion,
-    Normalized,
-    degree_one,
-    normalized,
-)
+from avmsf.baselines.sonicgauss.conditioning import CHANNELS, ContactEncoding, Fusion, Normalized, normalized
 from avmsf.baselines.sonicgauss.training import (
     DROPPED,
     Loss,
@@ -42,6 +36,8 @@ from avmsf.baselines.sonicgauss.training import (
 )
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.registry import METHODS, MethodEntry
+from avmsf.evaluation.task import Task
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.mesh.points import farthest_points
 from avmsf.modal.clips import resampled, with_length
@@ -287,8 +283,12 @@ def _together(network: SmallSonicGauss, codec: PatchCodec) -> nn.ModuleDict:
 
 
 def visible(cloud: GaussianCloud) -> Normalized:
-    """Return an object's Gaussians in its unit cube. Raises EvaluationError where nothing can be seen of it."""
-    return normalized(cloud, degree_one(cloud))
+    """Return an object's Gaussians in its unit cube, with the coefficients of degree 1 of red, green and blue.
+
+    Coefficients are zeros where the cloud has none. Raises EvaluationError where nothing can be seen of the object.
+    """
+    rest = cloud.harmonics[:, 1:4]
+    return normalized(cloud, torch.nn.functional.pad(rest, (0, 0, 0, 3 - rest.shape[1])).flatten(1))
 
 
 def object_tokens(found: Normalized, *, count: int) -> Float[Tensor, "tokens 23"]:
@@ -377,3 +377,15 @@ def fit_small(
 
     loss = clip_loss(network.train(), features, owners, seen.places(recordings.contacts), latents)
     return tune(network, network.parameters(), loss, recordings, config, seed=seed, seen=seen, generate=generate)
+
+
+def fit_task(task: Task, *, path: Path) -> TunedRenderer:
+    """Fine-tune the generator of a file: the method `sonicgauss-small:FILE` of `avmsf evaluate`."""
+    return fit_small(SmallWeights.read(path), task.gaussians(), task.train, seed=task.seed)
+
+
+METHODS["sonicgauss-small"] = MethodEntry(
+    "SonicGauss's objective at a small size, trained from scratch on simulated objects",
+    fit_task,
+    path=f"a file, which {COMMAND} makes",
+)
