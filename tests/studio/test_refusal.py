@@ -5,7 +5,6 @@ import errno
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -122,15 +121,6 @@ def test_a_capture_folder_that_is_gone_is_said_to_be(capture: Served, tmp_path: 
 def test_a_body_that_is_no_request_is_refused(plate: Served, place: str, body: bytes) -> None:
     refused(plate.ask("POST", place, body), 400, 409)
     assert plate.manifest()["live"]["revision"] == 1
-
-
-@pytest.mark.parametrize("words", [{"prompt": "w" * 500_000}, {"prompt": " "}, {"prompt": "wood", "pitch": 2.0}])
-def test_a_prompt_is_short_and_alone(plate: Served, words: dict[str, Any]) -> None:
-    plate.studio.model = "a model"
-    try:
-        refused(plate.ask("POST", "edit", {"base": 1, **words}), 400)
-    finally:
-        plate.studio.model = None
 
 
 def test_the_body_of_an_edit_is_bounded(plate: Served) -> None:

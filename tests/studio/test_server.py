@@ -134,15 +134,7 @@ def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served)
     assert found["position"] == pytest.approx(points[33].tolist(), abs=1e-7)
 
 
-def test_words_need_their_model(plate: Served) -> None:
-    assert "words" not in plate.manifest()["live"]["abilities"]
-    answer = plate.ask("POST", "edit", {"base": 1, "prompt": "a wooden bowl is hit"})
-    assert answer.status == 422
-    assert "pip install 'avmsf[text]'" in answer.words["error"]
-
-
 def test_a_descent_is_asked_for_alone(plate: Served) -> None:
-    assert plate.ask("POST", "edit", {"base": 1, "prompt": "wood", "pitch": 2.0}).status == 400
     for query in ("", "?base=", "?base=-1", "?base=²", "?base=1e3", f"?base={'9' * 5000}"):
         assert plate.ask("POST", f"lead{quote(query, safe='?=')}", blow()).status == 400
     assert plate.ask("POST", "lead?base=7", blow()).status == 409

@@ -41,8 +41,6 @@ class Options(Common):
     any free one if that is taken."""
     no_browser: Flag = False
     """Do not open the browser."""
-    model: Annotated[str | None, arg("FOLDER|NAME")] = None
-    """Stable Audio pipeline for edits by text: a folder, or its name on the hub; needs the extra `text`."""
     modes: int = 128
     """Maximum number of modes of a reconstruction."""
     preset: Preset = "default"
@@ -74,7 +72,7 @@ def run(options: Options) -> int:
         port=options.port,
         browser=not options.no_browser,
         log=_print,
-        config=StudioConfig(options.model, options.modes, preset=options.preset),
+        config=StudioConfig(options.modes, preset=options.preset),
     )
     say("closed")
     if computing:

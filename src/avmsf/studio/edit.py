@@ -4,12 +4,10 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from importlib.util import find_spec
 from typing import Any
 
 import torch
 
-from avmsf.editing.config import STABLE_AUDIO
 from avmsf.editing.material import edit, infer_material
 from avmsf.editing.modal_edit import EDITS, remarks
 from avmsf.errors import EditError
@@ -37,8 +35,6 @@ _MAX_ROW = 1 << 31
 """Rows of a field's bank: far more than any has, and few enough digits to repeat."""
 _MAX_NAME = 100
 """Characters of a material's name."""
-_MAX_PROMPT = 2000
-"""Characters, several paragraphs: a description of a sound is a sentence."""
 MUTE = -math.inf
 """Decibels that a mode is muted by; in JSON, where there are no such numbers, null."""
 
@@ -135,31 +131,6 @@ class Sliders:
 
 REST = Sliders()
 """Sliders that change nothing."""
-
-
-def read_prompt(request: Mapping[str, Any], *, model: str | None) -> str:
-    """Return the text of a guided edit. Raises RequestError (400), and EditError without a `model`."""
-    unknown = sorted(set(request) - {"base", "prompt"})
-    if unknown:
-        raise bad_request("prompt", "only base, prompt", unknown, advice="set the sliders before or after")
-    if model is None:
-        advice = "pip install 'avmsf[text]' and start avmsf studio with --model FOLDER"
-        raise EditError.expected("the extra and the model for edits by text", name="model", advice=advice)
-    prompt = request.get("prompt")
-    if not isinstance(prompt, str) or not prompt.strip() or len(prompt) > _MAX_PROMPT:
-        raise bad_request("prompt", f'1 to {_MAX_PROMPT} characters, such as "a wooden bowl is hit"', prompt)
-    return prompt
-
-
-def text_model(given: str | None) -> str | None:
-    """Return the model for text edits: the given one, or that in the hub's cache; None if there is none."""
-    if any(find_spec(name) is None for name in ("diffusers", "torchsde", "transformers")):
-        return None
-    if given is not None:
-        return given
-    from huggingface_hub import try_to_load_from_cache
-
-    return STABLE_AUDIO if isinstance(try_to_load_from_cache(STABLE_AUDIO, "model_index.json"), str) else None
 
 
 def _check_keys(values: Any, known: tuple[str, ...], what: str) -> None:

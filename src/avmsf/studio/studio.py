@@ -13,7 +13,7 @@ from avmsf.fem.material import MATERIALS
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import CaptureEditor, read_upload
-from avmsf.studio.edit import OLD_MATERIAL, Sliders, read_prompt, text_model
+from avmsf.studio.edit import OLD_MATERIAL, Sliders
 from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Event, Jobs, Result, Threads
 from avmsf.studio.locate import Searches
@@ -26,12 +26,10 @@ from avmsf.studio.session import Revision, Session
 class StudioConfig:
     """Options of the page other than what is opened."""
 
-    model: str | None = None
-    """Folder or name of a Stable Audio pipeline for text edits; by default that in the hub's cache."""
     modes: int = 128
     """Maximum number of modes of a reconstruction."""
     steps: int = 150
-    """Steps towards a recording or a text: half of the command line's, after which little changes."""
+    """Steps towards a recording: half of the command line's, after which little changes."""
     preset: Preset = "default"
     """Settings of a reconstruction."""
 
@@ -47,7 +45,6 @@ class Studio:
         self.showcase = Showcase(opened, self.editor)
         self.session = Session(opened.home, self.showcase.show)
         self.jobs = Jobs()
-        self.model = text_model(self.config.model)
         self.threads = Threads()
         self.searches = Searches(self.session, self.showcase, self.editor, self.threads)
         self.session.open(None if opened.field is None else load(opened.field))
@@ -71,11 +68,8 @@ class Studio:
         return {"revision": revision.number, "impacts": impacts}
 
     async def edit(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Set the sliders, or start to optimize the field towards a text. Raises the errors of edits."""
+        """Set the sliders. Raises the errors of edits."""
         base = base_of(request)
-        if request.get("prompt") is not None:
-            prompt = read_prompt(request, model=self.model)
-            return await self._lead(base, {"prompt": prompt, "model": self.model})
         sliders = Sliders.read(request, modes=len(self.session.current.require_field().bank))
         return self._changed(await self._compute(self.session.edit, base, sliders))
 
@@ -83,7 +77,16 @@ class Studio:
         """Start to optimize the field towards a recording. Raises CaptureError for one that cannot be used."""
         base = base_of(request)
         await self.threads.run("read", read_upload, content)
-        return await self._lead(base, {}, recording=content)
+        self.session.check_current(base)
+        field = self.session.current.require_field()
+        self.jobs.check_idle()
+        folder = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
+        (folder / "like.wav").write_bytes(content)
+        await self.threads.run("compute", save, field, folder / "field")
+        files = {"field": "field", "recording": "like.wav", "output": "led"}
+        task = {name: str(folder / file) for name, file in files.items()}
+        task |= {"task": "lead", "steps": self.config.steps}
+        return {"job": self.jobs.start("the guided edit", task, partial(self._take_led, base)).identifier}
 
     async def undo(self, request: dict[str, Any]) -> dict[str, Any]:
         """Go back by one revision."""
@@ -132,21 +135,6 @@ class Studio:
         task = {"task": "make_object", "folder": str(self.require_editor().folder)}
         return {"job": self.jobs.start("the reconstruction from the images", task, self._take_object).identifier}
 
-    async def _lead(self, base: int, target: Event, *, recording: bytes | None = None) -> dict[str, Any]:
-        """Start to optimize the field towards the recording, or the prompt in `target`."""
-        self.session.check_current(base)
-        field = self.session.current.require_field()
-        self.jobs.check_idle()
-        folder = Path(tempfile.mkdtemp(prefix="lead-", dir=self.folder))
-        task = {"task": "lead", "field": str(folder / "field"), "output": str(folder / "led"), **target}
-        if recording is not None:
-            (folder / "like.wav").write_bytes(recording)
-            task["recording"] = str(folder / "like.wav")
-        await self.threads.run("compute", save, field, folder / "field")
-        take = partial(self._take_led, base)
-        task |= {"steps": self.config.steps}
-        return {"job": self.jobs.start("the guided edit", task, take).identifier}
-
     async def _compute(self, act: Callable[..., Result], *arguments: Any) -> Result:
         """Compute with a user's values. Raises RequestError (422) if they give no result."""
         try:
@@ -186,7 +174,7 @@ class Studio:
         shown, running, abilities = self.showcase.current, self.jobs.current, list[str]()
         revision, field = shown.revision, shown.revision.field
         if field is not None:
-            abilities += ["locate", "edit", "save", "like", *(["words"] if self.model is not None else [])]
+            abilities += ["locate", "edit", "save", "like"]
         if self.editor is not None:
             abilities += ["capture", "reconstruct"]
         live = {

@@ -23,10 +23,8 @@ from avmsf._utils.progress import ProgressListener
 from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
 from avmsf.editing.config import GuidedEditConfig
-from avmsf.editing.distillation import DecoderDistillation
-from avmsf.editing.guided import Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.guided import GuidedEditProgress, edit_towards
 from avmsf.editing.reference import Reference
-from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import NO_MEMORY, AvmsfError, CaptureWarning, lacks_memory
 from avmsf.field.store import load, save
 from avmsf.pipeline.config import CACHE, PRESETS, SceneConfig
@@ -98,15 +96,9 @@ def make_object(task: Values, events: EventWriter) -> Values:
 
 
 def lead(task: Values, events: EventWriter) -> Values:
-    """Optimize a field towards a recording or a text, and return the file of the edited one."""
+    """Optimize a field towards a recording, and return the file of the edited one."""
     field = load(task["field"])
-    guide: Guide
-    if "recording" in task:
-        guide = Reference.read(task["recording"], sample_rate=field.sample_rate)
-    else:
-        events.log("model: loading")
-        model = StableAudio.load(task["model"])
-        guide = DecoderDistillation(model, task["prompt"], sample_rate=field.sample_rate)
+    guide = Reference.read(task["recording"], sample_rate=field.sample_rate)
     config = GuidedEditConfig(steps=int(task["steps"]), preview_every=0)
     save(edit_towards(field, guide, config=config, progress=events.guided_edit), task["output"])
     return {"output": task["output"]}

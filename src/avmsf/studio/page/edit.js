@@ -143,7 +143,7 @@ export function editTab(studio, load) {
   return { element: sheet };
 }
 
-/** Optimize the sound towards a recording or a text: minutes of work, during which the sliders rest. */
+/** Optimize the sound towards a recording: minutes of work, during which the sliders rest. */
 function guidedEdit(studio, changes, hold) {
   const progress = new JobProgress();
   const start = (ask) =>
@@ -168,16 +168,10 @@ function guidedEdit(studio, changes, hold) {
   };
 
   const byRecording = (file) => start(() => server.guide(studio.revision, file));
-  const rows = [filePicker("Towards a recording …", ".wav,audio/wav", byRecording)];
-  if (studio.can("words")) {
-    const placeholder = "a wooden bowl is hit";
-    const text = element("input", { type: "text", "aria-label": "Description of the sound", placeholder });
-    const byText = () => start(() => server.edit(studio.revision, { prompt: text.value }));
-    rows.push(text, button("Towards this text", byText));
-  }
+  const picker = filePicker("Towards a recording …", ".wav,audio/wav", byRecording);
   // One that was running before the page was loaded goes on.
   if (studio.live.jobKind === "lead") hold(() => follow(studio.live.job));
-  return group(element("h2", {}, "Guided edit"), line(...rows, progress.stop), progress.bar, progress.stage);
+  return group(element("h2", {}, "Guided edit"), line(picker, progress.stop), progress.bar, progress.stage);
 }
 
 /** The result of an optimization's steps, {loss, pitch} each. */
