@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import trimesh
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -20,7 +19,7 @@ from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from avmsf.plotting.clouds import ALL_SIDES, AROUND, component_colors, draw_cloud, view_from
-from avmsf.plotting.contacts import contact_colors, draw_contact, write_contact_cloud
+from avmsf.plotting.contacts import contact_colors, draw_contact
 from avmsf.plotting.edits import draw_clap_curves
 from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
 from avmsf.plotting.spectrograms import draw_spectrograms, log_spectrogram
@@ -213,16 +212,6 @@ def test_colors_grow_with_probability() -> None:
     assert bool((brightness[order].diff() >= -1e-6).all())
     # Viridis begins with a dark purple.
     assert colors[int(brightness.argmin())].tolist() == pytest.approx([0.267, 0.005, 0.329], abs=1e-3)
-
-
-def test_a_cloud_holds_what_was_found(tmp_path: Path) -> None:
-    write_contact_cloud(contact(), tmp_path / "blow.ply")
-    read = trimesh.load(tmp_path / "blow.ply")
-    assert np.allclose(read.vertices, contact().points.numpy())
-    assert np.array_equal(read.colors[:, :3], (255 * contact_colors(contact())).round().numpy().astype(np.uint8))
-    columns = read.metadata["_ply_raw"]["vertex"]["data"]
-    assert np.allclose(columns["probability"], contact().probability.numpy())
-    assert np.allclose(columns["cosine_distance"], contact().distance.numpy(), atol=1e-6)
 
 
 def test_a_picture_shows_both_maps_and_the_marks(tmp_path: Path) -> None:

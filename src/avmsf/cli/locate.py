@@ -1,4 +1,4 @@
-"""`avmsf locate`: contacts of recorded impacts, as text, heat maps and point clouds."""
+"""`avmsf locate`: contacts of recorded impacts, as text and heat maps."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -58,7 +58,7 @@ class Options(Common):
     unit: Unit = "m"
     """Unit of the true contacts; the field is in meters."""
     output: PictureFolder = None
-    """Folder for a heat map and a point cloud of every impact, NAME.png and NAME.ply: most of many recordings' time."""
+    """Folder for a heat map of every impact, NAME.png: most of many recordings' time."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
@@ -258,15 +258,13 @@ def _draw(
 ) -> dict[str, str]:
     import torch
 
-    from avmsf.plotting.contacts import draw_contact, write_contact_cloud
+    from avmsf.plotting.contacts import draw_contact
     from avmsf.plotting.pictures import save_picture
 
-    picture, cloud = folder / f"{name}.png", folder / f"{name}.ply"
+    picture = folder / f"{name}.png"
     others = [other["position"] for other in values["equivalent_points"]]
     marks = torch.tensor(others) if others else None
     title = f"{values['recording']}: contact"
     save_picture(draw_contact(contact, title=title, others=marks, truth=truth), picture)
-    write_contact_cloud(contact, cloud)
-    for path in (picture, cloud):
-        say(f"wrote {path}")
-    return {"picture": str(picture), "cloud": str(cloud)}
+    say(f"wrote {picture}")
+    return {"picture": str(picture)}

@@ -1,7 +1,6 @@
-"""The probability of a contact, as a picture of the object from all sides and as a colored point cloud."""
+"""The probability of a contact, as a picture of the object from all sides."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,8 +11,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from avmsf._utils.files import write_whole
-from avmsf.errors import EvaluationError
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.plotting.clouds import ALL_SIDES, Side, draw_cloud, in_front, view_from
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
@@ -74,24 +71,6 @@ def contact_colors(contact: ContactPosterior) -> Float[Tensor, "points 3"]:
     share = likely / likely.max().clamp_min(torch.finfo(torch.float64).tiny)
     level = 1.0 + torch.log10(share.clamp_min(10.0**-_DECADES)) / _DECADES
     return _heat(level)
-
-
-def write_contact_cloud(contact: ContactPosterior, path: Path) -> None:
-    """Write the object's points with their colors as a binary `.ply` that any viewer of point clouds opens.
-
-    The vertices have the floats `probability` (they sum to one) and `cosine_distance` beside place and color. Raises
-    EvaluationError where it cannot be written.
-    """
-    numbers = ("probability", "cosine_distance")
-    kinds = dict.fromkeys("xyz", "<f4") | dict.fromkeys(("red", "green", "blue"), "u1") | dict.fromkeys(numbers, "<f4")
-    colors = (255.0 * contact_colors(contact)).round()
-    columns = [*contact.points.double().T, *colors.T, contact.probability, contact.distance]
-    table = np.rec.fromarrays([column.cpu().numpy() for column in columns], dtype=list(kinds.items()))
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds.items()]
-    header += ["end_header", ""]
-    content = "\n".join(header).encode("ascii") + table.tobytes()
-    write_whole(path, content, raising=EvaluationError)
 
 
 def _heat(level: Float[Tensor, " points"]) -> Float[Tensor, "points 3"]:
