@@ -8,13 +8,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf.capture import Impacts
 from avmsf.errors import ExtractionError
 from avmsf.evaluation.metrics import relative_stft_error
 from avmsf.evaluation.modal_metrics import truth_at
+from avmsf.evaluation.simple_methods import floor
 from avmsf.evaluation.splits import split
 from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
-from avmsf.modal.extraction.least_squares import fit_gains, fit_sine_gains
+from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
@@ -151,8 +153,7 @@ def _error(sound: Float[Tensor, " samples"], bank: ModalBank | None, sample_rate
     """Return the relative STFT error of one sound's best fit by the modes."""
     if bank is None:
         return 1.0
-    gains = fit_gains(sound[None], bank, sample_rate=sample_rate)
-    fitted = synthesize(gains, bank.frequency, bank.damping, samples=len(sound), sample_rate=sample_rate)
+    fitted = floor(Impacts(torch.zeros(1, 3), sound[None], sample_rate, ("clip",)), bank)
     return float(relative_stft_error(fitted, sound[None], sample_rate=sample_rate)[0])
 
 

@@ -20,6 +20,7 @@ from avmsf.evaluation.simple_methods import (
     NearestRecording,
     SplineGains,
     WhiteNoise,
+    floor,
 )
 from avmsf.evaluation.splits import split
 from avmsf.modal.extraction.extract import Extraction
@@ -90,6 +91,16 @@ def test_mean_gains_have_both_phases():
     cosines = torch.exp(-bank.damping[:, None] * times) * torch.cos(2 * math.pi * bank.frequency[:, None] * times)
     expected = extraction.gains.real.double() @ cosines
     assert torch.allclose(sounds.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_the_floor_is_the_noise_alone():
+    impacts, clean = plate_impacts(noise_db=-40.0), plate_impacts()
+    bank = true_extraction(impacts).bank
+    left = (floor(impacts, bank) - impacts.sounds).square().mean() / impacts.sounds.square().mean()
+    # Least squares takes away the noise in as many directions of 4410 as there are gains, so 2 % at most.
+    assert 10 * math.log10(float(left)) == pytest.approx(-40.0, abs=0.15)
+    left = (floor(clean, bank) - clean.sounds).square().mean() / clean.sounds.square().mean()
+    assert 10 * math.log10(float(left)) < -90.0
 
 
 def test_an_extraction_of_other_impacts_is_refused():

@@ -1,6 +1,6 @@
-"""Baselines made of the training recordings.
+"""Baselines made of the training recordings, and what an object's modes alone reach.
 
-Each is a `Renderer`; nearest is by Euclidean distance, and of equally near contacts the first.
+Each baseline is a `Renderer`; nearest is by Euclidean distance, and of equally near contacts the first.
 """
 
 import zlib
@@ -23,6 +23,7 @@ from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites
 from avmsf.mesh.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import shape_noise
 from avmsf.modal.synthesis import synthesize
@@ -192,6 +193,17 @@ class RandomImpact:
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the sound for every contact."""
         return self.sound.expand(len(contacts), -1)
+
+
+def floor(test: Impacts, bank: ModalBank) -> Float[Tensor, "contacts samples"]:
+    """Return the test sounds as `bank` expresses them best: their own complex gains, without noise.
+
+    No gains that are predicted for the same modes come nearer in the squared error of the waveform; a field with noise
+    can have less error in a spectrum.
+    """
+    rate, samples = test.sample_rate, test.sounds.shape[1]
+    gains = fit_gains(test.sounds, bank, sample_rate=rate)
+    return synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=rate)
 
 
 @dataclass(frozen=True, eq=False)

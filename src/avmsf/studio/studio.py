@@ -84,8 +84,8 @@ class Studio:
         (folder / "like.wav").write_bytes(content)
         await self.threads.run("compute", save, field, folder / "field")
         files = {"field": "field", "recording": "like.wav", "output": "led"}
-        task = {name: str(folder / file) for name, file in files.items()}
-        task |= {"task": "lead", "steps": self.config.steps}
+        task: Event = {"task": "lead", "steps": self.config.steps}
+        task |= {name: str(folder / file) for name, file in files.items()}
         return {"job": self.jobs.start("the guided edit", task, partial(self._take_led, base)).identifier}
 
     async def undo(self, request: dict[str, Any]) -> dict[str, Any]:
