@@ -1,6 +1,7 @@
 """ObjectFolder Real and RealImpact as published: whatever force and gain, the same object sounds the same."""
 
 import json
+import os
 import shutil
 import warnings
 from pathlib import Path
@@ -248,19 +249,6 @@ def test_check_counts_blows_and_names_what_is_not_here(whole: Path) -> None:
     assert "43_IronMortar" in report.remarks[0]
 
 
-def spoil(path: Path, damage: object) -> None:
-    """Delete a file, cut it to as many bytes, or write an array in its place."""
-    if damage is None:
-        path.unlink()
-    elif isinstance(damage, int):
-        with open(path, "r+b") as file:
-            file.truncate(damage)
-    elif isinstance(damage, float):
-        np.lib.format.open_memmap(path, mode="r+")[:, 7] = damage
-    else:
-        np.save(path, damage)
-
-
 @pytest.mark.parametrize(
     ("file", "damage", "name", "value"),
     [
@@ -278,7 +266,15 @@ def spoil(path: Path, damage: object) -> None:
     ],
 )
 def test_files_that_are_not_what_they_should_be_are_refused(copied: Path, file, damage, name, value) -> None:
-    spoil(copied / NAME / "preprocessed" / file, damage)
+    path = copied / NAME / "preprocessed" / file
+    if damage is None:
+        path.unlink()
+    elif isinstance(damage, int):
+        os.truncate(path, damage)
+    elif isinstance(damage, float):
+        np.lib.format.open_memmap(path, mode="r+")[:, 7] = damage
+    else:
+        np.save(path, damage)
     with raises(DatasetError, file=f"preprocessed/{file}", name=name) as caught:
         RealImpact(copied).capture(NAME)
     assert value is None or caught.value.value == value

@@ -21,11 +21,7 @@ from avmsf.cli import VERBS, options_of
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 LINKED = [*PAGES, REPOSITORY / "CONTRIBUTING.md"]
-
-
-def _commands() -> list[str]:
-    lines = [line for page in PAGES for line in page.read_text().splitlines()]
-    return sorted({re.split(r"\s+#", line.strip())[0] for line in lines if line.startswith("    avmsf ")})
+COMMANDS = {*re.findall(r"^    (avmsf .+?)(?: +#.*)?$", "\n".join(page.read_text() for page in PAGES), re.MULTILINE)}
 
 
 def _blocks(language: str) -> list[str]:
@@ -38,7 +34,7 @@ def _anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("command", _commands())
+@pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_every_command_of_the_docs_parses(command: str) -> None:
     _, verb, *arguments = shlex.split(command)
     options_of(verb, arguments)

@@ -59,36 +59,20 @@ def photographed(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder
 
 
-@pytest.fixture(scope="module")
-def bare(workshop: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the same without anything that shows the object."""
-    folder = tmp_path_factory.mktemp("bare") / "workshop"
-    shutil.copytree(workshop, folder)
-    (folder / "bowl" / "surface.ply").unlink()
-    return folder
-
-
 def parts(page: Path) -> dict[str, str]:
     """Return the page's text by the folder in which it is to run."""
     text = page.read_text()
-    if page.stem == "README":
-        mesh, _, rest = text.partition(PHOTOGRAPHS)
-        photographs, _, python = rest.partition(PYTHON)
-        # README's Python would fit bodies of many thicknesses, for minutes, if anything showed the shape.
-        return {"workshop": mesh, "photographed": photographs, "bare": python}
-    return {"photographed" if page.stem == "photographs" else "workshop": text}
+    if page.stem != "README":
+        return {"photographed" if page.stem == "photographs" else "workshop": text}
+    mesh, _, rest = text.partition(PHOTOGRAPHS)
+    # Its Python, which another test runs, would fit bodies of many thicknesses, for minutes.
+    return {"workshop": mesh, "photographed": rest.partition(PYTHON)[0]}
 
 
 def steps(text: str) -> list[tuple[str, str]]:
     """Return a page's commands and Python blocks in their order, each as its kind and its text."""
     found = re.findall(r"^    (avmsf [^\n]+)$|^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     return [("command", re.split(r"\s+#", command)[0]) if command else ("python", block) for command, block in found]
-
-
-def run(command: str) -> None:
-    _, verb, *words = shlex.split(command)
-    small = SMALL.get(f"{verb} {words[0]}", SMALL.get(verb, ()))
-    assert main([verb, *words, *small]) == 0, command
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +92,8 @@ def test_every_step_of_a_page_runs(page, done, request, tmp_path, monkeypatch):
                 continue
             done.add((folder, step))
             if kind == "command":
-                run(step)
+                _, verb, *words = shlex.split(step)
+                assert main([verb, *words, *SMALL.get(f"{verb} {words[0]}", SMALL.get(verb, ()))]) == 0, step
             else:
                 # A page adds rows of its own to the tables.
                 with patch.dict(METHODS), patch.dict(METRICS):

@@ -1,6 +1,5 @@
 """Encoders: the embedded one, EfficientNet-Lite0 with its trained weights, and what all of them are given."""
 
-import math
 import sys
 from dataclasses import replace
 
@@ -55,12 +54,10 @@ def test_one_color_is_carried_on_unchanged():
 NAMES = ("L", "a", "b", "gradient", "first", "second", "third", "fourth", "larger", "smaller", "next L", "next a")
 
 
-def picture(size: int = 256, *, angle: float = 0.0) -> torch.Tensor:
-    """Smooth colored waves of 12 to 60 pixels (at 256), turned about the image's middle by `angle`, radians."""
+def picture(size: int = 256) -> torch.Tensor:
+    """Smooth colored waves of 12 to 60 pixels (at 256)."""
     place = (torch.arange(size, dtype=torch.float64) + 0.5) / size - 0.5
-    down, across = torch.meshgrid(place, place, indexing="ij")
-    x = math.cos(angle) * across + math.sin(angle) * down
-    y = -math.sin(angle) * across + math.cos(angle) * down
+    y, x = torch.meshgrid(place, place, indexing="ij")
     generator = torch.Generator().manual_seed(3)
     waves = torch.randn(12, 5, generator=generator, dtype=torch.float64)
     color = torch.zeros(size, size, 3, dtype=torch.float64)
@@ -68,15 +65,6 @@ def picture(size: int = 256, *, angle: float = 0.0) -> torch.Tensor:
         phase = torch.sin(12 * (a * x + b * y) * (1 + row / 6) + row)
         color += phase[..., None] * torch.tensor(mix, dtype=torch.float64) / 12
     return (0.5 + color).clamp(0, 1).float()
-
-
-def middle(features: torch.Tensor) -> torch.Tensor:
-    """Features far from the borders, where a turned image shows the same."""
-    rows, columns = features.shape[1:]
-    place_down, place_across = torch.meshgrid(
-        torch.arange(rows) + 0.5 - rows / 2, torch.arange(columns) + 0.5 - columns / 2, indexing="ij"
-    )
-    return features[:, (place_down**2 + place_across**2).sqrt() < 0.12 * rows]
 
 
 ENCODER = ImageDescriptors(color_scales=(2.0, 8.0), texture_scales=(4.0, 8.0))

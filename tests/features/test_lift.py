@@ -27,8 +27,8 @@ def camera_at(direction: list[float], *, width: int = WIDTH, height: int = HEIGH
     return Camera.looking(position, torch.zeros(3), up=up, focal=FOCAL, width=width, height=height)
 
 
-def view_of(camera: Camera, *, mask: torch.Tensor | None = None, name: str = "a view") -> View:
-    return View(name, torch.zeros(camera.height, camera.width, 3, dtype=torch.uint8), camera, mask)
+def view_of(camera: Camera, *, mask: torch.Tensor | None = None) -> View:
+    return View("a view", torch.zeros(camera.height, camera.width, 3, dtype=torch.uint8), camera, mask)
 
 
 AROUND = [camera_at(d) for d in ([1, 0, 0], [0, 1, 0.2], [-1, 0.3, 0], [0, -1, 0.4], [0.5, 0.1, 1], [0.1, 0.5, -1])]
@@ -70,10 +70,9 @@ class Painted:
         return self.maps[len(self.images) - 1]
 
 
-def painted_sphere(cameras: list[Camera], *, columns: int = 80, rows: int = 55) -> Painted:
+def painted_sphere(cameras: list[Camera]) -> Painted:
     """Maps, coarser than the images, of the object coordinates that each cell's middle shows."""
-    small = [camera.resized(columns, rows) for camera in cameras]
-    return Painted([sphere_places(camera).permute(2, 0, 1).float() for camera in small])
+    return Painted([sphere_places(camera.resized(80, 55)).permute(2, 0, 1).float() for camera in cameras])
 
 
 def sphere_cloud(points: torch.Tensor, scale: float = 0.004) -> GaussianCloud:
@@ -136,17 +135,6 @@ def test_gaussians_get_their_own_positions():
     assert lifted.agreement > 0.999
 
 
-def test_the_far_side_is_never_seen():
-    points, cameras = sphere_points(), AROUND[:1]
-    truth = painted_sphere(cameras)
-    lifted = lift_points(points, [view_of(cameras[0])], truth, depth_map=sphere_depth)
-    # From DISTANCE, a sphere's cap of x > R^2 / DISTANCE is in sight; the rim, within two pixels' depth, may go.
-    horizon = RADIUS**2 / DISTANCE
-    assert not bool((lifted.seen > 0)[points[:, 0] < horizon - 0.005].any())
-    assert bool((lifted.seen > 0)[points[:, 0] > horizon + 0.02].all())
-    assert lifted.unseen == int((lifted.seen == 0).sum()) > 250
-
-
 def test_rendered_gaussians_hide_what_lies_behind_them():
     points = sphere_points(2500)
     cloud, camera = sphere_cloud(points), AROUND[0]
@@ -201,6 +189,7 @@ def test_unseen_points_take_the_mean_of_the_three_nearest_seen():
     points = sphere_points(300)
     lifted = lift_points(points, [view_of(AROUND[0])], painted_sphere(AROUND[:1]), depth_map=sphere_depth)
     known = lifted.seen > 0
+    assert lifted.unseen == int((~known).sum()) > 150
     near = torch.cdist(points[~known], points[known]).topk(3, largest=False).indices
     expected = lifted.features.features[known][near].mean(1)
     torch.testing.assert_close(lifted.features.features[~known], expected, rtol=0, atol=1e-7)

@@ -191,20 +191,16 @@ def test_orientation_tags_turn_only_what_fits_its_camera_no_other_way(tmp_path: 
         assert np.abs(view.image.numpy().astype(int) - RAMP).max() <= 12
 
 
-def black_png(width: int, height: int) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
-    data = zlib.compress(bytes((1 + (width + 7) // 8) * min(height, 2)))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-
-
 @pytest.mark.parametrize("read", [read_image, read_mask])
 def test_a_picture_of_too_many_pixels_is_never_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read) -> None:
     # The largest sensors'.
     assert MAX_PIXELS >= 16_320 * 12_240
-    (tmp_path / "bomb.png").write_bytes(black_png(30_016, 30_016))
+    write_image(tmp_path / "bomb.png", RAMP)
+    content = bytearray((tmp_path / "bomb.png").read_bytes())
+    # Width and height of the header, and its check sum.
+    content[16:24] = struct.pack(">II", 30_016, 30_016)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    (tmp_path / "bomb.png").write_bytes(content)
     monkeypatch.setattr(cv2, "imdecode", None)
     with raises(CaptureError, file="bomb.png", name="pixels", value=30_016**2):
         read(tmp_path / "bomb.png")
@@ -214,21 +210,17 @@ SHARP = (2, 11, 13, 21, 28, 30)
 """Of 36 frames, one in each sixth that is not blurred."""
 
 
-def picture(number: int, *, blurred: bool) -> np.ndarray:
-    """Fine noise whose brightness in the corner tells the frame's number."""
-    frame = np.random.default_rng(number).integers(0, 256, (64, 96, 3), dtype=np.uint8)
-    frame = cv2.resize(frame[::2, ::2], (96, 64), interpolation=cv2.INTER_NEAREST)
-    if blurred:
-        frame = cv2.GaussianBlur(frame, (0, 0), 2.0)
-    frame[:16, :16] = 7 * number
-    return frame
-
-
 def film(path: Path, *, count: int = 36, codec: str = "MJPG", sharp: tuple[int, ...] = SHARP) -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 30.0, (96, 64))
     assert writer.isOpened()
     for number in range(count):
-        writer.write(picture(number, blurred=number not in sharp))
+        # Fine noise whose brightness in the corner tells the frame's number.
+        frame = np.random.default_rng(number).integers(0, 256, (64, 96, 3), dtype=np.uint8)
+        frame = cv2.resize(frame[::2, ::2], (96, 64), interpolation=cv2.INTER_NEAREST)
+        if number not in sharp:
+            frame = cv2.GaussianBlur(frame, (0, 0), 2.0)
+        frame[:16, :16] = 7 * number
+        writer.write(frame)
     writer.release()
     return path
 
@@ -251,21 +243,16 @@ def test_the_sharp_frame_of_each_span_is_kept(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.avi", "images"]
 
 
-def turn(path: Path) -> None:
-    """Write a turn by 90 degrees clockwise into the matrix of an MP4's track header."""
-    content = bytearray(path.read_bytes())
-    place = content.index(b"tkhd") + 4
-    assert content[place] == 0
-    # Version and flags, times, track, reserved, duration: 24 bytes; reserved, layer, group, volume: 16 more.
-    start = place + 24 + 16
-    struct.pack_into(">9i", content, start, 0, 0x10000, 0, -0x10000, 0, 0, 64 << 16, 0, 0x40000000)
-    path.write_bytes(content)
-
-
 def test_a_video_taken_upright_is_written_upright(tmp_path: Path) -> None:
     path = film(tmp_path / "a.mp4", count=4, codec="mp4v", sharp=(0, 1, 2, 3))
     plain = pick(path, tmp_path / "plain", 4)[0]
-    turn(path)
+    # A turn by 90 degrees clockwise in the matrix of the track's header, behind version and flags, times, track,
+    # reserved and duration (24 bytes), and reserved, layer, group and volume (16 more).
+    content = bytearray(path.read_bytes())
+    start = content.index(b"tkhd") + 4
+    assert content[start] == 0
+    struct.pack_into(">9i", content, start + 40, 0, 0x10000, 0, -0x10000, 0, 0, 64 << 16, 0, 0x40000000)
+    path.write_bytes(content)
     turned = pick(path, tmp_path / "turned", 4)[0]
     lying, upright = cv2.imread(str(plain)), cv2.imread(str(turned))
     assert lying.shape == (64, 96, 3)

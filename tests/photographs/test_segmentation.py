@@ -220,13 +220,10 @@ def dino(shared: Path) -> tuple[View, ...]:
     return read_views(shared / "dino", longest=320)
 
 
-def corners() -> torch.Tensor:
-    return torch.cartesian_prod(*torch.tensor([LOW, HIGH]).T.double())
-
-
 def box_in(view: View) -> np.ndarray:
     """Where the bounding box lies in a view's image."""
-    pixels = view.camera.project(corners())[0].numpy()
+    corners = torch.cartesian_prod(*torch.tensor([LOW, HIGH]).T.double())
+    pixels = view.camera.project(corners)[0].numpy()
     outline = cv2.convexHull(np.round(pixels - 0.5).astype(np.int32))
     filled = np.zeros((view.camera.height, view.camera.width), dtype=np.uint8)
     cv2.fillConvexPoly(filled, outline, 1)
