@@ -73,11 +73,6 @@ def test_thin_walls_bend_in_proportion_to_their_thickness():
     torch.testing.assert_close(second / first, torch.full_like(first, thicker), rtol=0.03, atol=0.0)
 
 
-def test_points_without_triangles_are_refused():
-    with pytest.raises(SimulationError):
-        body_family(Surface(sheet().vertices, torch.zeros(0, 3, dtype=torch.int64)), count=3)
-
-
 RATE, SAMPLES = 48_000.0, 24_000
 STIFFNESS, POISSON = 1.3 * GLASS.young / GLASS.density, 0.27
 SILENT = Residual(torch.zeros(257))
@@ -266,6 +261,10 @@ def of_scale(scale: float) -> BodyFamily:
 
 REFUSED: dict[str, tuple[type[AvmsfError], Callable[[], object]]] = {
     "an unknown material": (SimulationError, lambda: DiffSoundConfig(material="unobtainium")),
+    "points without triangles": (
+        SimulationError,
+        lambda: body_family(Surface(sheet().vertices, torch.zeros(0, 3, dtype=torch.int64)), count=3),
+    ),
     "silence": (EvaluationError, lambda: clip_spectra(struck(torch.zeros(1, 12)))),
     "silence to level": (
         EvaluationError,

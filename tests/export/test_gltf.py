@@ -193,13 +193,15 @@ def test_a_texture_becomes_the_corners_colors(tmp_path):
     assert colors.sum() == 1.0
 
 
-def test_a_field_without_modes_is_refused(tmp_path):
+def test_a_field_without_modes_and_other_endings_are_refused(tmp_path):
     field = table()
     empty = replace(field, frequency=field.frequency[:0], damping=field.damping[:0], gains=field.gains[:, :0])
     with raises(ExportError, file="thing.glb", name="modes", value=0):
         write_gltf(empty, tmp_path / "thing.glb")
     with raises(ExportError, file="thing.obj", name="suffix", value=".obj"):
         write_gltf(field, tmp_path / "thing.obj")
+    with raises(ExportError, file="thing.cpp", name="suffix", value=".cpp"):
+        write_faust(field, tmp_path / "thing.cpp")
 
 
 DRIVER = Path(__file__).with_name("faust_driver.c")
@@ -306,11 +308,6 @@ def test_as_many_points_are_written_as_faust_compiles_unless_more_are_asked_for(
     assert "points = 5;" in path.read_text()
     remarks = write_faust(table(), path, contacts=3, overwrite=True).remarks
     assert "3 of 9 contacts are written, evenly spread" in remarks
-
-
-def test_other_endings_are_refused(tmp_path):
-    with raises(ExportError, file="thing.cpp", name="suffix", value=".cpp"):
-        write_faust(table(), tmp_path / "thing.cpp")
 
 
 def test_the_table_has_each_contacts_place(tmp_path):

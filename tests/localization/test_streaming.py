@@ -11,7 +11,7 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.localization.amplitudes import Extractor
-from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate, locate_impacts
+from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.streaming import WINDOW_SECONDS, LocatedImpact, Ringing, StreamingLocalizer
 from avmsf.modal.modes import ModalBank
@@ -230,15 +230,6 @@ def test_broad_modes_explain_a_stranger_and_it_is_refused(material, other, lengt
 def test_own_sounds_of_damped_plates_fit(material, noise_db):
     for sound in damped_blows(material, heard_by=material, noise_db=noise_db):
         assert damped_locator(material).locate(sound).mismatch_ratio <= WARN_ABOVE
-
-
-@pytest.mark.parametrize(("material", "other", "length"), FOREIGN)
-def test_of_several_blows_the_strangers_are_left_out(material, other, length):
-    own = damped_blows(material, heard_by=material)[0]
-    foreign = damped_blows(other, length=length, heard_by=material)[1]
-    both = torch.cat([recorded(own), recorded(foreign)])
-    found = locate_impacts(damped_field(material), both, locator=damped_locator(material))
-    assert [round(seconds, 2) for seconds, _ in found] == [0.1]
 
 
 @pytest.mark.parametrize(("material", "other", "length"), FOREIGN)
