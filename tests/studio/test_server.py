@@ -27,13 +27,11 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import StudioError
 from avmsf.fem.material import CERAMIC, WOOD
 from avmsf.field.store import load, save
-from avmsf.localization.contact_map import enlarged
 from avmsf.localization.locate import locate_impacts
 from avmsf.localization.locator import Locator
 from avmsf.studio.opening import open_target
 from avmsf.studio.server import listen, serve
 from avmsf.studio.studio import StudioConfig
-from avmsf.symmetry.find import find_symmetries
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
 from factories.raising import raises
@@ -160,18 +158,6 @@ def test_a_guided_edit_that_another_tab_has_overtaken_is_taken_and_its_change_co
     assert torch.equal(plate.studio.session.current.require_field().bank.frequency, led.bank.frequency)
     assert plate.ask("POST", "undo", {"base": 3}).status == 200
     assert plate.manifest()["live"]["sliders"]["pitch"] == 1.5
-
-
-@pytest.mark.slow
-def test_a_larger_object_has_the_same_symmetries_farther_out() -> None:
-    grid = torch.cartesian_prod(torch.linspace(-0.1, 0.1, 21), torch.linspace(-0.06, 0.06, 13))
-    points = torch.cat([grid, torch.full((len(grid), 1), 0.03)], dim=1) + torch.tensor([0.2, 0.0, 0.0])
-    larger, expected = enlarged(find_symmetries(points, seed=0), 1.5), find_symmetries(1.5 * points, seed=0)
-    assert len(larger.mirrors) == len(expected.mirrors) > 0
-    assert larger.spacing == pytest.approx(expected.spacing, rel=1e-5)
-    for kind in ("mirrors", "rotations"):
-        for one, other in zip(getattr(larger, kind), getattr(expected, kind), strict=True):
-            assert torch.allclose(one.point.double(), other.point.double(), atol=1e-3)
 
 
 def test_a_capture_is_made_of_a_mesh(capture: Served, tmp_path: Path) -> None:

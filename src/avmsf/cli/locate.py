@@ -129,18 +129,17 @@ def run(options: Options) -> int:
 def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_Answer]]":
     """Return what locates the impacts of a recording; what it needs of the field is computed with the first one."""
     from avmsf.capture.audio import read_recording
-    from avmsf.localization.contact_map import not_located, symmetries_of
+    from avmsf.localization.contact_map import not_located
     from avmsf.localization.likelihood import Force
     from avmsf.localization.locate import locate, locate_impacts
     from avmsf.localization.locator import Locator
 
     settings = None if options.settings is None else CaptureSettings.read(options.settings)
     force, level = None if options.force is None else Force(options.force), options.probability
-    locator, symmetries = cache(lambda: Locator.of(field)), cache(lambda: symmetries_of(field))
+    locator = cache(lambda: Locator.of(field))
 
     def describe(path: Path, seconds: float | None, contact: "ContactPosterior") -> "_Answer":
-        several = contact.refusal is None and len(contact.peaks(level)) > 1
-        values = contact.describe(symmetries() if several else None, level)
+        values = contact.describe(level)
         return {"recording": str(path), "seconds": seconds, **values}, None if contact.refusal else contact
 
     def answers(path: Path) -> "list[_Answer]":
@@ -241,7 +240,9 @@ def _words(values: dict[str, Any]) -> str:
         )
     if values["multimodal"]:
         lines.append("  ambiguous: there are other possible positions")
-    lines += [f"  {other['message']}" for other in values["equivalent_points"]]
+    for other in values["equivalent_points"]:
+        place = ", ".join(f"{value + 0.0:.4f}" for value in other["position"])
+        lines.append(f"  also at ({place}) m, with {100 * other['probability']:.0f} %")
     return "\n".join([*lines, *(f"  note: {each}" for each in values["notes"])])
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -15,10 +15,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_vectors, short_repr
 from avmsf._utils.text import counted
-from avmsf.errors import AvmsfError, LocationError
-from avmsf.field.sound_field import SoundField
-from avmsf.symmetry.find import find_symmetries
-from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
+from avmsf.errors import LocationError
 
 LEVEL = 0.9
 """Probability of a credible region by default."""
@@ -30,10 +27,6 @@ _LEAST_RESIDUAL = 0.01
 """Lower bound of the energy fraction that detuned modes leave: less is within rounding and noise."""
 _LINK_SPACINGS = 2.5
 _LINK_FRACTION = 0.04
-_ANGLES = 360
-"""Angles tried for a rotation about an axis that allows any."""
-_SYMMETRY_POINTS = 2000
-"""Points of the object in which symmetries are searched: of 500, a fifth would be lost in chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,43 +43,6 @@ class Peak:
     """That the contact is one of its points."""
     points: Bool[Tensor, " points"]
     """Which points it contains."""
-    symmetry: RotationalSymmetry | MirrorSymmetry | None = None
-    """The symmetry that maps the most probable position of all to this one; None if no known one does."""
-    angle: float | None = None
-    """Its angle in radians, for a rotation."""
-
-    @property
-    def message(self) -> str:
-        """Say that the contact may be here too, and by which symmetry."""
-        where = ", ".join(f"{round(value, 4) + 0.0:.4g}" for value in self.position.tolist())
-        if self.symmetry is None:
-            why = "no known symmetry of the object explains it"
-        elif isinstance(self.symmetry, MirrorSymmetry):
-            why = f"its image in the {self.symmetry}"
-        else:
-            assert self.angle is not None
-            axis = str(self.symmetry).split(" about ")[1]
-            why = f"its rotation by {math.degrees(self.angle):.0f} degrees about {axis}"
-        return f"also at ({where}) m, with {100 * self.probability:.0f} %: {why}"
-
-    def explained(self, first: Float[Tensor, " 3"], symmetries: Symmetries | None, *, tolerance: float) -> "Peak":
-        """Return it with the symmetry that maps `first` nearest to its position; positions and tolerance in meters.
-
-        Images farther off than `tolerance` do not count, nor do symmetries that leave `first` about where it is.
-        """
-        if symmetries is None:
-            return self
-        row, found, nearest = first.double()[None], self, tolerance
-        turns = [(each, angle) for each in symmetries.rotations for angle in each.angles(_ANGLES)[1:]]
-        images: list[tuple[RotationalSymmetry | MirrorSymmetry, float | None, Tensor]] = [
-            *((each, None, each.reflect(row)[0]) for each in symmetries.mirrors),
-            *((each, angle, each.turn(row, angle)[0]) for each, angle in turns),
-        ]
-        for symmetry, angle, image in images:
-            distance = float((image - self.position.double()).norm())
-            if distance < nearest and float((image - first.double()).norm()) > distance:
-                nearest, found = distance, replace(self, symmetry=symmetry, angle=angle)
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,20 +190,11 @@ class ContactPosterior:
         """Whether the contact may be at several positions apart: more than one of the `peaks` of the 90 % region."""
         return len(self.peaks()) > 1
 
-    def equivalent_points(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> tuple[Peak, ...]:
-        """Return the other possible positions, those of all `peaks` without `position`, the largest peak first.
+    def equivalent_points(self, level: float = LEVEL) -> tuple[Peak, ...]:
+        """Return the other possible positions, those of all `peaks` without `position`, the largest peak first."""
+        return tuple(each for each in self.peaks(level) if not each.points[self.most_probable])
 
-        Each has the symmetry that maps `position` nearest to it, if nearer than twice `linking_length`. Empty for a
-        posterior of one peak.
-        """
-        here, tolerance = self.position, 2.0 * self.linking_length
-        return tuple(
-            each.explained(here, symmetries, tolerance=tolerance)
-            for each in self.peaks(level)
-            if not each.points[self.most_probable]
-        )
-
-    def describe(self, symmetries: Symmetries | None = None, level: float = LEVEL) -> dict[str, Any]:
+    def describe(self, level: float = LEVEL) -> dict[str, Any]:
         """Return the results as plain values, lengths in meters; of a rejected recording the status and the reason.
 
         `position_probability` is that of the peak of the region that contains the position.
@@ -261,7 +208,7 @@ class ContactPosterior:
         }
         if self.refusal is not None:
             return not_located(self.refusal) | common
-        others = self.equivalent_points(symmetries, level)
+        others = self.equivalent_points(level)
         own = next(peak for peak in self.peaks(level) if peak.points[self.most_probable])
         return {
             "status": LOCATED,
@@ -277,8 +224,7 @@ class ContactPosterior:
             "cosine": {"position": self.points[self.best].tolist(), "distance": float(self.distance[self.best])},
             "multimodal": bool(others),
             "equivalent_points": [
-                {"position": each.position.tolist(), "probability": each.probability, "message": each.message}
-                for each in others
+                {"position": each.position.tolist(), "probability": each.probability} for each in others
             ],
         }
 
@@ -290,24 +236,6 @@ class ContactPosterior:
 def not_located(reason: str) -> dict[str, Any]:
     """Return the values for a recording that could not be located."""
     return {"status": NOT_LOCATED, "reason": " ".join(reason.split()), "position": None}
-
-
-def symmetries_of(field: SoundField) -> Symmetries | None:
-    """Return the symmetries of a field's points; None where these are too few."""
-    try:
-        return find_symmetries(field.gain_field.points, seed=0, limit=_SYMMETRY_POINTS)
-    except AvmsfError:
-        return None
-
-
-def enlarged(symmetries: Symmetries, factor: float) -> Symmetries:
-    """Return the symmetries of an object scaled by `factor` about the origin."""
-    return replace(
-        symmetries,
-        rotations=tuple(replace(each, point=each.point * factor) for each in symmetries.rotations),
-        mirrors=tuple(replace(each, point=each.point * factor) for each in symmetries.mirrors),
-        spacing=symmetries.spacing * factor,
-    )
 
 
 def _check_probability(level: float) -> None:

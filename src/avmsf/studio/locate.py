@@ -5,9 +5,8 @@ import base64
 import dataclasses
 import sys
 import traceback
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property
 from threading import Lock
 from typing import Any
 
@@ -20,7 +19,7 @@ from avmsf.capture.audio import Recording
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfError
 from avmsf.field.sound_field import SoundField
-from avmsf.localization.contact_map import LEVEL, ContactPosterior, enlarged, symmetries_of
+from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locate import locate_impacts
 from avmsf.localization.locator import Locator
 from avmsf.studio.capture import CaptureEditor
@@ -28,7 +27,6 @@ from avmsf.studio.files import Showcase
 from avmsf.studio.jobs import Threads
 from avmsf.studio.responses import FORESEEN_ERRORS
 from avmsf.studio.session import Revision, Session
-from avmsf.symmetry.symmetries import Symmetries
 
 _SETTLED = 0.5
 """Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
@@ -43,10 +41,6 @@ class Finder:
     """The page's points, on the object as the field has it now, meters."""
     length: float
     """Lengths on that object over those of the page's picture."""
-    find_symmetries: Callable[[], Symmetries | None]
-    """Returns the symmetries of the object as it was opened, whose search other revisions need not repeat."""
-    opened_length: float
-    """`length` of the field that they are found of."""
     settings: CaptureSettings | None
     """How the capture's recordings are read, where it is known."""
     _lock: Lock = dataclasses.field(default_factory=Lock, repr=False)
@@ -56,17 +50,10 @@ class Finder:
         """The tables over the page's points."""
         return Locator.of(self.field, points=self.points)
 
-    @property
-    def symmetries(self) -> Symmetries | None:
-        """The reason why several positions sound the same: those of the object as it was opened, scaled."""
-        found = self.find_symmetries()
-        return None if found is None else enlarged(found, self.length / self.opened_length)
-
     def prepare(self) -> None:
         """Compute the tables, once for all threads."""
         with self._lock:
             self.locator.prepare(self.field.samples)
-            _ = self.symmetries
 
     def locate(self, recording: Recording) -> list[dict[str, Any]]:
         """Return the impacts of a recording, each with a value for every point of the page.
@@ -78,7 +65,7 @@ class Finder:
         return [self._described(seconds, contact) for seconds, contact in impacts]
 
     def _described(self, seconds: float, contact: ContactPosterior) -> dict[str, Any]:
-        values = contact.describe(self.symmetries, LEVEL)
+        values = contact.describe()
         del values["cosine"]
         for each in (values, *values["equivalent_points"]):
             each["position"] = [value / self.length for value in each["position"]]
@@ -95,7 +82,6 @@ class Searches:
     def __init__(self, session: Session, showcase: Showcase, editor: CaptureEditor | None, threads: Threads) -> None:
         self.session, self.showcase, self.editor, self.threads = session, showcase, editor, threads
         self._finder: tuple[int, Finder] | None = None
-        self._symmetries: dict[int, tuple[Callable[[], Symmetries | None], float]] = {}
         self._ahead: asyncio.Task[None] | None = None
 
     def finder_of(self, revision: Revision) -> Finder:
@@ -105,8 +91,7 @@ class Searches:
             length = field.gain_field.length
             points = (self.showcase.current.sampled.points.double() * length).float()
             settings = None if self.editor is None else self.editor.settings
-            found = self._symmetries.setdefault(revision.opening, (cache(partial(symmetries_of, field)), length))
-            self._finder = (revision.number, Finder(field, points, length, *found, settings))
+            self._finder = (revision.number, Finder(field, points, length, settings))
         return self._finder[1]
 
     def prepare_ahead(self) -> None:

@@ -107,8 +107,8 @@ function describe(studio, impact) {
     facts.push(["Explained energy", `${percent(impact.explained_energy)} of the sound`]);
   const parts = [factList(facts), button("Strike here", () => studio.strike(impact.row))];
   if (impact.equivalent_points?.length) {
-    const items = impact.equivalent_points.map(({ position, probability, message }) =>
-      element("li", {}, `${millimeters(position)} mm, ${percent(probability)}${message ? `: ${message}` : ""}`),
+    const items = impact.equivalent_points.map(({ position, probability }) =>
+      element("li", {}, `${millimeters(position)} mm, ${percent(probability)}`),
     );
     parts.push(element("h3", {}, "Other possible contacts"), element("ul", { className: "listing" }, ...items));
   }
