@@ -1,6 +1,7 @@
 """Quality of one recording: its length, level, noise, clipping, onset and second impacts; and whether it is of one."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -9,7 +10,7 @@ from avmsf._utils.text import counted
 from avmsf.capture.audio import EIGHT_BIT, LOSSLESS, Recording, clipped_samples
 from avmsf.capture.issues import RecordingReport
 from avmsf.capture.onset import SECONDS_BEFORE, find_second_impact, find_second_push
-from avmsf.capture.prepare import Prepared, remove_rumble
+from avmsf.capture.prepare import Prepared, prepare, remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError
 
@@ -32,12 +33,9 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     filtered = remove_rumble(response, settings.highpass, recording)
     noise = decibels(noise_level(filtered, prepared.onset, rate) / float(np.abs(filtered).max()))
     clipped = clipped_samples(response)
-    if prepared.pulse is not None and settings.force_channel is not None:
-        force = recording.channel(settings.force_channel)
-        clipped += clipped_samples(force)
-        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=seconds)
-    else:
-        second = find_second_impact(response, prepared.onset, sample_rate=rate, seconds=seconds)
+    if settings.force_channel is not None:
+        clipped += clipped_samples(recording.channel(settings.force_channel))
+    second = _second_impact(recording, prepared, response, prepared.onset, settings=settings, seconds=seconds)
     others = (each for row, each in enumerate(recording.channels, 1) if row not in (channel, settings.force_channel))
     problems = []
     if settings.response_channel is None and any(not np.array_equal(each, response) for each in others):
@@ -74,6 +72,40 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
         clipped=clipped,
         double_hit_seconds=None if second is None else second / rate,
     )
+
+
+def _second_impact(
+    recording: Recording,
+    prepared: Prepared,
+    sound: Float64[np.ndarray, " frames"],
+    begin: int,
+    *,
+    settings: CaptureSettings,
+    seconds: float,
+) -> int | None:
+    """Return the sample of `sound` or of the force's channel at which the object was struck again, or None."""
+    rate = recording.sample_rate
+    if prepared.pulse is not None and settings.force_channel is not None:
+        force = recording.channel(settings.force_channel)
+        return find_second_push(force, prepared.pulse, sample_rate=rate, seconds=seconds)
+    return find_second_impact(sound, begin, sample_rate=rate, seconds=seconds)
+
+
+def prepare_single(recording: Recording, settings: CaptureSettings) -> tuple[Prepared, int | None]:
+    """Prepare a recording of one impact; of more, up to the second, whose sample in the file is returned as well.
+
+    Raises `CaptureError` as `prepare`, and for a hum or noise (`check_impulsive`).
+    """
+    rate, prepared = recording.sample_rate, prepare(recording, settings)
+    # Of one channel all is used, the silence before the impact too.
+    samples = recording.response() if len(recording.channels) == 1 else prepared.sound
+    check_impulsive(samples, sample_rate=rate, name=recording.name)
+    begin, seconds = prepared.onset if settings.align else 0, len(prepared.sound) / rate
+    second = _second_impact(recording, prepared, prepared.sound, 0, settings=settings, seconds=seconds)
+    if second is None:
+        return prepared, None
+    second += begin if prepared.pulse is None else 0
+    return replace(prepared, sound=prepared.sound[: max(second - begin, shortest_allowed(rate))]), second
 
 
 def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:

@@ -65,8 +65,6 @@ class FrameMismatch:
     """Meters."""
     distance: float = 0.0
     """Meters within which nine of ten contacts lie off the surface once it is undone."""
-    stated: str = ""
-    """Words of a file that says so; then `axes` is any rotation."""
 
     def undo(self, contacts: Float64[np.ndarray, "contacts 3"]) -> Float64[np.ndarray, "contacts 3"]:
         """Return where the contacts were meant."""
@@ -89,8 +87,6 @@ class FrameMismatch:
 
     def __str__(self) -> str:
         within, steps = f"they lie within {_length(self.distance)} of it", []
-        if self.stated:
-            return f"{within} once moved as {self.stated} says that the object was: give both in one frame"
         if self.factor != 1:
             whose = "the surface's" if self.factor > 1 else "their"
             unit = f' (is {whose} unit "{self.unit}"?)' if self.unit else ""
@@ -172,18 +168,16 @@ class Placement:
             return f"{found}: in a spot too small for impacts all over it; check that both are in one unit and frame"
         return (
             f"{found}, and no change of unit, axes or origin explains it: the {what} and the contacts are in different "
-            "frames; give both in one (structure from motion chooses its own: see docs/visual-inputs.md; nerfstudio "
-            "writes how it moved the object to dataparser_transforms.json, to be laid beside)"
+            "frames; give both in one (structure from motion chooses its own: see docs/visual-inputs.md; nerfstudio's "
+            "moved the object as its dataparser_transforms.json says)"
         )
 
 
-def check_placement(
-    contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, stated: Sequence[FrameMismatch] = ()
-) -> Placement:
+def check_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"]) -> Placement:
     """Measure how far contacts lie from a surface given by its points, and seek the similarity that explains them best.
 
-    Tried is what files have `stated` too. The similarity of the least description length is reported unless that leaves
-    the contacts where they are. Raises CaptureError where there are no contacts, or points without an extent.
+    That of the least description length is reported unless it leaves the contacts where they are. Raises CaptureError
+    where there are no contacts, or points without an extent.
     """
     places, cloud = contacts.double().numpy(), points.double().numpy()
     for name, values in (("contacts", places), ("points", cloud)):
@@ -204,7 +198,7 @@ def check_placement(
         tolerance=max(TOLERANCE * diagonal, 2 * spacing),
     )
     some, resolution = _evenly(places, _BOUNDS.max_contacts), max(spacing, _BOUNDS.resolution * diagonal)
-    return replace(placement, mismatch=_find_mismatch(tree, some, placement, resolution, stated))
+    return replace(placement, mismatch=_find_mismatch(tree, some, placement, resolution))
 
 
 def expect_placed(
@@ -232,12 +226,10 @@ def _find_mismatch(
     contacts: Float64[np.ndarray, "contacts 3"],
     placement: Placement,
     resolution: float,
-    stated: Sequence[FrameMismatch],
 ) -> FrameMismatch | None:
     """Return the similarity of the least description length; None where that changes nothing.
 
-    What is `stated` goes first where it leaves most contacts near: what is fitted to few contacts and coarse points
-    describes these better by chance. Below the `resolution`, meters, contacts lie equally well.
+    Below the `resolution`, meters, contacts lie equally well.
     """
     widest, tolerance = max(2 * resolution, float(placement.distances.max())), placement.tolerance
     steps = math.ceil(math.log(widest / resolution, 1.5)) + 1
@@ -262,10 +254,6 @@ def _find_mismatch(
     present = nats(FrameMismatch())
     if present - len(contacts) * (math.log(resolution) + 0.5) < 1:
         return None
-    for each in stated:
-        near, far = np.quantile(distances(each), (0.5, 0.9)).tolist()
-        if near <= tolerance and math.log(2) + nats(each) < present:
-            return replace(each, distance=far)
     starts = sorted(_starts(tree.data, contacts, placement), key=lambda start: start[0] + nats(start[1]))
     fitted = [(start[0], _fit(tree, contacts, *start[1:])) for start in starts[: _BOUNDS.max_starts]]
     for total, each in sorted(((code + nats(each), each) for code, each in fitted), key=lambda pair: pair[0]):

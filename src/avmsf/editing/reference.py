@@ -1,6 +1,5 @@
 """Guides towards reference sounds: recordings of another object, or synthetic sounds of a material."""
 
-import hashlib
 import math
 import warnings
 from collections.abc import Sequence
@@ -15,9 +14,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
 from avmsf.capture.audio import read_recording
-from avmsf.capture.measure import check_impulsive, find_clipping
-from avmsf.capture.onset import find_second_impact
-from avmsf.capture.prepare import prepare, shortest_allowed
+from avmsf.capture.measure import find_clipping, prepare_single
 from avmsf.capture.settings import CaptureSettings
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import AvmsfWarning, CaptureError, EditError
@@ -118,8 +115,7 @@ class Reference:
 
     def describe(self) -> dict[str, Any]:
         """Return its identifying settings, as plain values."""
-        digest = hashlib.sha256(self.clips.detach().cpu().contiguous().numpy().tobytes()).hexdigest()
-        return {"reference": self.name, "lengths": list(self.lengths), "samples_sha256": digest}
+        return {"reference": self.name, "lengths": list(self.lengths)}
 
     def start(self, rendered: FieldAtContacts) -> ModalEdit:
         """Return the edit by a common pitch and damping, up to 8 and 64 times either way, of least spectral error.
@@ -196,8 +192,7 @@ def _read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
         recording = read_recording(path)
         strongest = int(np.argmax(np.var(recording.channels, axis=1)))
         mono = replace(recording, channels=recording.channels[strongest : strongest + 1])
-        prepared = prepare(mono, CaptureSettings())
-        check_impulsive(mono.response(), sample_rate=mono.sample_rate, name=mono.name)
+        prepared, second = prepare_single(mono, CaptureSettings())
     except CaptureError as error:
         raise EditError(f"reference {error}", **{**error.attributes, "file": path}) from error
     sound, rate = prepared.sound, mono.sample_rate
@@ -208,12 +203,10 @@ def _read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
     clipped = find_clipping(mono.response(), name=mono.name)
     if clipped is not None:
         note(clipped, "clipping")
-    second = find_second_impact(sound, 0, sample_rate=rate, seconds=len(sound) / rate)
     if second is not None:
-        at = (prepared.onset / rate, (prepared.onset + second) / rate)
+        at = (prepared.onset / rate, second / rate)
         found = f"expected one impact, got two at {at[0]:.3f} s and {at[1]:.3f} s; only the first is used"
         note(f"{mono.name}: {found}", "impacts", at)
-        sound = sound[: max(second, shortest_allowed(rate))]
     if rate < sample_rate:
         lost = f"modes above {_HELD * 0.5 * rate:.4g} Hz are edited towards silence"
         note(f"{mono.name}: expected {sample_rate:g} Hz or more, got {rate:g} Hz; {lost}", "sample_rate", rate)

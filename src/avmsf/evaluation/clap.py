@@ -8,8 +8,6 @@ random, and of a fused network's clips declares one at random to be long; ours a
 long. Shorter sounds are repeated as the extractor's own settings have it, which is how the networks were trained.
 """
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,8 +40,6 @@ class Clap:
     """Its `ClapProcessor`: a tokenizer and a feature extractor."""
     name: str
     """What a report calls the network."""
-    digest: str
-    """SHA-256 of its weights and settings, in hexadecimal."""
 
     @classmethod
     def load(cls, source: str | Path = DEFAULT) -> "Clap":
@@ -72,7 +68,7 @@ class Clap:
             wanted, got = "all weights of a CLAP model", f"{len(missing)} missing such as {missing[0]}"
             raise EvaluationError.expected(wanted, missing, got=got, file=folder or name, name="weights", advice=advice)
         model.eval().requires_grad_(False)
-        return cls(model, processor, name, _digest_of(model, processor))
+        return cls(model, processor, name)
 
     @property
     def sample_rate(self) -> float:
@@ -96,7 +92,7 @@ class Clap:
         def score(sound: Float[Tensor, " samples"]) -> float:
             return float(self.score(sound[None], [prompt], sample_rate=sample_rate))
 
-        return PreviewScore(score, self.name, self.digest)
+        return PreviewScore(score, self.name)
 
     def embed(self, sounds: Float[Tensor, "..."], *, sample_rate: float) -> Float64[Tensor, "contacts dim"]:
         """Return the sounds' embeddings, of length one."""
@@ -140,11 +136,3 @@ class Clap:
 def _vector(output: Any) -> Float[Tensor, "rows dim"]:
     """Return the projected embeddings: until transformers 4 they came as they are, since then with the layers'."""
     return output.float() if isinstance(output, Tensor) else output.pooler_output.float()
-
-
-def _digest_of(model: Any, processor: Any) -> str:
-    """Return a digest of what decides embeddings: weights and the feature extractor's settings."""
-    digest = hashlib.sha256(json.dumps(processor.feature_extractor.to_dict(), sort_keys=True, default=str).encode())
-    for name, tensor in sorted(model.state_dict().items()):
-        digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
-    return digest.hexdigest()

@@ -15,8 +15,8 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike
 from avmsf._utils.progress import ProgressDisplay
 from avmsf._utils.text import counted
-from avmsf.capture.audio import Recording, check_not_silent
-from avmsf.capture.onset import find_onset, find_pulse
+from avmsf.capture.audio import check_not_silent
+from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import remove_rumble, shortest_allowed
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
@@ -35,8 +35,6 @@ WARN_ABOVE = 0.3
 """The same, above which a note says that it may be."""
 MIN_EXPLAINED = 0.1
 """Part of a sound's energy that an impact at the most probable position explains, below which a note is given."""
-SAME_FORCE = 1.41
-"""Factor between a known force and the recorded one from which on a note is given: 3 dB, as `Force` is uncertain."""
 
 
 def locate(
@@ -62,8 +60,7 @@ def locate(
         settings: Take the place of those of the capture that the field was fitted to (see `preprocess_recording`).
         points: Candidates [points, 3] on the surface, meters, as for `Locator.of`; by default the field's.
         directions: Unit vectors [points, 3] of impacts at the candidates; by default straight into the surface.
-        force: Peak force of the impact, a number or `Force`, see `Locator.locate`; a note says where the recording's
-            own force channel differs.
+        force: Peak force of the impact, a number or `Force`, see `Locator.locate`.
         locator: One made of the field before, with points of its own.
         progress: Whether a terminal shows that it works.
 
@@ -79,25 +76,14 @@ def locate(
         what = "points or directions" if locator.field is field else "another field"
         wanted = "one of this field, without points and directions"
         raise LocationError.expected(wanted, what, got=f"one with {what}", name="locator", advice="leave it out")
-    known = None if force is None else Force.of(force)
     with ProgressDisplay(shown=progress) as display:
         display.doing("locating the impact; the first of a field takes seconds to minutes")
         impact = preprocess_recording(recording, field, sample_rate=sample_rate, settings=settings)
         if locator is None and points is None and directions is None:
             locator = _locator_of(field)
         finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
-        found = finder.locate(impact.sound, highest=impact.highest, force=known)
-    measured = measured_force_notes(impact.newtons, field, known)
-    return assess_match(replace(found, notes=(*impact.notes, *measured, *found.notes)))
-
-
-def measured_force_notes(newtons: float | None, field: SoundField, force: Force | None) -> tuple[str, ...]:
-    """Return a note where a known force is not the one in the recording's force channel, `newtons`."""
-    if force is None or not newtons or not field.origin.per_newton:
-        return ()
-    if 1.0 / SAME_FORCE < force.expected / newtons < SAME_FORCE:
-        return ()
-    return (f"expected a force of {newtons:.3g} N as in the recording's force channel, got {force.expected:.3g} N",)
+        found = finder.locate(impact.sound, highest=impact.highest, force=force)
+    return assess_match(replace(found, notes=(*impact.notes, *found.notes)))
 
 
 @lru_cache(maxsize=1)
@@ -148,13 +134,6 @@ _PREDICTION_SECONDS = 0.006
 """Length of the past from which linear prediction takes the next sample."""
 _ONSET_RATIO, _MIN_RELATIVE_LEVEL = 4.0, 0.1
 """Level of the prediction residual at an onset, at least: over that before it, and over its largest."""
-_TRAVEL_SECONDS = 0.02
-"""Longest time from a push to the onset of its sound: a microphone up to 6.9 m away. Impacts are farther apart."""
-_PUSH_SECONDS = 0.005
-"""Longest time from the onset to the peak of the push, with a near microphone and a soft hammer."""
-_MIN_PUSH_RATIO = 12.0
-"""Range of the force channel around a push, at least, over the standard deviation of its noise: noise has 10 at most.
-"""
 
 
 def locate_impacts(
@@ -169,13 +148,12 @@ def locate_impacts(
     """Return the onset of each impact in a recording, seconds, and its map, in order.
 
     Bare samples are at `sample_rate` Hz, or at the field's rate; `settings` as for `preprocess_recording`; `force`, of
-    every impact, as for `locate`, is compared with the push in the force channel up to 20 ms before the onset;
-    `locator` is one made of the field before. The decaying sound of earlier impacts is fitted by the object's modes
-    just before an impact, extrapolated and subtracted. Impacts on other objects are left out, which a note says, and
-    impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`, where no impact can be
-    located, and for settings with `normalize = "deconvolve"` where the recording has a force channel.
+    every impact, as for `locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is
+    fitted by the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left
+    out, which a note says, and impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`,
+    where no impact can be located, and for settings with `normalize = "deconvolve"` where the recording has a force
+    channel.
     """
-    known = None if force is None else Force.of(force)
     whole, chosen, notes = open_recording(recording, field, sample_rate=sample_rate, settings=settings)
     if chosen.normalize == "deconvolve":
         wanted, advice = "a recording of one impact", "cut it into one recording for each impact"
@@ -185,7 +163,6 @@ def locate_impacts(
         check_not_silent(response, whole.name)
         sound = remove_rumble(response, chosen.highpass, whole)
     onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
-    forces = _peak_forces(whole, onsets, chosen)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     finder = Locator.of(field) if locator is None else locator
     ratio = len(resampled) / len(sound)
@@ -199,15 +176,14 @@ def locate_impacts(
             own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         seconds = onset / whole.sample_rate
         try:
-            located = assess_match(finder.locate(own.float(), highest=highest, force=known))
+            located = assess_match(finder.locate(own.float(), highest=highest, force=force))
             if located.refusal is not None:
                 message = f"{whole.name}, impact at {seconds:.3f} s: {located.refusal}"
                 raise LocationError(message, file=whole.name, name="impact", value=seconds)
         except LocationError as error:
             rejected.append((seconds, error))
             continue
-        measured = measured_force_notes(forces[number], field, known)
-        found.append((seconds, replace(located, notes=(*notes, *remark, *measured, *located.notes))))
+        found.append((seconds, replace(located, notes=(*notes, *remark, *located.notes))))
     if not found:
         raise rejected[0][1]
     if not rejected:
@@ -215,21 +191,6 @@ def locate_impacts(
     times = ", ".join(f"{seconds:.3f}" for seconds, _ in rejected)
     left_out = f"{whole.name}: {counted(len(rejected), 'impact')}, at {times} s, could not be located: {rejected[0][1]}"
     return [(seconds, replace(each, notes=(*each.notes, left_out))) for seconds, each in found]
-
-
-def _peak_forces(recording: Recording, onsets: list[int], settings: CaptureSettings) -> list[float | None]:
-    """Return the peak force of each impact by the recording's force channel; None without a push above the noise.
-
-    The push is searched from `_TRAVEL_SECONDS` before the onset of the sound to `_PUSH_SECONDS` after it.
-    """
-    if settings.force_channel is None:
-        return [None] * len(onsets)
-    force = recording.channel(settings.force_channel)
-    before, after = (round(seconds * recording.sample_rate) for seconds in (_TRAVEL_SECONDS, _PUSH_SECONDS))
-    parts = [force[max(0, onset - before) : onset + after] for onset in onsets]
-    # From the 90 % quantile of Gaussian noise: pushes take less than a tenth of the time.
-    limit = _MIN_PUSH_RATIO / 1.645 * float(np.quantile(np.abs(force - np.median(force)), 0.9))
-    return [abs(find_pulse(part).height * settings.force_scale) if np.ptp(part) > limit else None for part in parts]
 
 
 def detect_onsets(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> list[int]:

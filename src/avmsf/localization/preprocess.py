@@ -15,9 +15,8 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, read_recording
-from avmsf.capture.measure import check_impulsive, find_clipping
-from avmsf.capture.onset import find_second_impact, find_second_push
-from avmsf.capture.prepare import prepare, shortest_allowed
+from avmsf.capture.measure import find_clipping, prepare_single
+from avmsf.capture.prepare import shortest_allowed
 from avmsf.capture.preprocess import latest_start
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import ArrayError, CaptureError, LocationError
@@ -43,8 +42,6 @@ class PreparedImpact:
     """Frequency in Hz up to which the recording holds the sound; None where that is half the field's rate."""
     notes: tuple[str, ...]
     """Messages for the user."""
-    newtons: float | None = None
-    """Peak force by the recording's force channel; None without one."""
 
 
 def preprocess_recording(
@@ -65,32 +62,20 @@ def preprocess_recording(
     """
     whole, chosen, notes = open_recording(recording, field, sample_rate=sample_rate, settings=settings)
     with location_errors():
-        prepared = prepare(whole, chosen)
+        prepared, second = prepare_single(whole, chosen)
         if settings is None and not field.origin.settings.align and prepared.onset < latest_start(whole.sample_rate):
             # It starts with its impact as those did that the field was fitted to, which were not cut.
-            prepared = prepare(whole, replace(chosen, align=False))
-        # Of one channel all is used, the silence before the impact too.
-        samples = whole.response() if len(whole.channels) == 1 else prepared.sound
-        check_impulsive(samples, sample_rate=whole.sample_rate, name=whole.name)
+            prepared, second = prepare_single(whole, replace(chosen, align=False))
     # A pulse that was divided out took the force of the impact with it.
     sound = prepared.sound if prepared.newtons is None else prepared.sound * prepared.newtons
-    begin = prepared.onset if chosen.align else 0
-    rate, seconds = whole.sample_rate, len(sound) / whole.sample_rate
-    if prepared.pulse is not None and chosen.force_channel is not None:
-        force = whole.channel(chosen.force_channel)
-        second = find_second_push(force, prepared.pulse, sample_rate=rate, seconds=seconds)
-    else:
-        after = find_second_impact(sound, 0, sample_rate=rate, seconds=seconds)
-        second = None if after is None else begin + after
     if second is not None:
+        first, later = (each / whole.sample_rate for each in (prepared.onset, second))
         notes.append(
-            f"{whole.name}: expected one impact, got more, at {prepared.onset / rate:.3f} s and at {second / rate:.3f} "
-            "s: only the first was located; --several (in Python locate_impacts) locates all"
+            f"{whole.name}: expected one impact, got more, at {first:.3f} s and at {later:.3f} s: only the first was "
+            "located; --several (in Python locate_impacts) locates all"
         )
-        sound = sound[: max(second - begin, shortest_allowed(rate))]
     at_rate, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
-    newtons = None if prepared.pulse is None else abs(prepared.pulse.height * chosen.force_scale)
-    return PreparedImpact(at_rate, prepared.onset, highest, (*notes, *remark), newtons)
+    return PreparedImpact(at_rate, prepared.onset, highest, (*notes, *remark))
 
 
 @contextmanager

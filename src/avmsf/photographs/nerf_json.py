@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from avmsf._utils.text import read_json, read_json_object
+from avmsf._utils.text import read_json_object
 from avmsf.capture.filenames import PICTURE_SUFFIXES
-from avmsf.capture.placement import FrameMismatch
 from avmsf.errors import CaptureError
 from avmsf.mesh.io import load_parts
 from avmsf.photographs.lenses import CameraFile, Lens, Location, Photograph
@@ -75,32 +74,6 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
     if painted.shape[:1] == points.shape[:1]:
         colors = painted[:, :3].astype(np.uint8)
     return (points, colors) if len(points) else None
-
-
-def stated_moves(folder: Path, *, meters: float = 1.0) -> list[FrameMismatch]:
-    """Return how nerfstudio says that it moved an object, in transforms.json or beside it; none where it does not.
-
-    A position x became scale * (transform x), in units of so many `meters`. What cannot be read is passed over.
-    """
-    found = []
-    for name, keys in (
-        ("transforms.json", ("applied_transform", "applied_scale")),
-        ("dataparser_transforms.json", ("transform", "scale")),
-    ):
-        try:
-            record = read_json(folder / name)
-            matrix = np.array(record.get(keys[0], np.eye(4)), dtype=np.float64)[:3].reshape(3, 4)
-            scale = float(record.get(keys[1], 1.0))
-        except (OSError, ValueError, TypeError, AttributeError):
-            continue
-        determinant = float(np.linalg.det(matrix[:, :3]))
-        stretch = determinant ** (1 / 3) if determinant > 0 else math.nan
-        factor, shift = scale * stretch * meters, scale * meters * matrix[:, 3]
-        moved = factor != 1 or not np.allclose(matrix, np.eye(4)[:3])
-        if 0 < factor < math.inf and np.isfinite(matrix).all() and moved:
-            words = ", ".join(f"{key} = {np.round(record[key], 4).tolist()}" for key in keys if key in record)
-            found.append(FrameMismatch(factor, matrix[:, :3] / stretch, shift, stated=f"{name} ({words})"))
-    return found
 
 
 def _lens(settings: Mapping[str, Any], where: Location, fisheye: bool, image_width: int, image_height: int) -> Lens:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from avmsf.capture.placement import FACTORS, WRONG_ROWS, FrameMismatch, check_placement
+from avmsf.capture.placement import FACTORS, WRONG_ROWS, check_placement
 from avmsf.capture.settings import CaptureSettings, unit_named
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface
@@ -107,15 +107,12 @@ def expect_contacts_in_views(
     contacts: Float[Tensor, "contacts 3"],
     views: Sequence[View],
     settings: CaptureSettings,
-    *,
-    stated: Sequence[FrameMismatch] = (),
 ) -> None:
     """Raise CaptureError where cameras do not see one object, or see it elsewhere than the contacts (m) lie.
 
     Masks of one object have a common volume, the hull, and contacts on it lie inside its mask in every view. Where most
     do not in the median view, a unit is the mistake if nearly all do once it is undone; of several the largest, for
-    contacts that are shrunk enough lie inside whatever they were. What files have `stated` is it where its undoing
-    explains the contacts' distances to the hull. Views without masks say nothing.
+    contacts that are shrunk enough lie inside whatever they were. Views without masks say nothing.
     """
     chosen = _masked(views)
     if not chosen:
@@ -135,19 +132,10 @@ def expect_contacts_in_views(
                 name="cameras",
                 value=len(chosen),
             )
-    inside = 2 * _share_inside(contacts, chosen) > 1
-    if inside and not (stated and hull):
+    if 2 * _share_inside(contacts, chosen) > 1:
         return
     factor = max((each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS), default=1.0)
-    placement = None if hull is None else check_placement(contacts, _surface_of(hull), stated=stated)
-    if placement is not None and placement.mismatch is not None and placement.mismatch.stated:
-        raise CaptureError(
-            f"expected contacts on the object in the photographs: {placement.mismatch}",
-            name="frame",
-            value=float(placement.distances.max()),
-        )
-    if inside:
-        return
+    placement = None if hull is None else check_placement(contacts, _surface_of(hull))
     name = unit_named(factor * settings.meters)
     changed = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
     reason = f"and inside when multiplied by {factor:.4g}; {changed}"
@@ -166,7 +154,6 @@ def expect_on_object(
     *,
     names: Sequence[str],
     what: str = "surface",
-    stated: Sequence[FrameMismatch] = (),
     strict: bool = False,
 ) -> None:
     """Warn with `CaptureWarning` of contacts off `what` the object's points are, with the mistake that may explain it.
@@ -174,7 +161,7 @@ def expect_on_object(
     Raises `CaptureError` for contacts in another frame, for one farther off than the object is large, and, if `strict`,
     for any off it. The `value` of both is the largest distance, meters.
     """
-    placement = check_placement(contacts, points, stated=stated)
+    placement = check_placement(contacts, points)
     words, distance = placement.describe(names, what=what), float(placement.distances.max())
     apart = placement.fault in ("frame", "unit") or distance > placement.diagonal
     if words and (apart or (strict and placement.off)):

@@ -23,7 +23,6 @@ from avmsf.mesh import Surface
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import read_surface, surface_points, write_surface
 from avmsf.photographs import read_views
-from avmsf.photographs.nerf_json import stated_moves
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
 from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
@@ -147,17 +146,16 @@ def _shape_of_views(
 ) -> FitShape:
     """Return the shape that views show; `given` are features with their report, in place of those of the views."""
     impacts, settings = capture.impacts, capture.settings
-    stated = stated_moves(scene.source_folder, meters=settings.views_meters)
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         views = read_views(scene[VIEWS].path)
         warning = None if capture.surface is None else check_outlines(capture.surface, views, settings)
         if warning is not None:
             warnings.warn(warning, stacklevel=2)
-        expect_contacts_in_views(impacts.contacts, views, settings, stated=stated)
+        expect_contacts_in_views(impacts.contacts, views, settings)
     if scene.splats is not None:
         points = read_splats(scene[CLOUD].path).centers
-        expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians", stated=stated)
+        expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians")
     features, report = given or (load_features(scene.features.path), read_report(scene.features.path))
     surface, digest = object_shape(capture.surface, scene)
     # The paper's network reads the Gaussians' own centers.
@@ -177,7 +175,7 @@ def _shape_of_views(
     # Structure from motion knows nothing of the frame that the contacts are in.
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
     if scene.splats is None or given is not None:
-        expect_on_object(impacts.contacts, features.points, names=impacts.names, stated=stated, strict=found_frame)
+        expect_on_object(impacts.contacts, features.points, names=impacts.names, strict=found_frame)
 
     def symmetries() -> Symmetries | None:
         found = report.get("symmetries")

@@ -19,7 +19,6 @@ from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning,
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import mask_paths, read_camera_file, read_views
-from avmsf.photographs.nerf_json import stated_moves
 from avmsf.photographs.segmentation import find_foreground
 from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, check_outlines, expect_contacts_in_views, expect_on_object
 from avmsf.pipeline.scene import scaled, without_far
@@ -134,7 +133,6 @@ def misplaced(folder: Path, settings: CaptureSettings | None, visual: VisualInpu
     if not len(contacts):
         return []
     names = [row.cells["file"] for row in rows] if len(rows) == len(contacts) else []
-    stated = stated_moves(folder, meters=settings.views_meters)
     found = list[AvmsfWarning | AvmsfError]()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CaptureWarning)
@@ -145,10 +143,10 @@ def misplaced(folder: Path, settings: CaptureSettings | None, visual: VisualInpu
                 surface = None if visual.mesh is None else find_surface(folder, settings)
                 outlines = None if surface is None else check_outlines(surface, views, settings)
                 found += [] if outlines is None else [outlines]
-                expect_contacts_in_views(contacts, views, settings, stated=stated)
+                expect_contacts_in_views(contacts, views, settings)
             if visual.gaussians is not None:
                 cloud = without_far(scaled(read_splats(folder / visual.gaussians), settings.views_meters))
-                expect_on_object(contacts, cloud.centers, names=names, what="Gaussians", stated=stated)
+                expect_on_object(contacts, cloud.centers, names=names, what="Gaussians")
         except (CaptureError, SceneError) as error:
             found.append(error)
     # The error says what the cameras' axes show, and which photographs are missing the camera file's check.
