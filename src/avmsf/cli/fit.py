@@ -239,9 +239,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
         if options.output is not None:
             copy_whole(made.field, options.output)
     path, aligned = options.output or made.field, AlignmentReport.of(made.modes, train)
-    lines = [fitted.origin.report["advice"]] if fitted.origin.report.get("advice") else []
-    if aligned is not None:
-        lines += aligned.sentences() if display.verbose else aligned.warnings()
+    lines = [] if aligned is None else aligned.sentences() if display.verbose else aligned.warnings()
     lines += features_lines(made.report) if made.report and display.verbose else []
     scores: dict[str, Scores] = {}
     if test is not None:

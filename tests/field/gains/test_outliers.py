@@ -11,7 +11,6 @@ from torch import Tensor
 from avmsf.capture.impacts import Impacts
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.kernels import KernelFamily, Sites
-from avmsf.field.gains.labels import level_advice, order_advice
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import (
@@ -148,39 +147,6 @@ def test_exchanged_labels_are_found_with_the_places_exchanged() -> None:
     assert "hit16" in found[9].describe(train, with_body=False)
 
 
-def test_recordings_given_to_rows_in_another_order_are_found_with_the_order() -> None:
-    true, rows = _sites(), torch.arange(CONTACTS)
-    text = sorted(range(CONTACTS), key=lambda row: str(row + 1))
-    for given, order in (
-        ([f"{row + 1}.wav" for row in text], torch.tensor(text).argsort()),
-        ([f"{(row + 2) % CONTACTS:03d}.wav" for row in range(CONTACTS)], rows.roll(2)),
-        ([f"{row:03d}.wav" for row in range(CONTACTS)], rows.flip(0)),
-    ):
-        # Contact r has the recording that is wanted there, `order[r]`; the table gives it the r-th.
-        gains = _gains(true)
-        moved = replace(gains, values=gains.values[order.argsort()])
-        found = order_advice(given, _families(true), rows, moved)
-        assert found is not None
-        changes = [f"{given[new]} for {given[row]}" for row, new in enumerate(order.tolist()) if new != row]
-        assert ", ".join(changes[:4]) in found
-        assert order_advice(given, _families(true), rows, gains) is None
-
-
-@pytest.mark.parametrize(("first", "level"), [(3, -10.0), (10, 5.0), (15, 20.0)])
-def test_recordings_of_two_levels_are_found_with_where_the_second_begins(first: int, level: float) -> None:
-    true, gains = _sites(), _gains(_sites())
-    moved = gains.values.clone()
-    moved[first:] *= 10 ** (level / 20)
-    names = [f"{row:02d}.wav" for row in range(CONTACTS)]
-    advice = level_advice(names, _families(true), replace(gains, values=moved))
-    assert advice is not None
-    assert f"from {first:02d}.wav on are {abs(level):.0f} dB {'louder' if level > 0 else 'weaker'}" in advice
-    assert level_advice(names, _families(true), gains) is None
-    # Where places say nothing of the gains, no level is wrong.
-    values = torch.view_as_complex(draw(CONTACTS, MODES, 2, seed=7))
-    assert level_advice(names, _families(true), replace(gains, values=values)) is None
-
-
 def test_a_recording_of_another_gain_is_named_as_such() -> None:
     true, gains = _sites(), _gains(_sites())
     gains.values[6] *= 0.1
@@ -208,9 +174,7 @@ def test_noise_accuses_nobody() -> None:
         size = 10.0 ** torch.randint(0, 2, (CONTACTS, 1), generator=generator)
         noise = torch.randn(CONTACTS, MODES, dtype=torch.complex128, generator=generator) * size
         gains = MeasuredGains(noise, measured.variance, measured.frequency, measured.damping)
-        assessment = assess_contacts(_fit(sites, gains), None, sites, _places(), gains)
-        assert assessment.outliers == ()
-        assert not assessment.informative
+        assert assess_contacts(_fit(sites, gains), None, sites, _places(), gains).outliers == ()
 
 
 def test_few_places_accuse_nobody() -> None:

@@ -5,7 +5,7 @@
 - `mixture`: regression, evidence, the average over kernels and leave-one-out predictions (R&W 2, 5). Start here.
 - `fitting`: measured gains, the prior of kernels learned from all modes, and which shape of a body a mode is.
 - `mixture_gains`, `attention`, `scaled`: the final classes, and their form in a file.
-- `outliers`, `labels`: log predictive ratios, by which labels are wrong and whether a body is credible.
+- `outliers`: log predictive ratios, by which labels are wrong and whether a body is credible.
 - `regression`: the model of some contacts and bodies, with what gains say of supports and of changed stiffness.
 - `estimator`: the order of all this in a fit, and the gains at the contacts, refined end to end on spectra.
 

@@ -208,7 +208,6 @@ class MixtureEstimator(GainEstimator):
         report["levels"] = levels
         report["support_evidence"] = evidence
         report["thickness"] = None if thickness is None else asdict(thickness)
-        report["advice"] = None if assessment.informative else fit.advice(found.bodies)
         return replace(found.model, report=report), found.rows
 
     def _refined(self, fit: Regression, bodies: Sequence[CandidateBody]) -> Solution:

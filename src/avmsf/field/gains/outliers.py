@@ -24,7 +24,7 @@ The contacts S that are set aside maximize
 
 found by adding, removing or exchanging one contact; the kernels are weighed again without S. A contact of S is an
 outlier if its own label is refuted, L_i < -1.5, and if another site or the opposite direction explains it. Where places
-say little of the gains nothing is an outlier, but all labels may be in another order (`labels`).
+say little of the gains nothing is an outlier.
 """
 
 import math
@@ -250,8 +250,6 @@ class ContactAssessment:
     """By ratio, the lowest first."""
     credibility: Credibility | None
     """None without a body."""
-    informative: bool
-    """Whether places say enough of the gains to accuse a contact; else all labels may be wrong, or places too far."""
 
     @property
     def rows(self) -> frozenset[int]:
@@ -289,10 +287,9 @@ def assess_contacts(
     if credibility is None or not credibility.credible:
         used = _search(plain, sites, measured)
     mean = used.mean()
-    informative = mean >= _INFORMATIVE
-    located = [_located(used, row, places, mean) for row in sorted(used.aside)] if informative else []
+    located = [_located(used, row, places, mean) for row in sorted(used.aside)] if mean >= _INFORMATIVE else []
     outliers = sorted((each for each in located if each is not None), key=lambda each: each.ratio)
-    return ContactAssessment(tuple(outliers), credibility, informative)
+    return ContactAssessment(tuple(outliers), credibility)
 
 
 def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> frozenset[int]:

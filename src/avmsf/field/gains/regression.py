@@ -21,7 +21,6 @@ from avmsf.field.gains.data import GainData, gain_variance
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, matched, total_evidence
 from avmsf.field.gains.kernels import POSITIONAL, KernelFamily, Sites, Unstructured, Visual
-from avmsf.field.gains.labels import level_advice, order_advice
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import ContactAssessment, Fit, assess_contacts, predicts_better
@@ -30,7 +29,7 @@ from avmsf.mesh.points import farthest_points
 from avmsf.symmetry.characters import Group
 
 _MAX_SPREAD = 64
-"""Contacts that a body is updated from, or orders and levels are compared at, at most."""
+"""Contacts that a body is updated from, at most."""
 _PLACES = 500
 """Points of the surface where the contacts that contradict the others may have been."""
 
@@ -177,8 +176,8 @@ class Regression:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
         if body.elastic.perturbations is None:
             return None
-        # The cost goes with the cube of the number of contacts.
-        rows = rows[self._spread_out(rows)]
+        # The cost goes with the cube of the number of contacts, and some far from each other say enough of the body.
+        rows = rows[farthest_points(self.sites.points[rows], min(_MAX_SPREAD, len(rows))).sort().values]
         sites, measured = self.sites.take(rows), self.measured.take(rows)
         others = [WeighedFamily.of(family, measured) for family in self.families(rows)]
         found = update(
@@ -196,20 +195,6 @@ class Regression:
             return lambda rows, noise_shares: self(rows, bodies, noise_shares).model
 
         return assess_contacts(fitted([]), None if best is None else fitted([best]), self.sites, places, self.measured)
-
-    def advice(self, bodies: Sequence[CandidateBody]) -> str | None:
-        """Return what makes the recordings agree with the contacts far better: one level, or another order."""
-        names, rows = self.data.train.names, self._spread_out(torch.arange(len(self.sites)))
-        positional = [kind(self.sites.take(rows), self._size) for kind in POSITIONAL.values()]
-        level = level_advice([names[row] for row in rows.tolist()], positional, self.measured.take(rows))
-        if level is not None:
-            return level
-        families = [*self.families(rows), *(self.elastic(rows, body.elastic) for body in bodies)]
-        return order_advice(names, families, rows, self.measured)
-
-    def _spread_out(self, rows: Int[Tensor, " rows"]) -> Int[Tensor, " some"]:
-        """Return which of some rows are far from each other, sorted: they say enough of what all have in common."""
-        return farthest_points(self.sites.points[rows], min(_MAX_SPREAD, len(rows))).sort().values
 
     @property
     def _size(self) -> float:
