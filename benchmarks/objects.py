@@ -19,7 +19,7 @@ from avmsf.capture.prepare import prepare
 from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.splits import split
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import CandidateBodies, SurfaceBodies
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import along_phase
@@ -223,7 +223,7 @@ def bodies_of(surface: Surface | ObjectShape, settings: Settings) -> CandidateBo
 def solid_estimator(surface: Surface, settings: Settings) -> MixtureEstimator:
     """Return the gain models' estimator for a solid body with this surface, coarse for a quick look."""
     shapes, dofs = (12, 20_000) if settings.quick else (60, 40_000)
-    return MixtureEstimator(bodies=SurfaceBodies(surface, thicknesses=[None], count=shapes, dofs=dofs))
+    return MixtureEstimator(bodies=CandidateBodies(surface, thicknesses=[None], count=shapes, dofs=dofs))
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from avmsf.capture import read_capture, write_capture
 from avmsf.evaluation.splits import split
-from avmsf.fem.candidate_bodies import SurfaceBodies
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.fem.material import NOMINAL, material_named
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
@@ -103,7 +103,7 @@ def _frequencies(settings: Settings) -> Iterator[Record]:
         true = make_body(replace(recipe, elastic_modes=COMPARED), cache=None, log=lambda message: None)
         dofs, messages = 5000 if settings.quick else 40_000, list[str]()
         begun = processor_seconds()
-        made = SurfaceBodies(true.surface, thicknesses=[None], count=COMPARED, dofs=dofs, log=messages.append)
+        made = CandidateBodies(true.surface, thicknesses=[None], count=COMPARED, dofs=dofs, log=messages.append)
         modes = made.bodies[0].elastic
         taken, material = processor_seconds() - begun, material_named(recipe.material)
         speed = (material.young / material.density * NOMINAL.density / NOMINAL.young) ** 0.5

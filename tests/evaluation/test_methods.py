@@ -39,6 +39,7 @@ from avmsf.field.gains.attention import Attention
 from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.synthesis import synthesize
 from factories.clouds import cloud
+from factories.known_bodies import KnownBodies
 from factories.made_sheet import sheet_over
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_features, plate_impacts
 from factories.raising import raises
@@ -79,7 +80,7 @@ def plate_bodies() -> CandidateBodies:
     """Return a sheet of the plate's size, of a few hundred elements: enough to be computed with."""
     sheet = sheet_over(np.linspace(0, PLATE.length, 5), np.linspace(0, PLATE.width, 5))
     solid = shell(sheet, thickness=PLATE.thickness, detail=0.15)
-    return CandidateBodies([CandidateBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12))])
+    return KnownBodies([CandidateBody(PLATE.thickness, elastic_modes(solid, NOMINAL, count=12))])
 
 
 @cache

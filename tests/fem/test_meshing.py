@@ -13,7 +13,7 @@ from trimesh import Trimesh
 
 from avmsf.errors import SimulationError
 from avmsf.fem import meshing
-from avmsf.fem.candidate_bodies import SurfaceBodies
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.fem.meshing import (
     TOLERANCES,
     CheckedSurface,
@@ -161,7 +161,7 @@ def test_a_dense_mesh_vibrates_as_a_coarse_one_of_the_same_shape(dense, coarse, 
     # Those that the wall is made of are far fewer.
     limit(monkeypatch, 6000)
     found, known = (
-        SurfaceBodies(surface_of(mesh), thicknesses=[0.002], count=4, dofs=8000).bodies[0].elastic
+        CandidateBodies(surface_of(mesh), thicknesses=[0.002], count=4, dofs=8000).bodies[0].elastic
         for mesh in (dense, coarse)
     )
     # Without thinning, elements that differ change frequencies by 1.5 % at this size.

@@ -12,7 +12,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, SurfaceBodies
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import GainData, gain_data, gain_variance
@@ -27,6 +27,7 @@ from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
+from factories.known_bodies import KnownBodies
 from factories.made_dome import STIFFER, WALLS, bodies, dome, points, truth
 from factories.raising import raises
 
@@ -34,7 +35,7 @@ RATE, SAMPLES, LEVEL = 12000.0, 2400, 0.01
 CONFIG = FitConfig(warmup_steps=0, steps=6, fft_sizes=(1024, 256), early=1024, damping="shared")
 
 
-class Asked(CandidateBodies):
+class Asked(KnownBodies):
     """Makes bodies finer in name alone, and remembers which were asked for."""
 
     def __init__(self, *known: CandidateBody) -> None:
@@ -48,7 +49,7 @@ class Asked(CandidateBodies):
 
 def estimator(*known: CandidateBody, kinds: tuple[str, ...] = ()) -> MixtureEstimator:
     """Return the estimator of these bodies, or of all the dome's."""
-    candidates = CandidateBodies(known or bodies())
+    candidates = KnownBodies(known or bodies())
     return MixtureEstimator(kinds, candidates) if kinds else MixtureEstimator(bodies=candidates)
 
 
@@ -112,7 +113,7 @@ def test_the_true_wall_and_its_stiffness_are_the_most_probable() -> None:
 def test_a_mesh_in_centimeters_is_said_to_be() -> None:
     """Read in meters, it has frequencies a hundredth of the object's."""
     slow = [replace(each, elastic=replace(each.elastic, frequency=each.elastic.frequency / 100)) for each in bodies()]
-    candidates = CandidateBodies(slow)
+    candidates = KnownBodies(slow)
     candidates.unit_ratios = CaptureSettings().unit_ratios(8.0)
     report = MixtureEstimator(bodies=candidates).solve(case())[0].report
     assert (report["bodies"][0]["body"], report["bodies"][0]["unit"]) == (bodies()[1].name, "cm")
@@ -143,16 +144,10 @@ def test_a_fine_body_is_not_computed_again() -> None:
 
 def test_estimators_of_other_bodies_or_elements_have_other_digests() -> None:
     assert estimator().digest() == estimator().digest()
-    finer = [CandidateBodies(bodies()) for _ in range(2)]
+    finer = [KnownBodies(bodies()) for _ in range(2)]
     finer[0].dofs, finer[1].dofs = 20_000, 40_000
     made = (estimator(), estimator(*bodies()[:2]), *(MixtureEstimator(bodies=each) for each in finer))
     assert len({each.digest() for each in made}) == len(made)
-
-
-def test_reasons_against_other_bodies_are_reported() -> None:
-    known = CandidateBodies(bodies()[1:2], {None: "the mesh is open"})
-    report = MixtureEstimator(bodies=known).solve(case())[0].report
-    assert report["unavailable"] == {"solid body": "the mesh is open"}
 
 
 def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
@@ -223,12 +218,6 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
     estimator_for("smooth", make)
 
 
-def test_a_stated_wall_is_not_blamed_for_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avmsf.fem.body_meshes.free_memory", lambda: 1000.0)
-    with raises(SimulationError, name="memory"):
-        candidate_bodies(dome(), BodyConfig(wall=0.004))
-
-
 def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
     told: list[str] = []
     surface = Surface(1000.0 * dome().vertices, dome().faces)
@@ -277,7 +266,7 @@ class Cup:
 
 @pytest.mark.slow
 def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
-    filled, *walls = SurfaceBodies(Cup(), count=6, dofs=4000).bodies
+    filled, *walls = CandidateBodies(Cup(), count=6, dofs=4000).bodies
     assert filled.thickness is None
     assert [body.thickness for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)])
     lowest = [float(body.elastic.frequency[0]) for body in walls]
@@ -289,7 +278,7 @@ def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
 
 @pytest.mark.slow
 def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
-    found = SurfaceBodies(Cup(opens=False), count=6, dofs=4000)
+    found = CandidateBodies(Cup(opens=False), count=6, dofs=4000)
     walls = found.bodies[1:]
     assert [body.closed for body in walls] == 5 * [False] + 5 * [True]
     for cup, box in zip(walls[:5], walls[5:], strict=True):
@@ -304,10 +293,8 @@ def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
 
 
 def test_walls_that_cannot_be_had_are_left_out() -> None:
-    found = SurfaceBodies(Cup(most=0.01), count=4, dofs=2000)
+    found = CandidateBodies(Cup(most=0.01), count=4, dofs=2000)
     assert all(body.thickness is None or body.thickness <= 0.01 for body in found.bodies)
-    # Tetrahedra are random, and may miss a thin wall.
-    assert len([wall for wall in found.refused if wall is not None and wall > 0.01]) == 3
     assert found.with_thickness(found.bodies[0], 0.011) is None
 
 

@@ -169,7 +169,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_field_does_not_depend_on_free_memory_and_is_made_again_once_there_are_bodies(tmp_path, monkeypatch):
+def test_a_field_does_not_depend_on_why_there_are_no_bodies_and_is_made_again_once_there_are(tmp_path, monkeypatch):
     capture = read_capture(fill_plate(tmp_path / "plate"))
     failures: list[Exception | None] = []
 

@@ -3,14 +3,14 @@
 A surface does not say whether the object is solid, how thick its wall is or where it was held, all of which decide the
 shapes of its modes. So several bodies are hypotheses, of few degrees of freedom, enough to choose by; the chosen one is
 refined, other thicknesses and supports are computed when the recordings ask for them. Refinement, thicknesses and the
-chosen support are calls of one function, `SurfaceBodies.modes`, whose results are kept in memory and, by content, in a
-folder. Supports are compared on a basis of few elements (`HeldModes`), which is not kept.
+chosen support are calls of one function, `CandidateBodies.modes`, whose results are kept in memory and, by content, in
+a folder. Supports are compared on a basis of few elements (`HeldModes`), which is not kept.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -24,15 +24,7 @@ from threadpoolctl import threadpool_limits
 from avmsf._utils.caching import content_digest, key_of, once, source_digest
 from avmsf._utils.compiled import lane_count
 from avmsf.errors import SimulationError
-from avmsf.fem.body_meshes import (
-    MIN_DOFS,
-    HollowShape,
-    count_dofs,
-    expect_memory,
-    filled_solid,
-    shape_solid,
-    wall_solids,
-)  # fmt: skip
+from avmsf.fem.body_meshes import MIN_DOFS, HollowShape, count_dofs, filled_solid, shape_solid, wall_solids
 from avmsf.fem.elastic_modes import ElasticModes, HeldModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.material import MAX_FREQUENCY_ERROR, NOMINAL, Material
@@ -45,6 +37,8 @@ Supports = Literal["auto", "free", "try"]
 """Whether bodies are held: where the free one predicts little, never, or always tried."""
 THICKNESS_RATIOS = tuple(float(ratio) for ratio in np.geomspace(0.003, 0.05, 6))
 """Thickness of walls that are tried, over the diagonal of the box around the surface."""
+PRESENT_UNIT: Mapping[str, float] = MappingProxyType({"m": 1.0})
+"""The only unit of a surface whose unit is known."""
 COARSE_DOFS = 12_000
 """Degrees of freedom at most of each of several bodies."""
 COARSE_WALL_DOFS = 22_000
@@ -56,7 +50,7 @@ _FORMAT = 3
 """Number of the way in which bodies are made; cached files of another are not read."""
 _SHAPE_THICKNESSES = 5
 """Thicknesses that are computed at first of a shape whose wall is not known."""
-_MEANS = frozenset({"memory", "timeout", "pytetwild"})
+_MEANS = frozenset({"timeout", "pytetwild"})
 """Names of errors that are no fault of a surface or its wall."""
 
 
@@ -91,49 +85,6 @@ def body_name(thickness: float | None, *, closed: bool = False) -> str:
 
 
 class CandidateBodies:
-    """Bodies of which each is a hypothesis; by themselves those that are known, as `SurfaceBodies` those of a surface.
-
-    `refined`, `held` and `with_thickness` compute more of them, where that can be done.
-    """
-
-    bodies: tuple[CandidateBody, ...]
-    """At least one: the solid body first, then walls from thin to thick, or as the user states them."""
-    refused: Mapping[float | None, str]
-    """Reasons why others could not be had, by the others' thickness: names of two may be alike."""
-    supports: Supports = "free"
-    held_at: Sequence[Place] = ()
-    """Points in meters at which the object was held, all of them, as a user says."""
-    unit_ratios: Mapping[str, float] = MappingProxyType({"m": 1.0})
-    """Units that the surface may be in, with the lengths that it then has over those that it was read with. The present
-    unit comes first."""
-    searches_thickness: bool = False
-    """Whether the thickness of the wall is not known, so that `with_thickness` is asked."""
-    dofs: int = 0
-    """Degrees of freedom of a fine body, about."""
-
-    def __init__(self, bodies: Sequence[CandidateBody], refused: Mapping[float | None, str] | None = None) -> None:
-        self.bodies, self.refused = tuple(bodies), refused or {}
-
-    def refined(self, body: CandidateBody) -> CandidateBody:
-        """Return a body with finer elements; itself where it is fine already or that fails."""
-        return body
-
-    def held(self, body: CandidateBody) -> HeldModes | None:
-        """Return the modes of a body on any support, with few elements; None where they cannot be computed."""
-        return None
-
-    def with_thickness(self, body: CandidateBody, thickness: float) -> CandidateBody | None:
-        """Return a body that differs in its wall's thickness, meters; None where that fails."""
-        return None
-
-    def digest(self) -> str:
-        """Return a digest of the bodies."""
-        settings = self.searches_thickness, self.supports, self.held_at, self.dofs, dict(self.unit_ratios)
-        found = [(each.name, each.elastic.frequency, each.elastic.nodes, each.elastic.shapes) for each in self.bodies]
-        return content_digest(settings, *chain.from_iterable(found))
-
-
-class SurfaceBodies(CandidateBodies):
     """The bodies that may lie behind a surface, with the lowest `count` modes of each, made of `material`.
 
     `thicknesses` states what to try: walls in meters, None for what the surface encloses. By itself it tries that, and
@@ -144,9 +95,13 @@ class SurfaceBodies(CandidateBodies):
     one lies behind its triangles, whichever way they face. Modes are cached by content in the folder `cache`, for they
     take most of the time; a damaged file is made again.
 
+    `supports` and `held_at`, points in meters, say whether and where the object was held. `unit_ratios` are the units
+    that the surface may be in, with the lengths that it then has over those that it was read with, the present one
+    first.
+
     Raises SimulationError for too few degrees of freedom. `bodies` raises it for a surface of points, and where no body
-    can be had, with the reason for each: by the name "surface", or by that of the
-    reason where only memory, time or the mesher stood against it.
+    can be had, with the reason for each: by the name "surface", or by that of the reason where only time or the mesher
+    stood against it.
     """
 
     def __init__(
@@ -156,7 +111,7 @@ class SurfaceBodies(CandidateBodies):
         thicknesses: Sequence[float | None] | None = None,
         supports: Supports = "free",
         held_at: Sequence[Place] = (),
-        unit_ratios: Mapping[str, float] | None = None,
+        unit_ratios: Mapping[str, float] = PRESENT_UNIT,
         count: int = 80,
         dofs: int = 40_000,
         material: Material = NOMINAL,
@@ -167,8 +122,7 @@ class SurfaceBodies(CandidateBodies):
             raise SimulationError.expected(f"{MIN_DOFS} or more", dofs, name="dofs")
         self.shape = None if isinstance(surface, Surface) else surface
         """The shape, where it is no surface."""
-        self.supports, self.held_at, self.dofs = supports, tuple(held_at), dofs
-        self.unit_ratios = unit_ratios or self.unit_ratios
+        self.supports, self.held_at, self.unit_ratios, self.dofs = supports, tuple(held_at), unit_ratios, dofs
         self._surface, self._log = surface, log or (lambda message: None)
         self._thicknesses, self._count, self._material, self._cache = thicknesses, count, material, cache
         self._coarse_dofs = min(dofs, COARSE_DOFS if self.shape is None else COARSE_WALL_DOFS)
@@ -176,17 +130,44 @@ class SurfaceBodies(CandidateBodies):
         self._walls, self._remeshing = once(lambda dofs: wall_solids(self.checked, dofs)), Lock()
 
     @cached_property
-    def bodies(self) -> tuple[CandidateBody, ...]:  # type: ignore[override]
-        """The free bodies that can be had."""
-        return self._found[0]
+    def bodies(self) -> tuple[CandidateBody, ...]:
+        """The free bodies that can be had, at least one: the solid one first, then walls from thin to thick."""
+        wanted = list(dict.fromkeys(self._guesses() if self._thicknesses is None else self._thicknesses))
+        refused: dict[tuple[float | None, bool], SimulationError] = {}
 
-    @cached_property
-    def refused(self) -> Mapping[float | None, str]:  # type: ignore[override]
-        """Reasons why others cannot."""
-        return self._found[1]
+        def make(wall: tuple[float | None, bool], *, fine: bool) -> CandidateBody | None:
+            try:
+                return self._body(*wall, fine=fine)
+            except SimulationError as error:
+                refused[wall] = error
+                return None
 
-    @cached_property
-    def searches_thickness(self) -> bool:  # type: ignore[override]
+        for thickness in wanted:
+            try:
+                self._expect_possible(thickness)
+            except SimulationError as error:
+                refused[thickness, False] = error
+        walls = [(each, False) for each in wanted if (each, False) not in refused]
+        make_one = partial(make, fine=len(walls) == 1)
+        walls += [(each, True) for each, _ in walls if each is not None and self._closed is not None]
+        # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
+        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
+            bodies = [body for body in pool.map(make_one, walls) if body is not None]
+        ordered = sorted(refused, key=lambda wall: (wall[1], wanted.index(wall[0])))
+        reasons = _grouped({wall: refused[wall] for wall in ordered})
+        if not bodies:
+            causes = {str(error.name) for error in refused.values()}
+            name = min(causes) if causes <= _MEANS else "surface"
+            other = "another wall thickness, or none" if self._thicknesses else "the wall thickness in meters"
+            wanted_body, got = "a surface with a finite-element model", f"none ({'; '.join(reasons)})"
+            advice = f"repair the mesh, or give {other}"
+            raise SimulationError.expected(wanted_body, reasons, got=got, name=name, advice=advice)
+        for reason in reasons:
+            self._log_refused(reason)
+        return (self.refined(bodies[0]),) if len(bodies) == 1 else tuple(bodies)
+
+    @property
+    def searches_thickness(self) -> bool:
         """Whether there are several walls of no stated thickness."""
         return self._thicknesses is None and sum(body.thickness is not None for body in self.bodies) > 1
 
@@ -253,46 +234,6 @@ class SurfaceBodies(CandidateBodies):
         except SimulationError as error:
             self._log_refused(f"{body_name(thickness, closed=body.closed)}: {error}")
             return None
-
-    @cached_property
-    def _found(self) -> tuple[tuple[CandidateBody, ...], Mapping[float | None, str]]:
-        """The bodies, and why others cannot be had."""
-        wanted = list(dict.fromkeys(self._guesses() if self._thicknesses is None else self._thicknesses))
-        errors: dict[tuple[float | None, bool], SimulationError] = {}
-        for thickness in wanted:
-            try:
-                self._expect_possible(thickness)
-            except SimulationError as error:
-                errors[thickness, False] = error
-        possible = [each for each in wanted if (each, False) not in errors]
-
-        def make(wall: tuple[float | None, bool]) -> CandidateBody | None:
-            try:
-                return self._body(*wall, fine=len(possible) == 1)
-            except SimulationError as error:
-                errors[wall] = error
-                return None
-
-        closed = [(each, True) for each in possible if each is not None and self._closed is not None]
-        # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
-        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
-            bodies = [
-                body for body in pool.map(make, [*((each, False) for each in possible), *closed]) if body is not None
-            ]
-        refused = {each: errors[each] for each in [*((each, False) for each in wanted), *closed] if each in errors}
-        reasons = _grouped(refused)
-        if not bodies:
-            causes = {str(error.name) for error in refused.values()}
-            name = min(causes) if causes <= _MEANS else "surface"
-            other = "another wall thickness, or none" if self._thicknesses else "the wall thickness in meters"
-            wanted_body, got = "a surface with a finite-element model", f"none ({'; '.join(reasons)})"
-            advice = f"repair the mesh, or give {other}"
-            raise SimulationError.expected(wanted_body, reasons, got=got, name=name, advice=advice)
-        for reason in reasons:
-            self._log_refused(reason)
-        if len(bodies) == 1:
-            bodies = [self.refined(bodies[0])]
-        return tuple(bodies), {each: str(error) for (each, around), error in refused.items() if not around}
 
     @cached_property
     def _closed(self) -> HollowShape | None:
@@ -380,7 +321,6 @@ class SurfaceBodies(CandidateBodies):
 
     def _make_solid(self, thickness: float | None, dofs: int, *, closed: bool = False) -> Solid:
         """Return about so many degrees of freedom of a wall of a thickness, meters, or of all that is enclosed."""
-        expect_memory(dofs)
         self._log(f"dividing the {body_name(thickness, closed=closed)} into tetrahedra")
         if thickness is None:
             return filled_solid(self.checked, dofs)
@@ -391,6 +331,12 @@ class SurfaceBodies(CandidateBodies):
                 make = self._walls(dofs)
             return make(thickness)
         return shape_solid(shape, thickness, dofs, log=self._log)
+
+    def digest(self) -> str:
+        """Return a digest of the bodies."""
+        settings = self.searches_thickness, self.supports, self.held_at, self.dofs, dict(self.unit_ratios)
+        found = [(each.name, each.elastic.frequency, each.elastic.nodes, each.elastic.shapes) for each in self.bodies]
+        return content_digest(settings, *chain.from_iterable(found))
 
     def _log_refused(self, reason: str) -> None:
         """Log why a body cannot be had, where there are others; without an error's advice."""

@@ -16,7 +16,7 @@ from avmsf.capture.table import read_cells
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_meshes import HollowShape
-from avmsf.fem.candidate_bodies import CandidateBody, SurfaceBodies
+from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material, material_named
@@ -48,7 +48,7 @@ def candidate_bodies(
     material: Material = NOMINAL,
     cache: Path | None = None,
     log: Callable[[str], None] | None = None,
-) -> SurfaceBodies:
+) -> CandidateBodies:
     """Return the bodies that a surface may enclose; their mode shapes are cached by content in `cache`.
 
     `settings` of the capture say where the object was held and which units the surface may be in. Raises
@@ -64,7 +64,7 @@ def candidate_bodies(
     expect_held(held_at, seen)
     wall = config.wall
     try:
-        bodies = SurfaceBodies(
+        bodies = CandidateBodies(
             surface, thicknesses=None if wall is None else [wall or None], supports=config.supports,
             held_at=held_at, unit_ratios=settings.unit_ratios(float(extent.norm())), count=config.shapes,
             dofs=config.dofs, material=material, cache=cache, log=log,

@@ -237,7 +237,7 @@ def _fit_shape(
 
 
 def _is_final(path: Path, config: PipelineConfig, bodies: Callable[[], object]) -> bool:
-    """Return whether a kept field has the elastic family, or there are still no bodies, as for want of memory."""
+    """Return whether a kept field has the elastic family, or there are still no bodies."""
     if config.gain_model == NETWORK or Elastic.kind not in load(path).origin.report.get("unavailable", {}):
         return True
     try:

@@ -9,7 +9,7 @@ import torch
 from avmsf._utils.text import RecordError
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
+from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.elastic_modes import HeldModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.supports import EndPatch, Place, Support, patches_about
@@ -27,6 +27,7 @@ from avmsf.modal.extraction.extract import Extraction, extract_modes
 from avmsf.modal.modes import ModalBank
 from factories.believing_field import LENGTH, bar, bar_points
 from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from factories.known_bodies import KnownBodies
 from factories.made_fields import FIELDS, blows, draw, model, places, positional, sounding
 from factories.plate_field import plate_impacts
 from factories.raising import raises
@@ -297,7 +298,7 @@ def test_the_finished_model_is_judged_by_the_measured_gains_of_its_recordings():
 SIDES = (0.24, 0.16, 0.003)
 
 
-class Plate(CandidateBodies):
+class Plate(KnownBodies):
     """A coarse plate of nominal material, which may be held."""
 
     supports = "try"

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.errors import SimulationError
 from avmsf.fem.body_meshes import HollowShape
-from avmsf.fem.candidate_bodies import COARSE_WALL_DOFS, THICKNESS_RATIOS, SurfaceBodies
+from avmsf.fem.candidate_bodies import COARSE_WALL_DOFS, THICKNESS_RATIOS, CandidateBodies
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.solid import Solid
 from avmsf.fem.walls import wall_of
@@ -106,7 +106,7 @@ def body_family(
     Raises SimulationError for points without triangles, and where no body can be made, with the reason.
     """
     report = log or (lambda message: None)
-    candidates = SurfaceBodies(surface, log=report)
+    candidates = CandidateBodies(surface, log=report)
     thicknesses, make = _walls(candidates, dofs)
     if make is None:
         return BodyFamily((isotropic_modes(candidates.solid(None, _SOLID_DOFS), count=count),), ())
@@ -123,7 +123,7 @@ def body_family(
     return BodyFamily(tuple(made.values()), tuple(made), make)
 
 
-def _walls(candidates: SurfaceBodies, dofs: int) -> tuple[list[float], Callable[[float], Solid] | None]:
+def _walls(candidates: CandidateBodies, dofs: int) -> tuple[list[float], Callable[[float], Solid] | None]:
     """Return the thicknesses of walls to compute, meters, and what makes them; nothing for a solid body."""
     if candidates.shape is not None:
         between = candidates.shape.thickness_range

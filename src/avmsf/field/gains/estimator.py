@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY, FeatureField
-from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody, body_name
+from avmsf.fem.candidate_bodies import PRESENT_UNIT, CandidateBodies, CandidateBody
 from avmsf.fem.thickness import search_thickness
 from avmsf.field.config import AUTO, NETWORK, GainModelName
 from avmsf.field.gains.attention import SHARED, Attention
@@ -168,7 +168,7 @@ class MixtureEstimator(GainEstimator):
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         self._expect_inputs(data, groups)
         searched = bool(bodies) and self.bodies is not None and self.bodies.searches_thickness
-        units = (self.bodies or CandidateBodies([])).unit_ratios
+        units = PRESENT_UNIT if self.bodies is None else self.bodies.unit_ratios
         fit = Regression(data, self.kinds, sites_of(data, bodies), directional, groups, units)
         thickness = None
         if searched and self.bodies is not None:
@@ -202,7 +202,7 @@ class MixtureEstimator(GainEstimator):
                 found = fit(found.rows, [*found.bodies, updated])
         kept, names = set(found.rows.tolist()), data.train.names
         report = {"bodies": sorted(found.entries, key=lambda each: -each["weight"])} | assessment.report(data.train)
-        report["unavailable"] = missing
+        report["unavailable"] = {Elastic.kind: missing} if missing else {}
         report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
         report["supports_tried"] = tried
         report["levels"] = levels
@@ -229,10 +229,10 @@ class MixtureEstimator(GainEstimator):
             advice = "give --features, or take another gain model"
             raise FitError.expected("visual features", GEOMETRY, got="positions only", name=Visual.kind, advice=advice)
 
-    def _usable_bodies(self, data: GainData) -> tuple[list[CandidateBody], dict[str, str]]:
+    def _usable_bodies(self, data: GainData) -> tuple[list[CandidateBody], str]:
         """Return the bodies that the contacts lie on, and why there are none."""
         if Elastic.kind not in self.kinds:
-            return [], {}
+            return [], ""
         try:
             if self.bodies is None:
                 advice = self.missing or "give its mesh"
@@ -241,9 +241,8 @@ class MixtureEstimator(GainEstimator):
         except FitError as error:
             if self.name == Elastic.kind:
                 raise
-            missing = self.missing if self.bodies is None else str(error)
-            return [], {Elastic.kind: missing} if missing else {}
-        return list(self.bodies.bodies), {body_name(each): reason for each, reason in self.bodies.refused.items()}
+            return [], self.missing if self.bodies is None else str(error)
+        return list(self.bodies.bodies), ""
 
     def _may_be_held(self, assessment: ContactAssessment) -> bool:
         """Return whether supports are tried: where they are asked for or stated, or the free body predicts little."""
