@@ -10,16 +10,13 @@ import torch
 
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import FieldFileError, FitError
-from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.next_contacts import suggest
-from avmsf.field.posterior import fitted_mixture, has_posterior, relative_gain_std, spectrum_band
+from avmsf.field.posterior import fitted_mixture, has_posterior, relative_gain_std
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.localization.locator import Locator
-from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.believing_field import (
-    BANK,
     LENGTH,
     bar_contacts,
     bar_points,
@@ -97,43 +94,6 @@ def test_doubt_grows_away_from_contacts_and_has_no_unit(made: type) -> None:
     assert torch.allclose(louder, doubt, rtol=1e-4, atol=1e-6)
 
 
-def test_a_sound_without_doubt_has_its_own_spectrum(monkeypatch: pytest.MonkeyPatch) -> None:
-    contacts = bar_contacts(6)
-    gains = elastic_field(contacts, drawn_gains(contacts, seed=7))
-    field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
-    sure = replace(gains.predict(contacts[2:3]), std=torch.zeros(1, 4, 2))
-    monkeypatch.setattr(MixtureGains, "posterior", lambda known, sites, ways=None: sure)
-    band = spectrum_band(field, contacts[2])
-    power = torch.fft.rfft(field.render(contacts[2:3])[0].double()).abs().square()
-    assert torch.allclose(band.lower_db, band.upper_db)
-    assert len(band.frequencies) == 400
-    assert float(band.middle_db.max()) == pytest.approx(0.0, abs=1e-9)
-    # 401 frequencies in 400 bands: all but one hold one.
-    levels = 10 * torch.log10(power / power.max())
-    first = band.frequencies < 500.0
-    assert torch.allclose(band.middle_db[first], levels[: int(first.sum())], atol=0.05)
-    assert torch.allclose(band.frequencies[first], torch.arange(int(first.sum())).double() * 2000 / 800)
-
-
-def test_bands_hold_what_the_gains_intervals_hold() -> None:
-    contacts = bar_contacts(10)
-    gains = elastic_field(contacts, drawn_gains(contacts, seed=15))
-    field = replace(sound_field(gains), residual=Residual(torch.zeros(9)))
-    # One mode alone, whose energy is the square of its gains: two parts of means and deviations that are known.
-    lone = ModalBank(BANK.frequency[:1], BANK.damping[:1])
-    field = replace(field, bank=lone, phase=field.phase[:1], gain_field=gains.take(torch.tensor([0])))
-    far = torch.tensor([0.1, 0.0, 0.0])
-    known, spread = field.known(far[None]), field.gain_field.posterior(far[None]).std
-    mean = known.parts[0, 0]
-    drawn = mean + spread[0, 0] * torch.randn(20000, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    power = 10 * torch.log10(drawn.square().sum(1))
-    expected = torch.quantile(power, 0.95) - torch.quantile(power, 0.05)
-    band = spectrum_band(field, far)
-    peak = int((BANK.frequency[0] / 2000 * 800).round())
-    # 200 draws tell a twentieth's quantile to about a tenth of the width.
-    assert float(band.upper_db[peak] - band.lower_db[peak]) == pytest.approx(float(expected), rel=0.25)
-
-
 @both_models
 def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     contacts, others = bar_contacts(30)[:12], bar_contacts(30)[12:]
@@ -142,7 +102,6 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     assert has_posterior(same)
     assert fitted_mixture(same) is field.gain_field
     assert torch.equal(relative_gain_std(same, points), relative_gain_std(field, points))
-    assert torch.equal(spectrum_band(same, others[0]).upper_db, spectrum_band(field, others[0]).upper_db)
     maps = [Locator.of(each, points=points).locate(field.render(others[:1])[0]) for each in (field, same)]
     assert torch.equal(maps[0].probability, maps[1].probability)
 
@@ -155,9 +114,6 @@ def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
     mute = adjust_modes(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
     points = bar_points()[::5]
     assert torch.equal(relative_gain_std(above, points), relative_gain_std(mute, points))
-    torch.testing.assert_close(
-        spectrum_band(above, points[3]).upper_db, spectrum_band(mute, points[3]).upper_db, rtol=0, atol=1e-9
-    )
 
 
 def test_what_cannot_be_said_is_refused() -> None:

@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from avmsf.errors import EvaluationError
-from avmsf.field.posterior import relative_gain_std, spectrum_band
+from avmsf.field.posterior import relative_gain_std
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
@@ -24,7 +24,7 @@ from avmsf.plotting.edits import draw_clap_curves
 from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
 from avmsf.plotting.spectrograms import draw_spectrograms, log_spectrogram
 from avmsf.plotting.style import FIRST, SECOND
-from avmsf.plotting.uncertainty import draw_band, draw_uncertainty
+from avmsf.plotting.uncertainty import draw_uncertainty
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.believing_field import bar_contacts, bar_points, drawn_gains, elastic_field, sound_field
 from factories.made_fields import BANK, positional, sounding
@@ -318,8 +318,6 @@ def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()
     solid = draw_uncertainty(bent, std, title="bent", suggested=contacts[:3])
     assert len(solid.axes) == 7
-    band = draw_band(spectrum_band(field, contacts[0]), title="one impact")
-    assert band.axes[0].get_xlim() == (0.0, pytest.approx(1000.0, abs=5.0))
 
 
 def test_marks_behind_the_object_are_not_drawn() -> None:

@@ -47,9 +47,9 @@ class Options(Common):
     settings: SettingsFile = None
     """Field: use this capture.toml instead of the capture's own."""
     plots: PlotsFolder = None
-    """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png and spectrum.png if the gains have a
-    posterior; surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians:
-    cloud.png. Features: features.png. Mesh: surface.png."""
+    """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png if the gains have a posterior;
+    surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians: cloud.png.
+    Features: features.png. Mesh: surface.png."""
     up: Axis = "z"
     """Gaussians and features: axis that points up."""
 
@@ -117,13 +117,13 @@ def mode_levels(field: "SoundField") -> "Float[Tensor, ' modes']":
 
 def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:
     """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
-    from avmsf.field.posterior import has_posterior, relative_gain_std, spectrum_band
+    from avmsf.field.posterior import has_posterior, relative_gain_std
     from avmsf.mesh.points import farthest_points
     from avmsf.pipeline.record import modes_words
     from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
     from avmsf.plotting.spectrograms import draw_spectrograms
     from avmsf.plotting.surfaces import draw_surface
-    from avmsf.plotting.uncertainty import draw_band, draw_uncertainty
+    from avmsf.plotting.uncertainty import draw_uncertainty
 
     name, kept = field.origin.capture or "field", field.is_mode
     modes = modes_words(len(field.bank), int((~kept).sum()))
@@ -148,8 +148,6 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
     if has_posterior(field):
         std, title = relative_gain_std(field, points), f"uncertainty of the gains of {name}"
         pictures["uncertainty"] = draw_uncertainty(points, std, title=title, contacts=field.gain_field.contacts)
-        band, title = spectrum_band(field, points[0]), f"{name}: one impact, with its uncertainty"
-        pictures["spectrum"] = draw_band(band, title=title)
     if field.gain_field.surface is not None:
         pictures["surface"] = draw_surface(field.gain_field.surface, title=f"the body of {name}")
     for stem, picture in pictures.items():

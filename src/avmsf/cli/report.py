@@ -14,7 +14,7 @@ from torch import Tensor
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
-from avmsf.cli.output import decimals, display, table
+from avmsf.cli.output import decimals, table
 from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.task import Renderer
@@ -157,19 +157,12 @@ def quality_words(field: SoundField, path: Path) -> list[str]:
 
 
 def outlier_words(field: SoundField) -> list[str]:
-    """Return a line for each recording that contradicts the others: what was done, why it may be; --verbose figures."""
+    """Return a line for each recording that contradicts the others: what was done, and why it may be."""
     report = field.origin.report
     lines = []
     for name, words in report.get("outliers", {}).items():
         done = "left out of the fit" if name in report.get("excluded", ()) else "used in the fit all the same"
-        figures = ""
-        if display.verbose and (found := report.get("outlier_figures", {}).get(name)):
-            where = ", ".join(f"{each + 0.0:.4g}" for each in found["place"])
-            figures = (
-                f" (log likelihood ratio per mode {found['ratio']:.2g}, and {found['place_ratio']:.2g} at ({where}) m, "
-                f"{found['distance']:.2g} m away; plausible above 0)"
-            )
-        lines.append(f"{done}: {words}{figures}")
+        lines.append(f"{done}: {words}")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Pictures of predictive uncertainty: over the object from several sides, with contacts, and of a spectrum."""
+"""Pictures of predictive uncertainty over an object, from several sides, with contacts."""
 
 from typing import Any
 
@@ -7,12 +7,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from avmsf.field.posterior import LEVEL, SpectrumBand
 from avmsf.plotting.clouds import ALL_SIDES, in_front, name_axes, plane_of, view_from
-from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, scatter_surface, styled, titled_figure
-
-_RANGE_DB = 100.0
-"""What a spectrum shows below its highest level."""
+from avmsf.plotting.style import SECOND, SEQUENTIAL, scatter_surface, styled, titled_figure
 
 
 @styled
@@ -55,24 +51,6 @@ def draw_uncertainty(
     known = [words for words, each in (("× recorded", contacts), ("numbers: suggested", suggested)) if each is not None]
     known += ["white discs: hidden contacts"] * hidden
     figure.suptitle("\n".join([title, ", ".join(known)] if known else [title]))
-    return figure
-
-
-@styled
-def draw_band(band: SpectrumBand, *, title: str) -> Figure:
-    """Draw the credible band of a sound's spectrum."""
-    figure = titled_figure(title, 9, 4.2)
-    axes = figure.subplots()
-    frequencies = band.frequencies.numpy()
-    lower, middle, upper = (each.numpy() for each in (band.lower_db, band.middle_db, band.upper_db))
-    inside = f"{100 * LEVEL:g} % credible band"
-    axes.fill_between(frequencies, lower, upper, color=FIRST, alpha=0.3, linewidth=0, label=inside)
-    axes.plot(frequencies, middle, color=FIRST, linewidth=1, label="median")
-    lowest = max(upper.max() - _RANGE_DB, lower.min() - 3.0)
-    axes.set(xlabel="frequency (Hz)", ylabel="energy (dB re loudest band)")
-    axes.set(xlim=(0.0, float(frequencies[-1])), ylim=(lowest, upper.max() + 3.0))
-    axes.grid()
-    axes.legend()
     return figure
 
 

@@ -210,8 +210,6 @@ class Outlier:
     """Log predictive ratio, nats per mode: below zero the place predicts its gains worse than no place does."""
     place: tuple[float, float, float]
     """Where it is explained best, object frame, meters."""
-    place_ratio: float
-    """The ratio there."""
     distance: float
     """From its own place, meters."""
     reversed: bool
@@ -258,15 +256,10 @@ class ContactAssessment:
 
     def report(self, train: Impacts) -> dict[str, Any]:
         """Return it as plain values, with the possible causes; of the recordings' names, contacts and directions."""
-        names, body = train.names, self.credibility
+        body = self.credibility
         with_body = body is not None and body.credible
-        figures = {names[each.row]: asdict(each) for each in self.outliers}
         return {
-            "outliers": {names[each.row]: each.describe(train, with_body=with_body) for each in self.outliers},
-            "outlier_figures": {
-                name: {key: value for key, value in each.items() if key != "row"} for name, each in figures.items()
-            },
-            "excluded": [],
+            "outliers": {train.names[each.row]: each.describe(train, with_body=with_body) for each in self.outliers},
             "credibility": None if body is None else asdict(body) | {"credible": body.credible},
         }
 
@@ -358,11 +351,10 @@ def _located(search: PredictiveRatios, row: int, places: Sites, mean: float) -> 
     better = leveled >= needed and leveled + own - float(here[_GAINS.index(1.0)]) > ratio
     if own >= _REFUTED or (ratio < needed and not better):
         return None
-    if better:
-        best, ratio = row, leveled
+    best = row if better else best
     x, y, z = points[best].tolist()
     distance = float((points[best] - contacts.points[row]).norm())
-    return Outlier(row, own, (x, y, z), ratio, distance, float(ratios[1, row]) >= needed, level_db if better else 0.0)
+    return Outlier(row, own, (x, y, z), distance, float(ratios[1, row]) >= needed, level_db if better else 0.0)
 
 
 def others(sites: Sites, aside: frozenset[int]) -> Int[Tensor, " rows"]:
