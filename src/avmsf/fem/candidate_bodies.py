@@ -16,7 +16,7 @@ from itertools import chain
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -33,6 +33,7 @@ from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Place, Support, patches_about
 from avmsf.mesh.surface import Surface
 
+Made = TypeVar("Made")
 Supports = Literal["auto", "free", "try"]
 """Whether bodies are held: where the free one predicts little, never, or always tried."""
 THICKNESS_RATIOS = tuple(float(ratio) for ratio in np.geomspace(0.003, 0.05, 6))
@@ -163,7 +164,7 @@ class CandidateBodies:
             advice = f"repair the mesh, or give {other}"
             raise SimulationError.expected(wanted_body, reasons, got=got, name=name, advice=advice)
         for reason in reasons:
-            self._log_refused(reason)
+            self._log(f"not a candidate body: {reason}")
         return (self.refined(bodies[0]),) if len(bodies) == 1 else tuple(bodies)
 
     @property
@@ -199,16 +200,14 @@ class CandidateBodies:
         Where that fails, for want of memory or because it cannot be filled so finely, the coarser one is returned,
         which was good enough to choose by, and `log` is called with the reason.
         """
-        if body.fine:
-            return body
-        try:
+
+        def make() -> CandidateBody:
             if body.support is None:
                 return self._body(body.thickness, body.closed, fine=True)
             elastic = self.modes(body.thickness, closed=body.closed, support=body.support)
             return replace(body, elastic=elastic, fine=True)
-        except SimulationError as error:
-            self._log(f"{body.name}: using the coarse mesh: {error}")
-            return body
+
+        return body if body.fine else self._attempt(f"{body.name}: using the coarse mesh", make) or body
 
     def held(self, body: CandidateBody) -> HeldModes | None:
         """Return the modes of a body on any support; None where they cannot be computed.
@@ -216,23 +215,27 @@ class CandidateBodies:
         Of tetrahedra that are few enough to choose by; `refined` makes the chosen body fine, without a check of its
         convergence. `log` is called with the reason for None.
         """
-        patches = patches_about(self.held_at) or None
-        try:
+
+        def make() -> HeldModes:
             solid = self.solid(body.thickness, self._coarse_dofs, closed=body.closed)
-            return HeldModes(solid, self._material, count=self._count, patches=patches)
-        except (SimulationError, MemoryError) as error:
-            self._log(f"{body.name}: no supports tested: {error}")
-            return None
+            return HeldModes(solid, self._material, count=self._count, patches=patches_about(self.held_at) or None)
+
+        return self._attempt(f"{body.name}: no supports tested", make)
 
     def with_thickness(self, body: CandidateBody, thickness: float) -> CandidateBody | None:
         """Return a body like another with a wall of this thickness, meters, coarse as of several; None if that fails.
 
         `log` is called with the reason.
         """
+        name = body_name(thickness, closed=body.closed)
+        return self._attempt(f"not a candidate body: {name}", partial(self._body, thickness, body.closed, fine=False))
+
+    def _attempt(self, failure: str, make: Callable[[], Made]) -> Made | None:
+        """Return what is made; None where that cannot be, which is logged after `failure`."""
         try:
-            return self._body(thickness, body.closed, fine=False)
-        except SimulationError as error:
-            self._log_refused(f"{body_name(thickness, closed=body.closed)}: {error}")
+            return make()
+        except (SimulationError, MemoryError) as error:
+            self._log(f"{failure}: {error}")
             return None
 
     @cached_property
@@ -257,14 +260,11 @@ class CandidateBodies:
     def _body(self, thickness: float | None, closed: bool, *, fine: bool) -> CandidateBody:
         """Return a free body with all degrees of freedom, or with few of them where it need not be fine."""
         if not fine and self.dofs > self._coarse_dofs:
-            try:
-                modes = self.modes(thickness, dofs=self._coarse_dofs, closed=closed, perturbed=False)
-                return CandidateBody(thickness, modes, fine=False, closed=closed)
-            except SimulationError as error:
-                # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
-                if self.shape is not None:
-                    raise
-                self._log(f"retrying with more tetrahedra ({error})")
+            make = partial(self.modes, thickness, dofs=self._coarse_dofs, closed=closed, perturbed=False)
+            # Thin walls are lost in few tetrahedra. A shape has other thicknesses, and the thinnest is a bound.
+            coarse = make() if self.shape is not None else self._attempt("retrying with more tetrahedra", make)
+            if coarse is not None:
+                return CandidateBody(thickness, coarse, fine=False, closed=closed)
         modes = self.modes(thickness, closed=closed)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
         if self.dofs > COARSE_DOFS and (self.shape is None or thickness is None):
@@ -273,18 +273,13 @@ class CandidateBodies:
 
     def _converged(self, thickness: float | None, modes: ElasticModes) -> ElasticModes:
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
-        name = body_name(thickness)
-        try:
-            error = _frequency_error(self.modes(thickness, dofs=COARSE_DOFS, perturbed=False), modes)
-        except SimulationError as failure:
-            self._log(f"{name}: mesh convergence not checked ({failure})")
+        name, make = body_name(thickness), partial(self.modes, thickness, dofs=COARSE_DOFS, perturbed=False)
+        coarse = self._attempt(f"{name}: mesh convergence not checked", make)
+        if coarse is None or (error := _frequency_error(coarse, modes)) <= MAX_FREQUENCY_ERROR:
             return modes
-        if error > MAX_FREQUENCY_ERROR:
-            try:
-                finer = self.modes(thickness, dofs=2 * self.dofs)
-                modes, error = finer, _frequency_error(modes, finer)
-            except SimulationError as failure:
-                self._log(f"{name}: no finer mesh ({failure})")
+        finer = self._attempt(f"{name}: no finer mesh", partial(self.modes, thickness, dofs=2 * self.dofs))
+        if finer is not None:
+            modes, error = finer, _frequency_error(modes, finer)
         if error > MAX_FREQUENCY_ERROR:
             self._log(
                 f"{name}: mesh too coarse, relative error of the lowest frequencies about {error:.0%}; "
@@ -337,10 +332,6 @@ class CandidateBodies:
         settings = self.searches_thickness, self.supports, self.held_at, self.dofs, dict(self.unit_ratios)
         found = [(each.name, each.elastic.frequency, each.elastic.nodes, each.elastic.shapes) for each in self.bodies]
         return content_digest(settings, *chain.from_iterable(found))
-
-    def _log_refused(self, reason: str) -> None:
-        """Log why a body cannot be had, where there are others; without an error's advice."""
-        self._log(f"not a candidate body: {reason.partition('; ')[0].replace(': wall: expected', ': expected')}")
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:

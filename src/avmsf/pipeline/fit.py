@@ -194,7 +194,6 @@ def _fit_shape(
             config.gain_model,
             bodies,
             symmetries=shape.symmetries,
-            features=shape.features,
             log=listener.note if shape.known else None,
         )
     )
@@ -209,7 +208,7 @@ def _fit_shape(
         listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
         fitted = fit_field(
             train,
-            shape.features if config.gain_model == Visual.kind else shape.points,
+            shape.features if config.gain_model in (NETWORK, Visual.kind) else shape.points,
             modes,
             config.fit,
             gains=estimator(),

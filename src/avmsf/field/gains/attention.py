@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ from torch.nn.functional import softplus
 from avmsf._utils.text import RecordError, count_of, like, record_of, without_defaults
 from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField
-from avmsf.field.config import ADDED_SETTINGS, AttentionShape
+from avmsf.field.config import ADDED_SETTINGS, NETWORK, AttentionShape
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import Directions, GainModel, Gains, Points
 from avmsf.field.training import FittedGains, GainEstimator, TrainableGains, Trainer
@@ -158,21 +158,18 @@ class AttentionGains(TrainableGains, GainModel):
             )
 
 
-@dataclass(frozen=True, eq=False)
 class Attention(GainEstimator):
-    """Trains the paper's network, on the features of the fit or on its own."""
+    """Trains the paper's network on the features of the fit."""
 
-    features: FeatureField | None = None
-    """What it reads in place of the fit's features."""
-    name: str = "attention"
+    name = NETWORK
 
     def digest(self) -> str:
-        """Return the name and the digest of the network's own features."""
-        return f"attention {'' if self.features is None else self.features.digest()}"
+        """Return the name."""
+        return self.name
 
     def start(self, data: GainData, damping: str | None = None) -> tuple[AttentionGains, Int[Tensor, " contacts"]]:
         """Return an untrained network, and the points nearest to the contacts; `damping` in place of the config's."""
-        features, config = self._features(data), data.config
+        features, config = data.features, data.config
         scale = data.gains.square().mean(0).sqrt()
         # Never zero: the network's output is measured in it.
         least = float(scale.max()) * 1e-6 + torch.finfo(scale.dtype).tiny
@@ -196,14 +193,12 @@ class Attention(GainEstimator):
         config, train = data.config, data.train
         dampings = (SHARED, PER_CONTACT) if config.damping == "validated" else (config.damping,)
         held = held_out(train.contacts, config.validation)
-        few = len(rows_by_place(train.contacts)) < _MIN_PLACES
+        reason = ""
         if len(dampings) == 1:
             reason = "as set"
-        elif few:
-            reason = f"fewer than {_MIN_PLACES} positions leave none to validate on"
-        else:
-            reason = "chosen on validation contacts" if held else "no positions are held out to validate on"
-        if few or not held or len(dampings) == 1:
+        elif not held or len(rows_by_place(train.contacts)) < _MIN_PLACES:
+            reason = f"no positions are held out to validate on, of at least {_MIN_PLACES}"
+        if reason:
             return {"damping": dampings[0], "validated": False, "damping_reason": reason}
         learned, unseen = data.take([row for row in range(len(train)) if row not in held]), data.take(held)
         outcomes = {}
@@ -213,21 +208,18 @@ class Attention(GainEstimator):
                 network, rows = self.start(learned, damping)
                 trainer.run(
                     name, network, learned, rows, warmup=config.warmup_steps, steps=config.steps,
-                    held=(unseen, self._features(data).nearest(unseen.train.contacts)),
+                    held=(unseen, data.features.nearest(unseen.train.contacts)),
                 )  # fmt: skip
             outcomes[damping] = trainer.trials[name]
         best = min(outcomes, key=lambda damping: outcomes[damping]["envelope"])
         return {
             "damping": best,
             "validated": True,
-            "damping_reason": reason,
+            "damping_reason": "chosen on validation contacts",
             "validation_contacts": [train.names[row] for row in held],
             "validation_envelope": {damping: each["envelope"] for damping, each in outcomes.items()},
             "validation_spectral": {damping: each["spectral"] for damping, each in outcomes.items()},
         }
-
-    def _features(self, data: GainData) -> FeatureField:
-        return data.features if self.features is None else self.features
 
 
 def held_out(contacts: Float[Tensor, "contacts 3"], fraction: float) -> list[int]:

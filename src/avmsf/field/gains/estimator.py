@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
-from avmsf.features.feature_field import GEOMETRY, FeatureField
+from avmsf.features.feature_field import GEOMETRY
 from avmsf.fem.candidate_bodies import PRESENT_UNIT, CandidateBodies, CandidateBody
 from avmsf.fem.thickness import search_thickness
 from avmsf.field.config import AUTO, NETWORK, GainModelName
@@ -256,10 +256,9 @@ def estimator_for(
     bodies: Callable[[], CandidateBodies],
     *,
     symmetries: Callable[[], Symmetries | None] = lambda: None,
-    features: FeatureField | None = None,
     log: Callable[[str], None] | None = None,
 ) -> GainEstimator:
-    """Return the estimator of this name; the network reads `features`, or the fit's own.
+    """Return the estimator of this name.
 
     `bodies` computes what may lie behind the object's surface. Where it raises an AvmsfError, `auto` has no elastic
     family, which `log` reports, and takes the `symmetries` of the object's shape. With `elastic` the error passes, and
@@ -267,7 +266,7 @@ def estimator_for(
     `dofs`).
     """
     if name == NETWORK:
-        return Attention(features, NETWORK)
+        return Attention()
     if name != AUTO and name != Elastic.kind:
         return MixtureEstimator((name,), symmetries=symmetries() if name == Symmetric.kind else None)
     kinds = FAMILIES if name == AUTO else (name,)
