@@ -23,7 +23,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import POSITIONAL, Unstructured, Visual
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains, complex_of
-from avmsf.field.gains.outliers import ContactAssessment, others, predicts_better
+from avmsf.field.gains.outliers import Credibility, others, predicts_better
 from avmsf.field.gains.regression import Regression, Solution, sites_of
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.training import FittedGains, GainEstimator, TrainableGains, Trainer
@@ -126,29 +126,21 @@ class MixtureEstimator(GainEstimator):
         symmetries = "" if self.symmetries is None else json.dumps(self.symmetries.to_dict())
         return hashlib.sha256(f"{' '.join(self.kinds)} {bodies} {symmetries} {self.update}".encode()).hexdigest()
 
-    def start(self, data: GainData) -> tuple[RefinedGains, Int[Tensor, " contacts"]]:
-        """Return the gain model, to be refined end to end, and its row of each contact. Raises as `solve`."""
-        model, used = self.solve(data)
-        rows = torch.full((len(data.train),), -1)
-        rows[used] = torch.arange(len(used))
-        return RefinedGains(model, data.modes.bank), rows
-
     def fit(self, data: GainData, trainer: Trainer) -> FittedGains:
         """Return the gain model, refined end to end, with its noise as measured by the refined modes."""
-        refined, rows = self.start(data)
-        if levels := refined.model.report["levels"]:
+        model, used = self.solve(data)
+        if levels := model.report["levels"]:
             data = data.divided(torch.tensor(levels, dtype=torch.float64))
-        used = torch.nonzero(rows >= 0).flatten()
         rates = {name: _PACE * getattr(data.config, name) for name in ("correction_rate", "noise_rate")}
         # A recording of another position than its label would pull the others' gains to its sound.
-        taken = replace(data.take(used.tolist()), config=replace(data.config, **rates))
-        run = trainer.run("fit", refined, taken, rows[used], warmup=0, steps=math.ceil(data.config.steps / _PACE))
-        order, rate = run.order, data.train.sample_rate
-        measured = along_phase(fit_gains(data.train.sounds, run.trained, sample_rate=rate), data.phase[order])
+        taken, rate = replace(data.take(used.tolist()), config=replace(data.config, **rates)), data.train.sample_rate
+        refined, steps = RefinedGains(model, data.modes.bank), math.ceil(data.config.steps / _PACE)
+        run = trainer.run("fit", refined, taken, torch.arange(len(used)), warmup=0, steps=steps)
+        measured = fit_gains(taken.train.sounds, run.trained, sample_rate=rate)
         reason = "as set" if data.config.damping == SHARED else "the only form of this gain model"
         damping = {"damping": SHARED, "validated": False, "damping_reason": reason}
-        model = refined.finished(order, measured[used])
-        return FittedGains(model, run, data.train.take(used.tolist()), model.report | damping)
+        refined_model = refined.finished(run.order, along_phase(measured, data.phase[run.order]))
+        return FittedGains(refined_model, run, taken.train, model.report | damping)
 
     def solve(self, data: GainData) -> tuple[MixtureGains, Int[Tensor, " used"]]:
         """Return the gain model as it follows from the data's gains, and the rows of the contacts it is fitted to.
@@ -163,26 +155,23 @@ class MixtureEstimator(GainEstimator):
         its stiffness and density updated becomes one more hypothesis.
         """
         bodies, missing = self._usable_bodies(data)
+        known = self.bodies if bodies else None
         given, every = data.train.directions, torch.arange(len(data.train))
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
         self._expect_inputs(data, groups)
-        searched = bool(bodies) and self.bodies is not None and self.bodies.searches_thickness
-        units = PRESENT_UNIT if self.bodies is None else self.bodies.unit_ratios
-        fit = Regression(data, self.kinds, sites_of(data, bodies), directional, groups, units)
-        thickness = None
-        if searched and self.bodies is not None:
-            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), self.bodies.with_thickness)
+        units = PRESENT_UNIT if known is None else known.unit_ratios
+        fit, thickness = Regression(data, self.kinds, sites_of(data, bodies), directional, groups, units), None
+        if known is not None and known.searches_thickness:
+            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), known.with_thickness)
         found = self._refined(fit, bodies)
         assessment, evidence = fit.assess(found), dict[str, float]()
-        tried = found.best is not None and self._may_be_held(assessment)
-        if tried and found.best is not None and self.bodies is not None:
-            modes = self.bodies.held(found.best)
-            rows, stated = others(fit.sites, assessment.rows), bool(self.bodies.held_at)
-            choose = fit.held_on_all if stated else fit.held
-            held = None if modes is None else choose(rows, found.best, modes)
-            if held is not None and modes is not None:
-                if stated:
+        tried = known is not None and _may_be_held(known, assessment.credibility)
+        if tried and known is not None and found.best is not None and (modes := known.held(found.best)) is not None:
+            rows = others(fit.sites, assessment.rows)
+            held = (fit.held_on_all if known.held_at else fit.held)(rows, found.best, modes)
+            if held is not None:
+                if known.held_at:
                     free = replace(held, elastic=modes.free, support=None)
                     evidence = dict(zip(("held", "free"), fit.evidence(rows, [held, free]), strict=True))
                 # All modes have the support in common, so free bodies are no hypotheses any more.
@@ -196,18 +185,19 @@ class MixtureEstimator(GainEstimator):
         levels = list[float]()
         if data.train.forces is None:
             fit, found, levels = _leveled(fit, found)
-        if found.best is not None and self.update:
-            updated = fit.updated(found.rows, found.best)
-            if updated is not None:
-                found = fit(found.rows, [*found.bodies, updated])
-        kept, names = set(found.rows.tolist()), data.train.names
-        report = {"bodies": sorted(found.entries, key=lambda each: -each["weight"])} | assessment.report(data.train)
-        report["unavailable"] = {Elastic.kind: missing} if missing else {}
-        report["excluded"] = [name for row, name in enumerate(names) if row not in kept]
-        report["supports_tried"] = tried
-        report["levels"] = levels
-        report["support_evidence"] = evidence
-        report["thickness"] = None if thickness is None else asdict(thickness)
+        updated = fit.updated(found.rows, found.best) if found.best is not None and self.update else None
+        if updated is not None:
+            found = fit(found.rows, [*found.bodies, updated])
+        kept = set(found.rows.tolist())
+        report = assessment.report(data.train) | {
+            "bodies": sorted(found.entries, key=lambda each: -each["weight"]),
+            "unavailable": {Elastic.kind: missing} if missing else {},
+            "excluded": [name for row, name in enumerate(data.train.names) if row not in kept],
+            "supports_tried": tried,
+            "levels": levels,
+            "support_evidence": evidence,
+            "thickness": None if thickness is None else asdict(thickness),
+        }
         return replace(found.model, report=report), found.rows
 
     def _refined(self, fit: Regression, bodies: Sequence[CandidateBody]) -> Solution:
@@ -244,11 +234,11 @@ class MixtureEstimator(GainEstimator):
             return [], self.missing if self.bodies is None else str(error)
         return list(self.bodies.bodies), ""
 
-    def _may_be_held(self, assessment: ContactAssessment) -> bool:
-        """Return whether supports are tried: where they are asked for or stated, or the free body predicts little."""
-        tried, found = "free" if self.bodies is None else self.bodies.supports, assessment.credibility
-        stated = self.bodies is not None and bool(self.bodies.held_at)
-        return tried == "try" or stated or (tried == "auto" and found is not None and found.gained < _PREDICTS)
+
+def _may_be_held(bodies: CandidateBodies, found: Credibility | None) -> bool:
+    """Return whether supports are tried: where they are asked for or stated, or the free body predicts little."""
+    little = found is not None and found.gained < _PREDICTS
+    return bodies.supports == "try" or bool(bodies.held_at) or (bodies.supports == "auto" and little)
 
 
 def estimator_for(
