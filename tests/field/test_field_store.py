@@ -226,7 +226,7 @@ def test_edits_of_earlier_versions_have_the_present_names(tmp_path):
         ({EDITS: ["x"]}, "edits.0"),
         ({EDITS: [{"a": 1}]}, "edits.0.edit"),
         ({EDITS: [{"edit": "change_material"}]}, "edits.0.to"),
-        ({EDITS: [{"edit": "recast", "to": {"name": "wood"}}]}, "edits.0.to.density"),
+        ({EDITS: [{"edit": "recast", "to": {"name": "wood"}}]}, "edits.0.to.alpha"),
         ({EDITS: [{"edit": "adjust_modes", "decay": 1.0}]}, "edits.0.pitch"),
         ({EDITS: [{"edit": "adjust_modes", "pitch": 0.0, "decay": 1.0}]}, "edits.0.pitch"),
         ({"supporting_poles": 3}, "supporting_poles"),

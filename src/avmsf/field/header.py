@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from avmsf._utils.headers import FileKind
-from avmsf._utils.text import RecordError, like
+from avmsf._utils.text import RecordError, like, record_of
 from avmsf.errors import FieldFileError
+from avmsf.fem.material import NOMINAL
 
 FORMAT = 8
 """Number of this format; it grows with every change that older versions could not read. Later versions read it."""
@@ -15,8 +16,6 @@ SUPPORTING = "supporting_poles"
 """What a report calls the rows of the bank's poles that are no modes of the object."""
 _RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer": "guided"}
 """Kinds of edits that earlier versions wrote, and what they are called now."""
-_MATERIAL = {"name": "", **dict.fromkeys(("density", "young", "poisson", "alpha", "beta"), 1.0)}
-"""What the entry of a material has, by example."""
 
 
 def checked_report(report: dict[str, Any], modes: int) -> dict[str, Any]:
@@ -38,9 +37,7 @@ def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
     written = like(known.get("edit"), "", f"{name}.edit")
     kind = _RENAMED_EDITS.get(written, written)
     if kind == "change_material":
-        material = like(known.get("to"), {}, f"{name}.to")
-        for key, example in _MATERIAL.items():
-            like(material.get(key), example, f"{name}.to.{key}")
+        record_of(NOMINAL, known.get("to"), f"{name}.to")
     if kind == "adjust_modes":
         for key in ("pitch", "decay"):
             factors = known.get(key)

@@ -132,16 +132,6 @@ def gain_variance(data: GainData) -> Float64[Tensor, " modes"]:
 def _expect_fitting(train: Impacts, modes: Extraction) -> None:
     if len(train) == 0:
         raise FitError.expected("1 recording or more", 0, got="none", name="train", advice="record impacts")
-    finite = torch.isfinite(train.sounds).all(1) & torch.isfinite(train.contacts).all(1)
-    if not bool(finite.all()):
-        row = int(finite.int().argmin())
-        wanted, advice = "finite samples and coordinates", "remove the recording"
-        raise FitError.expected(wanted, got="NaN or infinity", row=row, name=train.names[row], advice=advice)
-    if train.directions is not None and not bool((known := torch.isfinite(train.directions).all(1)).all()):
-        row = int(known.int().argmin())
-        advice = "give the direction in which the hammer moves, or zeros if unknown"
-        given = train.directions[row].tolist()
-        raise FitError.expected("a finite direction", given, row=row, name=train.names[row], advice=advice)
     if train.forces is not None and not bool((train.forces > 0.0).all()):
         row = int((train.forces > 0.0).int().argmin())
         force, name = float(train.forces[row]), train.names[row]

@@ -165,10 +165,10 @@ class MixtureEstimator(GainEstimator):
         if known is not None and known.searches_thickness:
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), known.with_thickness)
         found = self._refined(fit, bodies)
-        assessment, evidence = fit.assess(found), dict[str, float]()
-        tried = known is not None and _may_be_held(known, assessment.credibility)
+        (outliers, credibility), evidence = fit.assess(found), dict[str, float]()
+        tried = known is not None and _may_be_held(known, credibility)
         if tried and known is not None and found.best is not None and (modes := known.held(found.best)) is not None:
-            rows = others(fit.sites, assessment.rows)
+            rows = others(fit.sites, {each.row for each in outliers})
             held = (fit.held_on_all if known.held_at else fit.held)(rows, found.best, modes)
             if held is not None:
                 if known.held_at:
@@ -176,9 +176,9 @@ class MixtureEstimator(GainEstimator):
                     evidence = dict(zip(("held", "free"), fit.evidence(rows, [held, free]), strict=True))
                 # All modes have the support in common, so free bodies are no hypotheses any more.
                 found = self._refined(fit, [held])
-                assessment = fit.assess(found)
-        if assessment.outliers:
-            rows = others(fit.sites, assessment.rows)
+                outliers, credibility = fit.assess(found)
+        if outliers:
+            rows = others(fit.sites, {each.row for each in outliers})
             fewer = fit(rows, found.bodies)
             if predicts_better(fewer.model.leave_one_out(), found.model.leave_one_out()[rows], fit.measured.take(rows)):
                 found = fewer
@@ -188,12 +188,15 @@ class MixtureEstimator(GainEstimator):
         updated = fit.updated(found.rows, found.best) if found.best is not None and self.update else None
         if updated is not None:
             found = fit(found.rows, [*found.bodies, updated])
-        kept = set(found.rows.tolist())
-        report = assessment.report(data.train) | {
+        kept, credible = set(found.rows.tolist()), credibility is not None and credibility.credible
+        contradicting = {data.train.names[each.row]: each.describe(data.train, with_body=credible) for each in outliers}
+        report = {
             "bodies": sorted(found.entries, key=lambda each: -each["weight"]),
             "unavailable": {Elastic.kind: missing} if missing else {},
             "excluded": [name for row, name in enumerate(data.train.names) if row not in kept],
             "supports_tried": tried,
+            "outliers": contradicting,
+            "credibility": None if credibility is None else asdict(credibility) | {"credible": credible},
             "levels": levels,
             "support_evidence": evidence,
             "thickness": None if thickness is None else asdict(thickness),

@@ -28,10 +28,9 @@ say little of the gains nothing is an outlier.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import scipy
 import torch
@@ -240,34 +239,10 @@ class Outlier:
         return f"{train.names[self.row]} contradicts the other recordings; possible causes: {', '.join(causes)}"
 
 
-@dataclass(frozen=True)
-class ContactAssessment:
-    """What the log predictive ratios say of the contacts, and of the body."""
-
-    outliers: tuple[Outlier, ...]
-    """By ratio, the lowest first."""
-    credibility: Credibility | None
-    """None without a body."""
-
-    @property
-    def rows(self) -> frozenset[int]:
-        """Of the outliers."""
-        return frozenset(each.row for each in self.outliers)
-
-    def report(self, train: Impacts) -> dict[str, Any]:
-        """Return it as plain values, with the possible causes; of the recordings' names, contacts and directions."""
-        body = self.credibility
-        with_body = body is not None and body.credible
-        return {
-            "outliers": {train.names[each.row]: each.describe(train, with_body=with_body) for each in self.outliers},
-            "credibility": None if body is None else asdict(body) | {"credible": body.credible},
-        }
-
-
 def assess_contacts(
     plain: Fit, elastic: Fit | None, sites: Sites, places: Sites, measured: MeasuredGains
-) -> ContactAssessment:
-    """Return the contacts that the others contradict, and whether the body is credible.
+) -> tuple[list[Outlier], Credibility | None]:
+    """Return the contacts that the others contradict, the surest first, and how credible a body is.
 
     `plain` fits the gain model without elastic families, `elastic` with them, where there is a body. Contacts are
     judged without the body unless it is credible. `sites` are all contacts, `places` impacts all over the object.
@@ -281,8 +256,7 @@ def assess_contacts(
         used = _search(plain, sites, measured)
     mean = used.mean()
     located = [_located(used, row, places, mean) for row in sorted(used.aside)] if mean >= _INFORMATIVE else []
-    outliers = sorted((each for each in located if each is not None), key=lambda each: each.ratio)
-    return ContactAssessment(tuple(outliers), credibility)
+    return sorted(filter(None, located), key=lambda each: each.ratio), credibility
 
 
 def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> frozenset[int]:
@@ -357,7 +331,7 @@ def _located(search: PredictiveRatios, row: int, places: Sites, mean: float) -> 
     return Outlier(row, own, (x, y, z), distance, float(ratios[1, row]) >= needed, level_db if better else 0.0)
 
 
-def others(sites: Sites, aside: frozenset[int]) -> Int[Tensor, " rows"]:
+def others(sites: Sites, aside: Collection[int]) -> Int[Tensor, " rows"]:
     """Return the rows of the contacts that are not set aside."""
     return torch.tensor([row for row in range(len(sites)) if row not in aside])
 

@@ -23,7 +23,7 @@ from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture,
 from avmsf.field.gains.kernels import POSITIONAL, KernelFamily, Sites, Unstructured, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.outliers import ContactAssessment, Fit, assess_contacts, predicts_better
+from avmsf.field.gains.outliers import Credibility, Fit, Outlier, assess_contacts, predicts_better
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.mesh.points import farthest_points
 from avmsf.symmetry.characters import Group
@@ -186,8 +186,8 @@ class Regression:
         )  # fmt: skip
         return None if found is None else replace(body, elastic=found[0], updated=found[1])
 
-    def assess(self, found: Solution) -> ContactAssessment:
-        """Return what contradicts the other contacts, and whether the most probable body is credible."""
+    def assess(self, found: Solution) -> tuple[list[Outlier], Credibility | None]:
+        """Return what contradicts the other contacts, and how credible the most probable body is."""
         points, best = found.model.points, found.best
         places = found.model.sites(points[farthest_points(points, min(_PLACES, len(points)))])
 
