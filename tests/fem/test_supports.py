@@ -96,12 +96,6 @@ def test_the_basis_of_free_and_attachment_modes_has_the_held_bodys_modes(ratio: 
     assert float((overlap / norms.sqrt()).min()) > 0.99
 
 
-def test_a_patch_that_is_not_of_the_basis_is_refused():
-    held = HeldModes(block((0.1, 0.03, 0.004), (4, 2, 1)), NOMINAL, count=4)
-    with raises(SimulationError, name="patches", value="the moon"):
-        held.on(Support((EndPatch("the moon", (0.0, 0.0, 1.0)),), 1.0))
-
-
 def test_a_lying_plate_may_be_held_along_each_of_its_sides():
     mesh = SecondOrder.of(block((0.24, 0.16, 0.003), (12, 8, 1)))
     sides = [mesh.nodes[patch.nodes(mesh)] for patch in patches_of(mesh)]

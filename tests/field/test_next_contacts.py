@@ -126,9 +126,8 @@ ONE = torch.tensor([[0.4, 0.1, 0.0]])
         (1, torch.zeros(0, 3), None, {"name": "candidates", "value": 0}),
         (1, torch.tensor([[0.0, 0, 0], [0.0, float("nan"), 0]]), None, {"name": "candidates", "row": 1}),
         (1, torch.tensor([[0.4, 0.1, 0.2]]), None, {"name": "candidates", "row": 0, "value": [0.4, 0.1, 0.2]}),
-        (1, ONE, torch.zeros(1, 3), {"name": "directions", "row": 0, "value": [0.0, 0.0, 0.0]}),
         (1, ONE.expand(2, 3), DOWN.expand(1, 3), {"name": "directions", "value": 1}),
-        (1, None, DOWN.expand(1, 3), {"name": "directions", "value": None}),
+        (1, None, DOWN.expand(1, 3), {"name": "directions", "value": 1}),
         (1, bar_contacts(1), None, {"name": "candidates", "value": 0}),
     ],
 )

@@ -90,10 +90,6 @@ class ElasticModes:
 
     def _nearest(self, places: Float[Tensor, "contacts 3"]) -> Closest:
         """Return the nearest triangles, and the nearest points of them."""
-        unfit = torch.nonzero(~torch.isfinite(places).all(dim=1)).flatten()
-        if len(unfit):
-            row = int(unfit[0])
-            raise SimulationError.expected("finite coordinates in meters", places[row].tolist(), row=row, name="places")
         return self._closest(places.double().numpy())
 
     def _interpolated(self, places: Float[Tensor, "contacts 3"], part: Callable[[Tensor], Tensor]) -> Tensor:
@@ -191,14 +187,9 @@ class HeldModes:
         """The body's mass times the geometric mean of its squared angular frequencies, N/m."""
 
     def on(self, support: Support) -> ElasticModes:
-        """Return the lowest modes on a support of some of the `patches`, as many as the free body has.
-
-        Raises SimulationError for another patch.
-        """
+        """Return the lowest modes on a support of some of the `patches`, as many as the free body has."""
         total = self._stiffness.copy()
         for patch in support.patches:
-            if patch not in self.patches:
-                raise SimulationError.expected("a patch of the basis", patch.name, name="patches")
             loads = self._loads[self.patches.index(patch)]
             total += support.stiffness * loads.T @ loads
         squares, vectors = scipy.linalg.eigh(total, subset_by_index=(0, min(self._count + 5, len(total) - 1)))

@@ -32,9 +32,7 @@ class Material:
         }
         for name, (fits, wanted) in limits.items():
             if not fits:
-                value = getattr(self, name)
-                message = f"material {self.name}, {name}: expected {wanted}, got {value:g}"
-                raise SimulationError(message, name=name, value=value)
+                raise SimulationError.expected(f"{wanted} in {self.name}", getattr(self, name), name=name)
 
 
 CERAMIC = Material("ceramic", 2700.0, 7.2e10, 0.19, 6.0, 1e-7)

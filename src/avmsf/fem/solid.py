@@ -131,9 +131,9 @@ def prism_cells(
 def several_parts(what: str, sizes: Sequence[float], unit: str) -> SimulationError:
     """Return the error of something whose connected parts have these sizes, the largest first."""
     some = ", ".join(f"{size:.3g}" for size in sizes[:4])
-    got = f"{len(sizes)} parts of {some}{', ...' if len(sizes) > 4 else ''} {unit}"
-    message = f"expected a connected {what}, got {got}; join them, or give one of them"
-    return SimulationError(message, name="parts", value=len(sizes))
+    got = f"{len(sizes)} of {some}{', ...' if len(sizes) > 4 else ''} {unit}"
+    wanted, advice = f"a connected {what}", "join them, or give one of them"
+    return SimulationError.expected(wanted, len(sizes), got=got, name="parts", advice=advice)
 
 
 def _volumes(points: Float64[Tensor, "points 3"], cells: Int[Tensor, "cells 4"]) -> Float64[Tensor, " cells"]:

@@ -71,7 +71,8 @@ def suggest(
         count: Number of contacts; fewer come where fewer candidates have no recording.
         candidates: Places to choose from [candidates, 3], meters, on the surface; contacts of the fit are passed over.
             By default points spread over the surface that a hammer can strike from outside (`hammer_access`).
-        directions: Unit vectors [candidates, 3] of their impacts; by default straight into the surface.
+        directions: Unit vectors [candidates, 3] of their impacts; straight into the surface by default and where they
+            are zero.
         unseen: Use all of the surface of the field's body, also where no photograph shows the object.
         progress: Whether a terminal shows that it works.
 
@@ -190,21 +191,12 @@ def _reachable(
 
 
 def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates: Tensor | None) -> None:
-    if directions is None:
-        return
-    if candidates is None or len(directions) != len(candidates):
-        count = None if candidates is None else len(directions)
-        wanted = "candidates with them" if candidates is None else f"one for each of the {len(candidates)} candidates"
-        raise FitError.expected(wanted, count, name="directions", advice="give both")
-    zero = torch.nonzero(~(directions.norm(dim=1) > 0)).flatten().tolist()
-    if zero:
-        found, advice = directions[zero[0]].tolist(), "give the direction in which the hammer moves"
-        raise FitError.expected("a length above 0", found, row=zero[0], name="directions", advice=advice)
+    count = 0 if candidates is None else len(candidates)
+    if directions is not None and len(directions) != count:
+        raise FitError.expected(f"one for each of {count} candidates", len(directions), name="directions")
 
 
 def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], gains: MixtureGains) -> None:
-    if not len(candidates):
-        raise FitError.expected("1 position or more", 0, got="none", name="candidates", advice="leave it out")
     row, distance = max(off_surface(candidates, gains), key=lambda each: each[1], default=(0, 0.0))
     if distance:
         found = [round(each, 4) for each in candidates[row].tolist()]

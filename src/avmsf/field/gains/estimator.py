@@ -169,7 +169,7 @@ class MixtureEstimator(GainEstimator):
         tried = known is not None and _may_be_held(known, credibility)
         if tried and known is not None and found.best is not None and (modes := known.held(found.best)) is not None:
             rows = others(fit.sites, {each.row for each in outliers})
-            held = (fit.held_on_all if known.held_at else fit.held)(rows, found.best, modes)
+            held = fit.held(rows, found.best, modes, stated=bool(known.held_at))
             if held is not None:
                 if known.held_at:
                     free = replace(held, elastic=modes.free, support=None)

@@ -127,27 +127,26 @@ class Regression:
         elastic = (WeighedFamily.of(self.elastic(rows, body.elastic), measured) for body in bodies)
         return [total_evidence([*others, each], measured) for each in elastic]
 
-    def held_on_all(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody:
-        """Return a body that all patches hold, at the most probable stiffness by the evidence of all modes."""
-        return self._most_probable(rows, body, modes, [modes.patches], *STIFFNESS_RATIOS)[2]
-
-    def held(self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes) -> CandidateBody | None:
+    def held(
+        self, rows: Int[Tensor, " rows"], body: CandidateBody, modes: HeldModes, *, stated: bool
+    ) -> CandidateBody | None:
         """Return a body on its most probable support, by the evidence of all modes; None where it is free.
 
-        All patches and all pairs of them are tried at one stiffness, then the best with one patch more for as long as
-        that is more probable, then other stiffnesses. Where both bodies are far from the object, evidence between them
-        means little: the held one also has to predict contacts left out better.
+        A `stated` support is all patches. Else all patches and all pairs of them are tried at one stiffness, then the
+        best with one patch more for as long as that is more probable, then other stiffnesses. Where both bodies are far
+        from the object, evidence between them means little: the held one also has to predict contacts left out better.
         """
         patches, most_probable = modes.patches, partial(self._most_probable, rows, body, modes)
+        if stated:
+            return most_probable([patches], *STIFFNESS_RATIOS)[2]
         typical, *others = STIFFNESS_RATIOS
         best = most_probable([each for count in (1, 2) for each in combinations(patches, count)], typical)
-        while len(best[1].patches) < len(patches):
-            chosen = best[1].patches
-            more = most_probable([(*chosen, patch) for patch in patches if patch not in chosen], typical)
+        while True:
+            more = most_probable([(*best[1], patch) for patch in patches if patch not in best[1]], typical)
             if more[0] <= best[0]:
                 break
             best = more
-        best = max(best, most_probable([best[1].patches], *others), key=itemgetter(0))
+        best = max(best, most_probable([best[1]], *others), key=itemgetter(0))
         free = CandidateBody(body.thickness, modes.free, fine=False)
         if best[0] + math.log((1.0 - FREE_PRIOR) / FREE_PRIOR) <= self.evidence(rows, [free])[0]:
             return None
@@ -161,16 +160,16 @@ class Regression:
         modes: HeldModes,
         choices: Iterable[tuple[Patch, ...]],
         *ratios: float,
-    ) -> tuple[float, Support, CandidateBody]:
-        """Return the most probable of choices of patches at ratios of stiffness: log probability, support, body."""
-        patches, scale = modes.patches, modes.stiffness_scale
+    ) -> tuple[float, tuple[Patch, ...], CandidateBody]:
+        """Return the most probable of choices of patches at ratios of stiffness: log probability, patches, body."""
+        count, scale = len(modes.patches), modes.stiffness_scale
         supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
         bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
         # Numbers of patches share the probability of being held alike, and so do stiffnesses.
-        ways = [math.comb(len(patches), len(each.patches)) * len(patches) * len(STIFFNESS_RATIOS) for each in supports]
+        ways = [math.comb(count, len(each.patches)) * count * len(STIFFNESS_RATIOS) for each in supports]
         logs = [evidence - math.log(each) for evidence, each in zip(self.evidence(rows, bodies), ways, strict=True)]
-        row = max(range(len(bodies)), key=logs.__getitem__)
-        return logs[row], supports[row], bodies[row]
+        found = zip(logs, [each.patches for each in supports], bodies, strict=True)
+        return max(found, key=itemgetter(0), default=(-math.inf, (), body))
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""
