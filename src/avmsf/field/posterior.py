@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avmsf.errors import FitError
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.scaled import BodyGains, ScaledGains
+from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SoundField
 
 _MAX_MAPPED_POINTS = 1000
@@ -25,16 +25,13 @@ def has_posterior(field: SoundField) -> bool:
 def fitted_mixture(field: SoundField) -> MixtureGains:
     """Return the gain model that the field was fitted with, beneath its edits.
 
-    Raises FitError where its uncertainty is not known: for the attention network, and for contacts in a single place.
+    Raises FitError where its uncertainty is not known: for the attention network, a guess without recordings, and
+    contacts in a single place.
     """
     gains = field.gain_field.fitted
-    if isinstance(gains, BodyGains):
-        wanted, got = "one fitted to recordings", "one computed without"
-        raise FitError.expected(wanted, gains.kind, got=got, name="field", advice="record impacts and fit")
     if not isinstance(gains, MixtureGains):
-        raise FitError.expected(
-            f"gains of the kind {MixtureGains.kind!r}", gains.kind, name="field", advice="fit with --gain-model auto"
-        )
+        wanted, advice = f"gains of the kind {MixtureGains.kind!r}", "fit recordings with --gain-model auto"
+        raise FitError.expected(wanted, gains.kind, name="field", advice=advice)
     if gains.place_count < 2:
         wanted, advice = "recordings at 2 positions or more", "record impacts at another position"
         raise FitError.expected(wanted, gains.place_count, name="field", advice=advice)
@@ -45,16 +42,6 @@ def scale_of(field: SoundField) -> Float64[Tensor, " modes"]:
     """Return the field's gains over the fitted ones: 1, or what an edit has made of each mode."""
     gains = field.gain_field
     return gains.scale if isinstance(gains, ScaledGains) else torch.ones(len(field.bank), dtype=torch.float64)
-
-
-def posterior(
-    field: SoundField, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None = None
-) -> tuple[Float64[Tensor, "contacts modes 2"], Float64[Tensor, "contacts modes 2"]]:
-    """Return the mean of both parts of the gains, and their standard deviation. Raises as `fitted_mixture`."""
-    fitted_mixture(field)
-    known = field.gain_field.posterior(contacts, directions)
-    assert known.std is not None
-    return known.parts, known.std.double()
 
 
 def energy_of(field: SoundField, gains: Float[Tensor, "contacts modes 2"]) -> Float64[Tensor, " contacts"]:
@@ -71,5 +58,8 @@ def relative_gain_std(field: SoundField, points: Float[Tensor, "points 3"]) -> F
     surface = field.gain_field.points
     step = max(1, len(surface) // _MAX_MAPPED_POINTS)
     energy = energy_of(field, field.gain_field.predict(surface[::step]).parts).mean()
-    variance = energy_of(field, posterior(field, points)[1])
+    fitted_mixture(field)
+    std = field.gain_field.posterior(points).std
+    assert std is not None
+    variance = energy_of(field, std)
     return (variance / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()

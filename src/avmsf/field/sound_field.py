@@ -150,10 +150,12 @@ class SoundField:
             FitError: For a field without a posterior: of the attention network, of recordings in one place, or guessed
                 without recordings.
         """
-        from avmsf.field.posterior import posterior
+        from avmsf.field.posterior import fitted_mixture
 
-        mean, std = posterior(self, *self._impacts(positions, directions))
-        return GainPosterior(self._amplitudes(mean), std.square().sum(2).sqrt())
+        fitted_mixture(self)
+        known = self.gain_field.posterior(*self._impacts(positions, directions))
+        assert known.std is not None
+        return GainPosterior(self._amplitudes(known), known.std.double().square().sum(2).sqrt())
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings of the object with the starts that the field's sounds have."""
@@ -176,7 +178,7 @@ class SoundField:
         -i times `Extraction.gains`; contacts, directions and unit as in `gains`, dampings d those of the contacts.
         """
         places, ways = self._impacts(contacts, directions)
-        return self._amplitudes(self.known(places, directions=ways).parts)
+        return self._amplitudes(self.known(places, directions=ways))
 
     def known(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Gains:
         """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings."""
@@ -260,9 +262,8 @@ class SoundField:
         ways = None if directions is None else as_directions(directions, "directions", count=len(contacts))
         return contacts, ways
 
-    def _amplitudes(self, parts: Float64[Tensor, "contacts modes 2"]) -> Complex[Tensor, "contacts modes"]:
-        sines, cosines = parts.unbind(2)
-        return torch.complex(cosines, -sines) * torch.exp(1j * self.phase)
+    def _amplitudes(self, known: Gains) -> Complex[Tensor, "contacts modes"]:
+        return -1j * known.mean.to(torch.complex128) * torch.exp(1j * self.phase)
 
     def _recorded(
         self,
