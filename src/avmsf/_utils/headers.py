@@ -28,8 +28,6 @@ class FileKind:
     formats: tuple[int, ...] = ()
     """Numbers of the formats that are read, of which the last one is written. A number grows with every change that
     older versions could not read."""
-    remake: Callable[[dict[str, Any], Path], str] | None = None
-    """How the file of a record in an older format is made again."""
 
     def read_text(self, path: Path) -> str:
         """Return the text of a file. Raises `error` for one that is missing, damaged or of another kind."""
@@ -63,8 +61,6 @@ class FileKind:
             advice = self.advice
             if isinstance(found, int) and found > max(self.formats):
                 advice = f"install avmsf {writer} or newer, or {advice}"
-            elif self.remake is not None:
-                advice = self.remake(record, path)
         except (ValueError, TypeError, KeyError) as error:
             raise self.damaged(path, error, name="header") from error
         wanted = f"{self.what} in format {' or '.join(map(str, self.formats))}"

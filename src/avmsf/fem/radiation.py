@@ -38,11 +38,7 @@ MIN_DISTANCE_M = 0.01
 
 
 def radiated(
-    modes: ElasticModes,
-    vibration: Vibration,
-    microphone: Float64[Tensor, " 3"],
-    *,
-    retardation: float = 1.0,
+    modes: ElasticModes, vibration: Vibration, microphone: Float64[Tensor, " 3"], *, retardation: float = 1.0
 ) -> Complex128[Tensor, " modes"]:
     """Return the pressure at the microphone, pascals, of each damped mode for a push of one newton second on it alone.
 

@@ -76,12 +76,10 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
         advice = f"use a solid body (0 m), or a wall of {middle:.1g} m"
         raise SimulationError.expected(wanted, thickness, got=got, name="thickness", advice=advice)
     coarse = remeshed(mesh, detail * mesh.scale)
-    tried = (thickness * 0.5**step for step in range(8))
-    fitting = next((each for each in tried if _folded_part(coarse, each) <= TOLERANCES.max_spared_area), None)
-    if fitting != thickness:
-        hint = "smooth the mesh" if fitting is None else f"try thickness={fitting:.2g}, or smooth the mesh"
-        wanted, got = "less than the surface's radius of curvature", f"{thickness:g} m"
-        raise SimulationError.expected(wanted, thickness, got=got, name="thickness", advice=hint)
+    folded = float(_folded(coarse, -thickness * coarse.vertex_normals) @ coarse.area_faces / coarse.area)
+    if folded > TOLERANCES.max_spared_area:
+        wanted, advice = "less than the surface's radius of curvature", "try half of it, or smooth the mesh"
+        raise SimulationError.expected(wanted, thickness, got=f"{thickness:g} m", name="thickness", advice=advice)
     solid = prisms(coarse, np.full(len(coarse.vertices), thickness))
     return solid if solid is not None else fill(_both_sides(coarse, thickness), detail=detail)
 
@@ -115,11 +113,6 @@ def _offsets(mesh: Trimesh, thickness: Float64[np.ndarray, " points"]) -> Float6
         # A wall that thins within one triangle would fold the next.
         np.minimum.at(lengths, ends[:, 0], lengths[ends[:, 1]] + tolerance)
     return None
-
-
-def _folded_part(mesh: Trimesh, thickness: float) -> float:
-    """Return the part of the area at which a wall of even thickness folds."""
-    return float(_folded(mesh, -thickness * mesh.vertex_normals) @ mesh.area_faces / mesh.area)
 
 
 def _both_sides(mesh: Trimesh, thickness: float) -> Surface:

@@ -113,9 +113,7 @@ def _axes(normals: Float64[np.ndarray, "places 3"]) -> list[Float64[np.ndarray, 
     return axes
 
 
-def _across(
-    axes: Float64[np.ndarray, "axes 3"],
-) -> tuple[Float64[np.ndarray, "axes 3"], Float64[np.ndarray, "axes 3"]]:
+def _across(axes: Float64[np.ndarray, "axes 3"]) -> tuple[Float64[np.ndarray, "axes 3"], Float64[np.ndarray, "axes 3"]]:
     """Return two unit vectors perpendicular to each axis and to each other."""
     least = np.eye(3)[np.abs(axes).argmin(axis=1)]
     one = np.cross(axes, least)

@@ -1,8 +1,6 @@
 """The record in the header of a field's file: its format, and what it may say. Importing this loads no torch."""
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from avmsf._utils.headers import FileKind
@@ -47,12 +45,4 @@ def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
     return {**known, "edit": kind}
 
 
-def _remake(record: Mapping[str, Any], path: Path) -> str:
-    """Return the command that makes the field of an older file again."""
-    report = record["origin"]["report"]
-    material = f" --material {report['material']['name']}" if "guess" in report else ""
-    capture = record["origin"]["capture"]
-    return f"fit it again: avmsf fit FOLDER{material} --output {path}, where FOLDER is that of {capture!r}"
-
-
-FIELD = FileKind("avmsf", "a sound field", "fit and save it again", FieldFileError, (FORMAT,), _remake)
+FIELD = FileKind("avmsf", "a sound field", "fit and save it again", FieldFileError, (FORMAT,))

@@ -266,10 +266,7 @@ class SoundField:
         return -1j * known.mean.to(torch.complex128) * torch.exp(1j * self.phase)
 
     def _recorded(
-        self,
-        contacts: Float[Tensor, "contacts 3"],
-        directions: Float[Tensor, "contacts 3"] | None,
-        samples: int,
+        self, contacts: Float[Tensor, "contacts 3"], directions: Float[Tensor, "contacts 3"] | None, samples: int
     ) -> Float[Tensor, "contacts samples"]:
         """Return the mean of what the nearest recordings have in addition to their modes; silence after their end."""
         gains, recordings = self.gain_field.fitted, self.residual.recordings

@@ -76,14 +76,14 @@ def load(path: str | Path) -> SoundField:
     text, tensors = read_tensors(path, FIELD)
     record = FIELD.parse(text, path)
     with _reporting_damage(path):
-        origin = _checked(record, tensors, path)
+        origin, force = _checked(record, tensors, path), _background_force(record)
         gains = _KINDS[record["gains"]["kind"]].restore(record["gains"], _named(_GAINS, tensors))
     kept = record["alignment"]
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         gains,
         tensors["phase"],
-        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings"), _background_force(record)),
+        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings"), force),
         float(record["sample_rate"]),
         record["samples"],
         origin,
@@ -111,7 +111,6 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
     if samples > MAX_SAMPLES:
         raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
-    _ = _background_force(record)
     skeleton = _skeleton(record)
     origin, config = dict(like(record["origin"], {}, "origin")), like(record["config"], {}, "config")
     config = {name: value for name, value in config.items() if name not in REMOVED_SETTINGS}

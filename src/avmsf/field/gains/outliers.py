@@ -278,9 +278,7 @@ def set_aside(ratios: PredictiveRatios, start: frozenset[int] = frozenset()) -> 
 
 
 def predicts_better(
-    new: Complex128[Tensor, "contacts modes"],
-    old: Complex128[Tensor, "contacts modes"],
-    measured: MeasuredGains,
+    new: Complex128[Tensor, "contacts modes"], old: Complex128[Tensor, "contacts modes"], measured: MeasuredGains
 ) -> bool:
     """Return whether gains are surely predicted better, from leave-one-place-out predictions at the same contacts.
 
