@@ -36,25 +36,14 @@ class Tolerances:
 TOLERANCES = Tolerances()
 
 
-@dataclass(frozen=True)
-class ThicknessPosterior:
-    """What is known of the thickness of a wall."""
-
-    median: float
-    """Meters."""
-    low: float
-    """Fifth percentile, meters."""
-    high: float
-    """95th percentile, meters."""
-
-
 def search_thickness(
     bodies: Sequence[CandidateBody],
     evidence: Callable[[Sequence[CandidateBody]], Sequence[float]],
     with_wall: Callable[[CandidateBody, float], CandidateBody | None],
-) -> tuple[list[CandidateBody], ThicknessPosterior | None]:
+) -> tuple[list[CandidateBody], dict[str, float] | None]:
     """Return the bodies that are not improbable, the most probable one first, and the posterior of the thickness.
 
+    Of this the 5th percentile `low`, the `median` and the 95th percentile `high`, meters.
     `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body like
     another with a wall of a thickness in meters, None where that fails, and another thickness is tried then. Of open
     and closed walls only those like the most probable one are searched. There is no posterior where a body without a
@@ -120,11 +109,11 @@ def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnes
     return None
 
 
-def _posterior(walls: Sequence[tuple[float, float]]) -> ThicknessPosterior:
+def _posterior(walls: Sequence[tuple[float, float]]) -> dict[str, float]:
     places, values = np.log([wall for wall, _ in walls]), np.array([each for _, each in walls])
     grid = np.linspace(places[0] - 3 * DISCREPANCY, places[-1] + 3 * DISCREPANCY, TOLERANCES.steps)
     likely = np.exp(np.interp(grid, places, values - values.max(), left=-np.inf, right=-np.inf))
     density = gaussian_filter1d(likely, DISCREPANCY / (grid[1] - grid[0]), mode="constant")
     share = np.cumsum(density) / density.sum()
-    low, median, high = np.exp(grid[np.searchsorted(share, [0.05, 0.5, 0.95])])
-    return ThicknessPosterior(float(median), float(low), float(high))
+    found = np.exp(grid[np.searchsorted(share, [0.05, 0.5, 0.95])])
+    return dict(zip(("low", "median", "high"), found.tolist(), strict=True))

@@ -199,7 +199,7 @@ class MixtureEstimator(GainEstimator):
             "credibility": None if credibility is None else asdict(credibility) | {"credible": credible},
             "levels": levels,
             "support_evidence": evidence,
-            "thickness": None if thickness is None else asdict(thickness),
+            "thickness": thickness,
         }
         return replace(found.model, report=report), found.rows
 
