@@ -2,6 +2,8 @@
 
 import io
 import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import trimesh
 from PIL import Image
 
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.level_set import enclose
+from avmsf.mesh.level_set import decimated, enclose
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import GRAY, TexturedMesh, read_textured_mesh
 from factories.looked_at import mesh_of, surface_of
@@ -140,3 +142,17 @@ def test_what_encloses_nothing_or_reaches_the_edge_is_refused() -> None:
     for values in (empty, full):
         with raises(CaptureError, name="values", value=[values.min(), values.max()]):
             enclose(values, 0.5, lowest=np.zeros(3), spacing=0.1)
+
+
+def test_meshes_that_threads_thin_at_a_time_are_those_of_one_thread():
+    spheres = [trimesh.creation.icosphere(4, radius) for radius in (1.0, 2.0)]
+    alone = [decimated(each.vertices, each.faces, 300)[0] for each in spheres]
+    interval = sys.getswitchinterval()
+    try:
+        # As often as on a machine that is busy for hours.
+        sys.setswitchinterval(1e-6)
+        with ThreadPoolExecutor(2) as pool:
+            found = list(pool.map(lambda each: decimated(each.vertices, each.faces, 300)[0], 20 * spheres))
+    finally:
+        sys.setswitchinterval(interval)
+    assert all(np.array_equal(one, other) for one, other in zip(found, 20 * alone, strict=True))

@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 from typing import Literal
 
-import fast_simplification
 import numpy as np
 import torch
 import trimesh
@@ -18,6 +17,7 @@ from avmsf.export.sampled_field import SampledField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import holds_gaussians, read_splats
 from avmsf.mesh.io import MAX_BYTES, load_mesh
+from avmsf.mesh.level_set import decimated
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
 
@@ -94,9 +94,7 @@ def _reduced(mesh: trimesh.Trimesh, share: float) -> trimesh.Trimesh:
     merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     target = max(4, math.floor(share * len(mesh.faces)))
-    vertices, faces = fast_simplification.simplify(
-        np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=target
-    )
+    vertices, faces = decimated(np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target)
     small = trimesh.Trimesh(vertices, faces, process=False)
     if isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
         _, rows = cKDTree(mesh.vertices).query(vertices)

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
-import fast_simplification
 import numpy as np
 import scipy.optimize
 import scipy.sparse
@@ -25,6 +24,7 @@ from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of
 from avmsf.fem.solid import several_parts
 from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.level_set import decimated
 from avmsf.mesh.surface import Surface
 
 
@@ -218,8 +218,7 @@ def simplified(mesh: Trimesh, count: int, *, like: Trimesh | None = None, most: 
     opened, crowded, count = len(boundary_edges(reference)), count_crowded_edges(reference), max(count, 4)
     knotted = None
     while count < len(mesh.faces):
-        points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=count)
-        found = mesh_of(points.astype(np.float64), faces.astype(np.int64))
+        found = mesh_of(*decimated(mesh.vertices, mesh.faces, count))
         if len(boundary_edges(found)) <= opened:
             if len(found.faces) >= 4 and count_crowded_edges(found) <= crowded:
                 return found

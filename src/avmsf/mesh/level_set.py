@@ -1,10 +1,12 @@
 """Closed surfaces by libraries: of what values on a grid enclose, thinned, and of the difference of two."""
 
+from threading import Lock
+
 import fast_simplification
 import manifold3d
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int
+from jaxtyping import Float, Float32, Float64, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -13,6 +15,7 @@ from avmsf.mesh.surface import Surface
 
 _SPECK = 0.02
 """Area of a part over the largest part's, below which it does not belong to the object."""
+_DECIMATING = Lock()
 
 
 def enclose(
@@ -72,13 +75,22 @@ def _coarser(
 ) -> tuple[Float64[np.ndarray, "fewer 3"], Int[np.ndarray, "coarse 3"]]:
     wanted = faces
     while wanted < len(triangles):
-        places, rows = fast_simplification.simplify(vertices, triangles, target_count=wanted)
-        fewer, coarse = _compact(places.astype(np.float64), rows.astype(np.int64))
+        fewer, coarse = _compact(*decimated(vertices, triangles, wanted))
         if _closed(coarse):
             return fewer, coarse
         # Where it pinches a thin part off, a finer one does not.
         wanted *= 2
     return vertices, triangles
+
+
+def decimated(
+    vertices: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"], count: int
+) -> tuple[Float64[np.ndarray, "fewer 3"], Int[np.ndarray, "coarse 3"]]:
+    """Return about `count` triangles in place of more, by quadrics (Garland and Heckbert, SIGGRAPH 1997)."""
+    # The library keeps the mesh in variables of the process between its calls: two threads would mix their meshes.
+    with _DECIMATING:
+        places, rows = fast_simplification.simplify(vertices, triangles, target_count=count)
+    return places.astype(np.float64), rows.astype(np.int64)
 
 
 def _closed(triangles: Int[np.ndarray, "faces 3"]) -> bool:
