@@ -312,7 +312,7 @@ def test_the_curve_is_stored_drawn_and_shown(words: list[str], tmp_path: Path, m
     # The first score is of the field as it was, the last one of the edited field, at one of its points.
     for field, score in ((ceramic(), curve["scores"][0]), (new, curve["scores"][-1])):
         points = ceramic().gain_field.points
-        alone = clap.score(field.render(points), [PROMPT], sample_rate=RATE).numpy()
+        alone = clap.score(field.render(points), PROMPT, sample_rate=RATE).numpy()
         assert np.abs(alone - score).min() < 1e-6
     (axes,) = drawn["clap.png"].axes
     assert np.asarray(axes.lines[0].get_xydata()) == pytest.approx(np.array([curve["steps"], curve["scores"]]).T)

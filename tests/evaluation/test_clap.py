@@ -57,17 +57,12 @@ def directly(clap: Clap, sounds: torch.Tensor, prompts: tuple[str, ...]) -> torc
 def test_the_score_is_the_models_own_cosine(clap):
     sounds = strikes(samples=CLIP)
     sounds = sounds / sounds.abs().amax(dim=1, keepdim=True)
-    found = clap.score(sounds, PROMPTS, sample_rate=RATE)
+    found = torch.cat([clap.score(sounds[[row]], PROMPTS[row], sample_rate=RATE) for row in range(3)])
     expected = directly(clap, sounds, PROMPTS)
     # A random network: the cosines have to differ for their equality to say anything.
     assert float(expected.max() - expected.min()) > 0.01
     assert torch.allclose(found, expected, rtol=0.0, atol=1e-5)
     assert bool((found.abs() <= 1.0).all())
-
-
-def test_one_prompt_goes_with_all_sounds(clap):
-    one = clap.score(strikes(), PROMPTS[:1], sample_rate=RATE)
-    assert torch.equal(one, clap.score(strikes(), PROMPTS[:1] * 3, sample_rate=RATE))
 
 
 def test_level_does_not_matter_and_the_sample_rate_hardly(clap):
@@ -97,10 +92,9 @@ def test_longer_sounds_are_cut_at_the_same_place_every_time(tmp_path, fused):
 
 
 def test_sounds_and_prompts_that_cannot_be_scored_are_refused(clap):
-    refused = ([""], "prompt", ""), (["  "], "prompt", "  "), ("wood", "prompts", "wood"), ([], "prompts", [])
-    for prompts, name, value in (*refused, (PROMPTS[:2], "prompts", 2)):
-        with raises(EvaluationError, name=name, value=value):
-            clap.score(strikes(), prompts, sample_rate=RATE)
+    for prompt in ("", "  "):
+        with raises(EvaluationError, name="prompt", value=prompt):
+            clap.score(strikes(), prompt, sample_rate=RATE)
     silent = strikes()
     silent[1] = 0.0
     with raises(EvaluationError, name="sounds", row=1, value=0.0):

@@ -185,8 +185,6 @@ def test_colors_follow_the_principal_components():
 def test_what_cannot_be_drawn_is_refused():
     with raises(EvaluationError, value=(len(POINTS), 0, len(AROUND))):
         draw_cloud(POINTS, {}, title="")
-    with raises(EvaluationError, name="up", value=[0.0, 0.0, 0.0]):
-        draw_cloud(POINTS, {"color": POINTS}, title="", up=(0.0, 0.0, 0.0))
 
 
 SAMPLES = 3000

@@ -67,7 +67,7 @@ def run(options: Options) -> int:
         raise StudioError.expected(wanted, name=error.name, advice=advice) from error
     assert options.target is not None
     opened = open_target(options.target, object=options.object, capture=options.capture)
-    computing = serve(
+    serve(
         opened,
         port=options.port,
         browser=not options.no_browser,
@@ -75,10 +75,9 @@ def run(options: Options) -> int:
         config=StudioConfig(options.modes, preset=options.preset),
     )
     say("closed")
-    if computing:
-        # The interpreter would wait for the thread, or break off in the midst of it with a dump of its memory.
-        os._exit(0)
-    return 0
+    sys.stdout.flush()
+    # The interpreter would wait for a thread that still computes, or break off in its midst with a dump of its memory.
+    os._exit(0)
 
 
 def _print(address: str) -> None:

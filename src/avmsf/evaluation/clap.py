@@ -8,7 +8,6 @@ random, and of a fused network's clips declares one at random to be long; ours a
 long. Shorter sounds are repeated as the extractor's own settings have it, which is how the networks were trained.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -75,22 +74,19 @@ class Clap:
         """Hz that sounds are resampled to (polyphase)."""
         return float(self.processor.feature_extractor.sampling_rate)
 
-    def score(self, sounds: Float[Tensor, "..."], prompts: Sequence[str], *, sample_rate: float) -> PerContact:
-        """Return the cosine of each sound [contacts, samples] with its prompt; one prompt alone goes with all.
+    def score(self, sounds: Float[Tensor, "..."], prompt: str, *, sample_rate: float) -> PerContact:
+        """Return the cosine of each sound [contacts, samples] with a prompt.
 
-        Raises EvaluationError for sounds that are empty, silent or not finite, for an empty prompt and for another
-        number of prompts.
+        Raises EvaluationError for sounds that are empty, silent or not finite, and for an empty prompt.
         """
-        audio, text = self.embed(sounds, sample_rate=sample_rate), self.embed_prompts(prompts)
-        if len(text) not in (1, len(audio)):
-            raise EvaluationError.expected(f"one, or one for each of {len(audio)} sounds", len(text), name="prompts")
+        audio, text = self.embed(sounds, sample_rate=sample_rate), self.embed_prompt(prompt)
         return (audio * text).sum(dim=1).clamp(-1.0, 1.0)
 
     def of_previews(self, prompt: str, sample_rate: float) -> PreviewScore:
         """Return what scores the previews of an edit, at a rate in Hz, by their fit to a prompt."""
 
         def score(sound: Float[Tensor, " samples"]) -> float:
-            return float(self.score(sound[None], [prompt], sample_rate=sample_rate))
+            return float(self.score(sound[None], prompt, sample_rate=sample_rate))
 
         return PreviewScore(score, self.name)
 
@@ -106,20 +102,14 @@ class Clap:
         embeddings = [self._embedded(batch.numpy()) for batch in torch.split(prepared, _BATCH)]
         return torch.nn.functional.normalize(torch.cat(embeddings).double(), dim=1)
 
-    def embed_prompts(self, prompts: Sequence[str]) -> Float64[Tensor, "prompts dim"]:
-        """Return the prompts' embeddings, of length one. Raises EvaluationError for an empty prompt."""
-        if isinstance(prompts, str) or not prompts:
-            raise EvaluationError.expected("a list of prompts", prompts, name="prompts", advice="give one as [prompt]")
-        embeddings = []
-        for prompt in prompts:
-            if not prompt.strip():
-                raise EvaluationError.expected("words, such as 'striking a wooden bowl'", prompt, name="prompt")
-            # One by one: padding would make the last digits depend on the other prompts.
-            tokens = self.processor.tokenizer([prompt], return_tensors="pt", truncation=True)
-            inputs = {name: tokens[name] for name in ("input_ids", "attention_mask")}
-            with torch.no_grad():
-                embeddings.append(_vector(self.model.get_text_features(**inputs)))
-        return torch.nn.functional.normalize(torch.cat(embeddings).double(), dim=1)
+    def embed_prompt(self, prompt: str) -> Float64[Tensor, "1 dim"]:
+        """Return a prompt's embedding, of length one. Raises EvaluationError for an empty prompt."""
+        if not prompt.strip():
+            raise EvaluationError.expected("words, such as 'striking a wooden bowl'", prompt, name="prompt")
+        tokens = self.processor.tokenizer([prompt], return_tensors="pt", truncation=True)
+        with torch.no_grad():
+            made = self.model.get_text_features(**{name: tokens[name] for name in ("input_ids", "attention_mask")})
+        return torch.nn.functional.normalize(_vector(made).double(), dim=1)
 
     def _embedded(self, waveforms: Float64[np.ndarray, "batch samples"]) -> Float[Tensor, "batch dim"]:
         extractor, weights = self.processor.feature_extractor, next(self.model.parameters())

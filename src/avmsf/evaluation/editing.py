@@ -290,7 +290,7 @@ def score_edit(
         distance = spectral_distance(sounds, task.reference, sample_rate=edited.sample_rate)
         values["spectral"] = tuple(distance.tolist())
     if clap is not None and task.prompt is not None:
-        values["clap"] = tuple(clap.score(sounds, [task.prompt], sample_rate=edited.sample_rate).tolist())
+        values["clap"] = tuple(clap.score(sounds, task.prompt, sample_rate=edited.sample_rate).tolist())
         if CLAP in record:
             report[CLAP] = list(zip(record[CLAP]["steps"], record[CLAP]["scores"], strict=True))
     return values, figures, report

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 from jinja2 import Environment, PackageLoader, select_autoescape
-from matplotlib import colormaps
 from matplotlib.figure import Figure
-from PIL import Image
+from matplotlib.image import imsave
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
@@ -180,12 +179,8 @@ def draw_spectrogram(levels: Float64[Tensor, "height width"], *, loudest: float)
 
     Colors span 80 dB below `loudest`, dB, the brightest point of the recording it is compared with.
     """
-    shown = ((levels - loudest) / RANGE_DB + 1).clamp(0, 1).flip(0)
-    picture = Image.fromarray((shown * 255).round().to(torch.uint8).numpy()).convert("P")
-    colors = (colormaps[SEQUENTIAL](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
-    picture.putpalette(colors.tobytes())
     memory = io.BytesIO()
-    picture.save(memory, format="PNG", optimize=True)
+    imsave(memory, levels.numpy(), cmap=SEQUENTIAL, vmin=loudest - RANGE_DB, vmax=loudest, origin="lower", format="png")
     return _address("image/png", memory.getvalue())
 
 

@@ -1,7 +1,5 @@
 """The probability of a contact, as a picture of the object from all sides."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -12,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avmsf.localization.contact_map import ContactPosterior
-from avmsf.plotting.clouds import ALL_SIDES, Side, draw_cloud, in_front, view_from
+from avmsf.plotting.clouds import ALL_SIDES, draw_cloud, in_front, view_from
 from avmsf.plotting.style import FIRST, SECOND, SEQUENTIAL, styled
 
 _DECADES = 3.0
@@ -30,7 +28,6 @@ def draw_contact(
     title: str,
     others: Float[Tensor, "others 3"] | None = None,
     truth: Float[Tensor, " 3"] | None = None,
-    sides: Sequence[Side] = ALL_SIDES,
 ) -> Figure:
     """Draw the probability of a contact over the object, and below it the paper's cosine distance, from all sides.
 
@@ -49,11 +46,11 @@ def draw_contact(
         "cosine distance": _heat(1.0 - (contact.distance.double() - low) / (high - low))[rows],
     }
     legend = ", ".join(words for color, words in _LEGEND.items() if color in dict(marks))
-    figure = draw_cloud(points[rows], colors, title=f"{title}\n{legend}", sides=sides)
+    figure = draw_cloud(points[rows], colors, title=f"{title}\n{legend}", sides=ALL_SIDES)
     panels = np.array(figure.axes).reshape(len(colors), -1)
     drawn, places = points[rows].double().numpy(), np.stack([each.double().numpy() for _, each in marks])
     middle, edges = (drawn.min(0) + drawn.max(0)) / 2, np.array([color for color, _ in marks])
-    for axes, side in zip(panels.flat, [*sides] * len(colors), strict=True):
+    for axes, side in zip(panels.flat, ALL_SIDES * len(colors), strict=True):
         frame = view_from(side).T
         visible = in_front(drawn @ frame, places @ frame)
         spots = (places[visible] - middle) @ frame

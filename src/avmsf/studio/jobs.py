@@ -214,23 +214,7 @@ class Threads:
 
     def __init__(self) -> None:
         self._limiters = {kind: anyio.CapacityLimiter(1) for kind in get_args(Kind)}
-        self._computing: set[object] = set()
-
-    @property
-    def busy(self) -> bool:
-        """Whether a thread is computing, which cannot be interrupted and may outlive the server."""
-        return bool(self._computing)
 
     async def run(self, kind: Kind, act: Callable[..., Result], *arguments: Any) -> Result:
-        """Call a function in a thread, after the others of its kind."""
-
-        def call() -> Result:
-            token = object()
-            if kind in ("compute", "prepare"):
-                self._computing.add(token)
-            try:
-                return act(*arguments)
-            finally:
-                self._computing.discard(token)
-
-        return await anyio.to_thread.run_sync(call, limiter=self._limiters[kind])
+        """Call a function in a thread, after the others of its kind; it may outlive the server."""
+        return await anyio.to_thread.run_sync(act, *arguments, limiter=self._limiters[kind])

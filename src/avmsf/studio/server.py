@@ -41,11 +41,11 @@ def serve(
     browser: bool = True,
     log: Callable[[str], None],
     config: StudioConfig | None = None,
-) -> bool:
+) -> None:
     """Serve the page until Ctrl-C; `log` is called with its address.
 
-    Without `port` it is PORT, or a free one if that is in use. Return whether a thread is still computing a result that
-    is no longer needed. Raises StudioError if a given port is in use, and the errors of the readers.
+    Without `port` it is PORT, or a free one if that is in use. Raises StudioError if a given port is in use, and the
+    errors of the readers.
     """
     with listen(port) as listener, _temporary_folder() as folder:
         number, token = listener.getsockname()[1], new_token()
@@ -67,7 +67,6 @@ def serve(
                 server.run(sockets=[listener])
         finally:
             signal.signal(signal.SIGTERM, before)
-        return studio.threads.busy
 
 
 def _temporary_folder() -> tempfile.TemporaryDirectory[str]:

@@ -89,13 +89,7 @@ class BodyFamily:
         return replace(self, thickness=ordered, bodies=tuple(bodies[each] for each in ordered))
 
 
-def body_family(
-    surface: Surface | HollowShape,
-    *,
-    count: int,
-    dofs: int = COARSE_WALL_DOFS,
-    log: Callable[[str], None] | None = None,
-) -> BodyFamily:
+def body_family(surface: Surface | HollowShape, *, count: int, dofs: int = COARSE_WALL_DOFS) -> BodyFamily:
     """Return the bodies of a surface, with their lowest `count` modes.
 
     Walls have about `dofs` degrees of freedom, a solid body 40,000: prisms along walls of a pot and a tube are
@@ -105,14 +99,12 @@ def body_family(
 
     Raises SimulationError for points without triangles, and where no body can be made, with the reason.
     """
-    report = log or (lambda message: None)
-    candidates = CandidateBodies(surface, log=report)
+    candidates = CandidateBodies(surface)
     thicknesses, make = _walls(candidates, dofs)
     if make is None:
         return BodyFamily((isotropic_modes(candidates.solid(None, _SOLID_DOFS), count=count),), ())
     made, reasons = {}, []
     for thickness in thicknesses:
-        report(f"elastic modes of a wall of {1000 * thickness:.2g} mm")
         try:
             made[thickness] = isotropic_modes(make(thickness), count=count)
         except SimulationError as error:
