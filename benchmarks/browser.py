@@ -15,6 +15,7 @@ from typing import Any
 
 from avmsf.export.bundle import Bundle
 from avmsf.export.web import page_files
+from avmsf.export.writing import write_folder
 
 AVMSF = (sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())")
 WIDE = {"width": 1280, "height": 800}
@@ -51,7 +52,7 @@ def opened(browser: Any, address: str, viewport: dict[str, int] = WIDE, **contex
 
 def write_site(bundle: Bundle, folder: Path) -> None:
     """Write a bundle and the page's files beside it."""
-    bundle.write(folder)
+    write_folder(folder, bundle.files, bundle.manifest)
     for name, content in page_files().items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)

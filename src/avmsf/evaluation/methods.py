@@ -21,7 +21,7 @@ from torch import Tensor
 from avmsf._utils.device import usable_device
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
-from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published, folder_digest
+from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published
 from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.capture.filenames import files_in
@@ -98,7 +98,7 @@ def method_named(name: str) -> Method:
         made: Method = resolve(entry.make)(name, **entry.settings, **settings)
         return made
     if entry.path:
-        weights = folder_digest(path) if path.is_dir() else digest_of(path)[:16]
+        weights = digest_of(path)[:16]
     return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings, **settings), weights, entry.visual_input)
 
 

@@ -20,7 +20,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
 from avmsf.export.geometry import ObjectKind, read_object
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import Written, no_modes, pack, write_folder
+from avmsf.export.writing import no_modes, pack
 from avmsf.mesh.surface import Surface
 
 FORMAT = 1
@@ -40,10 +40,6 @@ class Bundle:
     """Contents by relative path, without the manifest."""
     remarks: tuple[str, ...] = ()
     """Notes on what the page leaves out."""
-
-    def write(self, folder: str | Path, *, overwrite: bool = False) -> Written:
-        """Write a folder, atomically. Raises `ExportError` for one that is not empty, unless `overwrite` is set."""
-        return Written(write_folder(Path(folder), self.files, self.manifest, overwrite=overwrite), self.remarks)
 
 
 def make_bundle(
