@@ -151,7 +151,7 @@ def tensors(folder: Path) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("shared", [True, False])
 def test_tensors_are_the_tables_to_the_last_bit(tmp_path: Path, shared: bool) -> None:
     table = struck_table(shared=shared, points=5, modes=3, seconds=0.0300625)
-    written = make_bundle(table).write(tmp_path / "page")
+    written = write_webpage(table, tmp_path / "page")
     found = tensors(tmp_path / "page")
     parts = {"sine": table.gains.real, "cosine": table.gains.imag}
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
@@ -174,7 +174,7 @@ def test_strikes_are_heard_as_they_were_recorded(tmp_path: Path) -> None:
     sounds = 3.0 * torch.randn(2, 500, generator=torch.Generator().manual_seed(0))
     contacts = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
     strikes = Impacts(contacts, sounds, RATE, ("a.wav", "../b.wav"), directions=-contacts.float() * 10)
-    make_bundle(struck_table(shared=True), strikes=strikes).write(tmp_path / "page")
+    write_webpage(struck_table(shared=True), tmp_path / "page", strikes=strikes)
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
     assert [each["name"] for each in manifest["strikes"]] == ["a.wav", "../b.wav"]
     assert [each["sound"] for each in manifest["strikes"]] == ["strikes/001.wav", "strikes/002.wav"]
@@ -233,7 +233,7 @@ def test_a_mesh_of_too_many_triangles_is_reduced_with_a_word(monkeypatch: pytest
 def test_gaussians_are_kept_as_they_are(tmp_path: Path) -> None:
     points = ball_points()
     write_splats(random_cloud(points), tmp_path / "ball.ply")
-    make_bundle(ball_table(), object=tmp_path / "ball.ply").write(tmp_path / "page")
+    write_webpage(ball_table(), tmp_path / "page", object=tmp_path / "ball.ply")
     assert (tmp_path / "page" / "object.ply").read_bytes() == (tmp_path / "ball.ply").read_bytes()
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
     assert manifest["object"] == {"kind": "gaussians", "file": "object.ply"}

@@ -226,7 +226,7 @@ def test_a_picture_shows_both_maps_and_the_marks(tmp_path: Path) -> None:
         if abs(side[1]) == 75.0:
             assert np.allclose(axes.collections[1].get_offsets(), (marks @ view_from(side).T)[:, :2])
             assert [to_hex(each) for each in axes.collections[1].get_edgecolors()] == [*["#ffffff"] * 2, FIRST, SECOND]
-    assert "red: " not in draw_contact(contact(), title="hit.wav", sides=((0.0, 25.0),)).get_suptitle()
+    assert "red: " not in draw_contact(contact(), title="hit.wav").get_suptitle()
     save_picture(figure, tmp_path / "hit.png")
     assert (tmp_path / "hit.png").read_bytes().startswith(b"\x89PNG")
 

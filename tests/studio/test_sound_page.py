@@ -1,7 +1,6 @@
 """The page's modal bank, in a browser: what it renders is what Python renders."""
 
 import base64
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 
 from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import write_webpage
 from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 from factories.made_tables import STRUCK_RATE as RATE
@@ -21,7 +21,6 @@ from factories.made_tables import struck_table
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-PAGE = Path(__file__).resolve().parents[2] / "src" / "avmsf" / "studio" / "page"
 BLANK = '<!doctype html><meta charset="utf-8"><script type="importmap">{"imports": {}}</script><title>sound</title>'
 START = '<script type="module" src="page/start.js"></script>'
 """Loads what the tests call, as the studio's own page does."""
@@ -57,8 +56,7 @@ def pages(
     opened = {kind: browser.new_page() for kind in KINDS}
     for kind, page in opened.items():
         folder = tmp_path_factory.mktemp(kind)
-        make_bundle(tables[kind]).write(folder)
-        shutil.copytree(PAGE, folder / "page")
+        write_webpage(tables[kind], folder)
         (folder / "page" / "start.js").write_text(MODULE)
         (folder / "index.html").write_text(BLANK + START)
         page.goto(serve(folder))
