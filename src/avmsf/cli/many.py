@@ -122,8 +122,8 @@ def run_many(verb: str, options: Many, *, raising: type[AvmsfError]) -> int:
         try:
             run_tasks(partial(_make, verb), tasks, workers, take, doing)
         finally:
-            rows = [_row(options, name, found[name]) for name in tasks if name in found]
-            if rows:
+            rows = [_row(options, name, found.get(name, {"state": "not reached"})) for name in tasks]
+            if found:
                 cells = [list(rows[0]), *(row.values() for row in rows)]
                 write_whole(folder / RESULTS, csv_text(cells), raising=OutputError)
     failures = [row for row in rows if row["failure"]]
