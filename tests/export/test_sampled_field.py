@@ -30,7 +30,7 @@ from factories.clouds import random_cloud
 from factories.looked_at import surface_of
 from factories.made_fields import BANK, FIELDS, elastic, places, plate, positional
 from factories.made_tables import STRUCK_RATE as RATE
-from factories.made_tables import struck_table
+from factories.made_tables import read_arrays, struck_table
 from factories.raising import raises
 
 SAMPLES = 3000
@@ -136,29 +136,17 @@ def test_supporting_poles_are_counted_among_the_modes_that_sound():
     assert SampledField.of(made).supporting == ()
 
 
-def tensors(folder: Path) -> dict[str, np.ndarray]:
-    """Read the tensors as a stranger would."""
-    manifest = json.loads((folder / "manifest.json").read_text())
-    found = {}
-    for name, record in manifest["tensors"].items():
-        count = int(np.prod(record["shape"]))
-        kind = np.dtype(record["dtype"]).newbyteorder("<")
-        values = np.frombuffer((folder / record["file"]).read_bytes(), kind, count, record["offset"])
-        found[name] = values.reshape(record["shape"])
-    return found
-
-
 @pytest.mark.parametrize("shared", [True, False])
 def test_tensors_are_the_tables_to_the_last_bit(tmp_path: Path, shared: bool) -> None:
     table = struck_table(shared=shared, points=5, modes=3, seconds=0.0300625)
     written = write_webpage(table, tmp_path / "page")
-    found = tensors(tmp_path / "page")
+    found = read_arrays(tmp_path / "page", "tensors")
     parts = {"sine": table.gains.real, "cosine": table.gains.imag}
     manifest = json.loads((tmp_path / "page" / "manifest.json").read_text())
     for name in ("points", "normals", "frequency", "damping", "sine", "cosine", "noise"):
-        expected = (parts[name] if name in parts else getattr(table, name)).numpy()
+        expected = parts[name] if name in parts else getattr(table, name)
         assert found[name].dtype == expected.dtype
-        assert np.array_equal(found[name], expected), name
+        assert torch.equal(found[name], expected), name
         # JavaScript reads numbers at multiples of their size alone.
         assert manifest["tensors"][name]["offset"] % expected.itemsize == 0
     assert "cosine" not in make_bundle(replace(table, gains=table.gains.real + 0j)).manifest["tensors"]

@@ -65,11 +65,12 @@ def struck_table(*, shared: bool, modes: int = 40, points: int = 6, seconds: flo
     return SampledField(0.1 * out, out, frequency, damping, gains, noise, STRUCK_RATE, per_newton=True, name="ball")
 
 
-def read_arrays(folder: Path) -> dict[str, torch.Tensor]:
-    """Return the arrays of a folder in the layout of the paper's demo, by its manifest's offsets, types and shapes."""
+def read_arrays(folder: Path, key: str = "arrays") -> dict[str, torch.Tensor]:
+    """Return the arrays of a folder by its manifest's offsets, types and shapes, all of one file or each of its own."""
     manifest = json.loads((folder / "manifest.json").read_text())
-    content, found = (folder / manifest["file"]).read_bytes(), {}
-    for name, record in manifest["arrays"].items():
+    found = {}
+    for name, record in manifest[key].items():
+        content = (folder / (record.get("file") or manifest["file"])).read_bytes()
         values = np.frombuffer(content, record["dtype"], math.prod(record["shape"]), record["offset"])
         found[name] = torch.from_numpy(values.reshape(record["shape"]).copy())
     return found

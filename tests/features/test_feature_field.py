@@ -193,13 +193,8 @@ UPRIGHT = MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.zeros(3).
 
 
 def symmetries(*found: RotationalSymmetry | MirrorSymmetry) -> Symmetries:
-    return Symmetries(
-        tuple(each for each in found if isinstance(each, RotationalSymmetry)),
-        tuple(each for each in found if isinstance(each, MirrorSymmetry)),
-        0.05,
-        0.35,
-        math.inf,
-    )
+    kinds = RotationalSymmetry, MirrorSymmetry
+    return Symmetries(*(tuple(each for each in found if isinstance(each, one)) for one in kinds), 0.05, 0.35, math.inf)
 
 
 def tube(around: int = 60, along: int = 12) -> torch.Tensor:

@@ -119,17 +119,20 @@ def test_evidence_does_not_depend_on_the_batches(monkeypatch):
     assert torch.allclose(log_evidence(*tensors), whole, rtol=1e-12, atol=0.0)
 
 
-def test_mean_and_spread_are_those_of_the_sum_over_hypotheses():
+def test_mean_spread_and_magnitude_are_those_of_the_hypotheses():
+    """The magnitude with their deviations, by draws, and without."""
     joint = torch.from_numpy(joint_kernels().copy())
     cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
-    mean, square = mixture().average(cross, own, lambda mean, _: mean, lambda mean, variance: mean.square() + variance)
+    taken = (lambda m, _: m, lambda m, variance: m.square() + variance, mean_magnitude, lambda m, _: m.abs())
+    mean, square, magnitude, of_means = mixture().average(cross, own, *taken)
     spread = (square - mean.square()).sqrt()
+    places = list(range(CONTACTS, CONTACTS + PLACES))
     for series in range(SERIES):
-        expected = textbook_prediction(
-            list(range(CONTACTS)), list(range(CONTACTS, CONTACTS + PLACES)), series, noise=False
-        )
+        expected = textbook_prediction(list(range(CONTACTS)), places, series, noise=False)
         assert mean[:, series].numpy() == pytest.approx(expected.mean, rel=1e-8, abs=1e-10)
         assert spread[:, series].numpy() == pytest.approx(expected.deviation, rel=1e-6)
+        assert magnitude[:, series].numpy() == pytest.approx(expected.magnitude, rel=1e-4, abs=1e-12)
+        assert of_means[:, series].numpy() == pytest.approx(expected.of_means, rel=1e-4, abs=1e-12)
 
 
 def test_the_prior_of_the_scale_is_integrated_over():
@@ -175,18 +178,6 @@ def test_levels_maximize_the_textbook_posterior():
     expected = minimize(cost, np.zeros(CONTACTS)).x
     assert np.abs(expected).max() > 0.2
     assert mixture().take(torch.tensor(counted)).levels().log().numpy() == pytest.approx(expected, abs=1e-3)
-
-
-def test_mean_magnitude_is_that_of_draws_from_the_hypotheses():
-    """With their deviations and without."""
-    joint = torch.from_numpy(joint_kernels().copy())
-    cross, own = joint[:, CONTACTS:, :CONTACTS], torch.diagonal(joint, dim1=1, dim2=2)[:, CONTACTS:]
-    found = mixture().average(cross, own, mean_magnitude, lambda mean, _: mean.abs())
-    places = list(range(CONTACTS, CONTACTS + PLACES))
-    for series in range(SERIES):
-        expected = textbook_prediction(list(range(CONTACTS)), places, series, noise=False)
-        assert found[0][:, series].numpy() == pytest.approx(expected.magnitude, rel=1e-4, abs=1e-12)
-        assert found[1][:, series].numpy() == pytest.approx(expected.of_means, rel=1e-4, abs=1e-12)
 
 
 def test_standard_error_is_the_root_of_the_mean_noise_variance():
