@@ -61,17 +61,18 @@ def expect_same(found: SoundField, expected: SoundField) -> None:
     assert torch.equal(found.render(PLACES), expected.render(PLACES))
 
 
-def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    """Let Ctrl-C come once, as a step is shown."""
-    shown, stopped = ProgressDisplay.step, list[int]()
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> list[int]:
+    """Let Ctrl-C come once, as a step is shown; return the steps that are shown."""
+    shown, steps = ProgressDisplay.step, list[int]()
 
     def impatient(bar: ProgressDisplay, stage: str, done: int, total: int, message: str) -> None:
         shown(bar, stage, done, total, message)
-        if done == step and not stopped:
-            stopped.append(done)
+        steps.append(done)
+        if done == step and steps.count(step) == 1:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(ProgressDisplay, "step", impatient)
+    return steps
 
 
 def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, capsys: Streams) -> None:
@@ -141,7 +142,7 @@ def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(fie
         assert "850 Hz" in str(caught.value)
 
 
-def test_towards_a_recording_with_previews_until_an_interruption(field, capsys, monkeypatch):
+def test_towards_a_recording_and_an_interrupted_edit_goes_on(field, capsys, monkeypatch):
     target = adjust_modes(ceramic(), pitch=1.3).render(PLACES[:1])[0]
     soundfile.write(field.with_name("like.wav"), torch.cat([torch.zeros(800), target]).numpy() / 50, int(RATE))
     words = ["--like", str(field.with_name("like.wav"))]
@@ -149,14 +150,20 @@ def test_towards_a_recording_with_previews_until_an_interruption(field, capsys, 
     whole, part = edited(field, *words, name="whole"), field.with_name("part.safetensors")
     assert whole.origin.report[EDITS][0]["reference"] == "like.wav"
     assert float((whole.bank.frequency / FREQUENCY).median()) == pytest.approx(1.3, rel=0.1)
-    interrupt_at(monkeypatch, 2)
+    steps = interrupt_at(monkeypatch, 2)
     assert main(["edit", str(field), "--output", str(part), *words]) == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "avmsf edit: interrupted"
+    assert capsys.readouterr().err.splitlines()[-1] == "avmsf edit: interrupted; repeat the command to continue"
     assert not part.exists()
     preview, rate = soundfile.read(field.with_name("part.safetensors.preview.wav"))
     assert (len(preview), rate) == (2400, RATE)
+    state = field.with_name("part.safetensors.checkpoint")
+    kept = state.read_bytes()
+    edited(field, "--pitch", "2", name="part")
+    assert state.read_bytes() == kept
+    del steps[:-1]
     expect_same(edited(field, *words, name="part"), whole)
-    assert not list(field.parent.glob("*.preview.wav"))
+    assert steps == [2, 3, 4]
+    assert not list(field.parent.glob("*.preview.wav")) + list(field.parent.glob("*.checkpoint"))
 
 
 def test_towards_a_materials_sound(field: Path) -> None:
@@ -317,3 +324,20 @@ def test_the_curve_is_stored_drawn_and_shown(words: list[str], tmp_path: Path, m
     (axes,) = drawn["clap.png"].axes
     assert np.asarray(axes.lines[0].get_xydata()) == pytest.approx(np.array([curve["steps"], curve["scores"]]).T)
     assert not list(tmp_path.glob("new.safetensors.*"))
+
+
+def test_an_interrupted_edit_has_the_whole_curve(words, tmp_path, monkeypatch):
+    def report(name: str) -> dict:
+        found: dict = load(tmp_path / name).origin.report[EDITS][-1]["clap"]
+        return found
+
+    assert run_verb("edit", *words, "--output", str(tmp_path / "whole.safetensors")) == 0
+    part = [*words, "--output", str(tmp_path / "part.safetensors")]
+    with monkeypatch.context() as patched:
+        interrupt_at(patched, 3)
+        assert main(["edit", *part]) == 130
+    save_clap(tmp_path / "other", seed=1)
+    with raises(AvmsfError, file="part.safetensors.checkpoint", value=["network"]):
+        run_verb("edit", *part, "--set", f"prompt.clap={tmp_path / 'other'}")
+    assert run_verb("edit", *part) == 0
+    assert report("part.safetensors") == report("whole.safetensors")

@@ -142,6 +142,37 @@ def test_stiffness_keeps_modes_together():
     assert spread(100.0) < 0.3 * spread(0.0)
 
 
+@pytest.mark.parametrize("stop", [1, 7, 12])
+def test_an_interrupted_edit_goes_on_to_the_same_result(tmp_path, stop):
+    field, guide, place = ringing_field(), replace(towards(pitch=1.02, damping=1.3), noise=0.3), tmp_path / "state"
+
+    def interrupt(progress) -> None:
+        if progress.step == stop:
+            raise KeyboardInterrupt
+
+    whole = edit_towards(field, guide, config=QUICK)
+    with pytest.raises(KeyboardInterrupt):
+        edit_towards(field, guide, config=QUICK, progress=interrupt, checkpoint=place)
+    resumed, seen = trace(field, guide, config=QUICK, checkpoint=place)
+    assert [each.step for each in seen] == list(range(stop + 1, 13))
+    assert torch.equal(resumed.bank.frequency, whole.bank.frequency)
+    assert torch.equal(resumed.bank.damping, whole.bank.damping)
+    assert torch.equal(sound_of(resumed), sound_of(whole))
+
+
+def test_a_checkpoint_of_another_edit_is_refused_by_name(tmp_path):
+    place, guide = tmp_path / "state", towards(pitch=1.02)
+    edit_towards(ringing_field(), guide, config=QUICK, checkpoint=place)
+    with raises(EditError, file=place, value=["field"]):
+        edit_towards(ringing_field(pitch=1.1), guide, config=QUICK, checkpoint=place)
+    with raises(EditError, file=place, value=["guide"]):
+        edit_towards(ringing_field(), towards(pitch=1.03), config=QUICK, checkpoint=place)
+    # How often previews come changes nothing.
+    edit_towards(ringing_field(), guide, config=replace(QUICK, preview_every=3), checkpoint=place)
+    with raises(EditError, file=place, value=["settings"]):
+        edit_towards(ringing_field(), guide, config=replace(QUICK, steps=13), checkpoint=place)
+
+
 def test_targets_that_are_not_finite_are_left_out_and_nothing_but_such_ends_the_edit():
     _, seen = trace(ringing_field(), replace(towards(pitch=1.01), spoilt=True), config=QUICK)
     # Even steps have no usable target, odd ones one of two.

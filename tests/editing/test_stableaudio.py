@@ -11,7 +11,7 @@ import torch
 from avmsf.editing.config import STABLE_AUDIO
 from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EditError
-from factories.made_audio import DIM, FRAMES, RATE, save_audio
+from factories.made_audio import DIM, FRAMES, RATE, save_audio, tiny_pipeline
 from factories.raising import raises
 
 with warnings.catch_warnings():
@@ -48,6 +48,11 @@ def test_a_folder_is_loaded_and_frozen(model):
     assert (model.device.type, model.dtype) == ("cpu", torch.float32)
     networks = (model.pipeline.vae, model.pipeline.transformer, model.pipeline.text_encoder)
     assert not any(weight.requires_grad for network in networks for weight in network.parameters())
+    # Models of one name are told apart by their weights.
+    same, other = (StableAudio(tiny_pipeline(), name="tiny-audio") for _ in range(2))
+    with torch.no_grad():
+        other.pipeline.transformer.proj_in.weight[0, 0] += 1e-3
+    assert same.describe() == model.describe() != other.describe()
 
 
 def test_only_what_sounds_is_encoded_and_decoded(model):

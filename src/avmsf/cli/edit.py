@@ -64,7 +64,6 @@ class Options(Configured):
     position: Annotated[tuple[float, float, float] | None, arg("X Y Z")] = None
     """Contact of these sounds, meters; by default the loudest."""
 
-    resumes = False
     usual = EditSettings()
 
     @cached_property
@@ -90,10 +89,9 @@ class Options(Configured):
         given["--like-material"] = self.like_material is not None
         return [name for name, present in given.items() if present]
 
-    @property
-    def preview(self) -> Path:
-        """The path of an unfinished edit's sound: next to its later file."""
-        return self.output.with_name(f"{self.output.name}.preview.wav")
+    def part(self, ending: str) -> Path:
+        """Return the path of a part of an unfinished edit: next to its later file."""
+        return self.output.with_name(f"{self.output.name}.{ending}")
 
     def check_inputs(self) -> None:
         """Raise the package's errors for an edit that cannot be done or written, before anything is loaded."""
@@ -146,7 +144,8 @@ def run(options: Options) -> int:
     contact = contact_of_sounds(old, options.position)
     new = _edited(options, old)
     save(new, options.output)
-    options.preview.unlink(missing_ok=True)
+    for ending in ("checkpoint", "preview.wav") if options.guides else ():
+        options.part(ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = ModeLevels.of(old), ModeLevels.of(new)
     rows = mode_changes(before, after)
@@ -219,7 +218,7 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
     from avmsf.editing.reference import Reference
     from avmsf.evaluation.clap import Clap
 
-    settings, preview, score = options.all_settings, options.preview, None
+    settings, preview, score = options.all_settings, options.part("preview.wav"), None
     if settings.prompt.clap is not None and options.prompt is not None:
         score = Clap.load(settings.prompt.clap).of_previews(options.prompt, field.sample_rate)
     # After CLAP: a wrong name of its network is refused before the large model is loaded.
@@ -242,7 +241,7 @@ def _guided(options: Options, field: "SoundField", old: Material | None) -> "Sou
 
     return edit_towards(
         field, guide, config=settings.guide, parameters=PARAMETERIZATIONS[settings.parameters], progress=progress,
-        score=score,
+        score=score, checkpoint=options.part("checkpoint"),
     )  # fmt: skip
 
 

@@ -3,12 +3,16 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf._utils.caching import content_digest, key_of, source_digest
+from avmsf._utils.checkpoint import Checkpoint
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.errors import EditError
@@ -89,7 +93,7 @@ class Guide(Protocol):
         ...
 
     def describe(self) -> dict[str, Any]:
-        """Return its identifying settings, as plain values, for the edit's report."""
+        """Return its identifying settings, as plain values, for the edit's report and checkpoint."""
         ...
 
     def start(self, rendered: FieldAtContacts) -> ModalEdit:
@@ -144,17 +148,20 @@ def edit_towards(
     parameters: Parameterization = HIERARCHICAL,
     progress: Callable[[GuidedEditProgress], None] | None = None,
     score: PreviewScore | None = None,
+    checkpoint: str | Path | None = None,
 ) -> SoundField:
     """Return the field with its modes optimized towards the targets of `guide`; gain ratios between contacts stay.
 
     Each step renders random contacts, compares the sounds with the guide's targets by the multi-scale spectral loss of
     fitting, and updates the free `parameters`. The level is not edited: the sounds compared, and the field returned,
     have the level of the given one. The `score` of the field before and of all previews, but for silence, goes to the
-    edit's report. Raises `EditError` for a field that is silent, for a guide at another rate, and where the guide's
-    targets or the loss are not finite.
+    edit's report. With `checkpoint`, the state is stored there while the edit runs, on interruption and at the end, and
+    an edit with the same arguments continues from it to the same result. Raises `EditError` for a field that is silent,
+    for a guide at another rate, for a checkpoint of another edit, and where the guide's targets or the loss are not
+    finite.
     """
     config = GuidedEditConfig() if config is None else config
-    return _Optimization(field, guide, config, parameters, score).finish(progress)
+    return _Optimization(field, guide, config, parameters, score, checkpoint).finish(progress)
 
 
 class _Optimization:
@@ -167,6 +174,7 @@ class _Optimization:
         config: GuidedEditConfig,
         parameters: Parameterization,
         score: PreviewScore | None,
+        checkpoint: str | Path | None,
     ) -> None:
         if guide.sample_rate != field.sample_rate:
             raise EditError.expected(f"the field's {field.sample_rate:g} Hz", guide.sample_rate, name="sample_rate")
@@ -184,12 +192,28 @@ class _Optimization:
         self.sizes = [scaled_fft_size(size, sample_rate=field.sample_rate) for size in config.fft_sizes]
         self.settings = {**guide.describe(), "parameters": parameters.name, **asdict(config)}
         self.step, self.failed = 0, 0
-        self.scores: dict[int, float] = {}
-        start = guide.start(self.probes) if parameters.searches else ModalEdit.none(self.field.bank)
+        self.consistent = True
+        """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
+        settings = {**asdict(config), **asdict(parameters)}
+        # The interval of previews does not change the result.
+        del settings["preview_every"]
+        identity = checkpoint_identity(field, probes, guide.describe(), settings)
+        identity |= {} if score is None else {"network": key_of({"name": score.network})}
+        self.checkpoint = Checkpoint(checkpoint, identity, what="the edit", raising=EditError)
+        state = self.checkpoint.read()
+        self.scores: dict[int, float] = {} if state is None else state["scores"]
+        searching = state is None and parameters.searches
+        start = guide.start(self.probes) if searching else ModalEdit.none(self.field.bank)
         self.edited = self.probes.loudest(config.free_modes)
         """The modes that move by themselves; the others follow the common factors alone."""
         self.values = {name: each.detach().clone() for name, each in vars(start).items()}
         self.optimizer = self._optimizer()
+        if state is not None:
+            with torch.no_grad():
+                for name, value in self.values.items():
+                    value.copy_(state["variables"]["values"][name])
+            self.optimizer.load_state_dict(state["variables"]["optimizer"])
+            self.step, self.failed = state["step"], state["failed"]
 
     def _optimizer(self) -> torch.optim.Adam:
         """Return an optimizer of the values; those whose rate is 0 stay where they begin."""
@@ -205,18 +229,27 @@ class _Optimization:
         return torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def finish(self, progress: Callable[[GuidedEditProgress], None] | None) -> SoundField:
-        """Take all steps and return the edited field."""
-        while self.step < self.config.steps:
-            loss = self._take_step()
-            edit, every, preview = ModalEdit(**self.values), self.config.preview_every, None
-            watched = every > 0 and (progress is not None or self.score is not None)
-            if watched and (self.step % every == 0 or self.step == self.config.steps):
-                preview = self._preview(self._normalized_edit().of(self.field))
-                if self.score is not None:
-                    self._add_score(self.score, preview)
-            if progress is not None:
-                factors = edit.pitch_factor, edit.decay_factor
-                progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview))
+        """Take the steps that are left and return the edited field."""
+        try:
+            while self.step < self.config.steps:
+                loss = self._take_step()
+                edit, every, preview = ModalEdit(**self.values), self.config.preview_every, None
+                watched = every > 0 and (progress is not None or self.score is not None)
+                if watched and (self.step % every == 0 or self.step == self.config.steps):
+                    preview = self._preview(self._normalized_edit().of(self.field))
+                    if self.score is not None:
+                        self._add_score(self.score, preview)
+                if progress is not None:
+                    factors = edit.pitch_factor, edit.decay_factor
+                    progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview))
+                if self.checkpoint.due:
+                    self._save()
+        except KeyboardInterrupt:
+            # Amid a step's changes there is nothing to keep but what was saved before.
+            if self.consistent:
+                self._save()
+            raise
+        self._save()
         if self.score is not None:
             record = {"model": self.score.network, "steps": [*self.scores], "scores": [*self.scores.values()]}
             self.settings[CLAP] = record
@@ -229,7 +262,7 @@ class _Optimization:
 
     def _take_step(self) -> float:
         """Take one step and return the loss before it."""
-        # All chance of a step hangs on its number.
+        # All chance of a step hangs on its number, so that an edit goes on as if it had never been interrupted.
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         rows = torch.randperm(len(self.points), generator=generator)[: self.config.contacts_per_step]
         rendered = self._at(self.points[rows])
@@ -251,6 +284,7 @@ class _Optimization:
                 advice = "lower the guidance, or compute in float32"
                 raise EditError.expected("finite sounds", self.failed, got=got, name="targets", advice=advice)
         self.step += 1
+        self.consistent = True
         return loss
 
     def _update(self, sounds: Sounds, targets: Sounds) -> float:
@@ -262,6 +296,7 @@ class _Optimization:
         if not all(bool(torch.isfinite(each).all()) for each in (error, *gradients)):
             wanted, advice = "a finite value and gradient", "lower the learning rates"
             raise EditError.expected(wanted, float(error), row=self.step, name="loss", advice=advice)
+        self.consistent = False
         for group in self.optimizer.param_groups:
             group["lr"] = group["rate"] * (0.525 + 0.475 * math.cos(math.pi * self.step / self.config.steps))
         self.optimizer.step()
@@ -292,3 +327,23 @@ class _Optimization:
         seconds = self.config.seconds
         samples = self.field.samples if seconds is None else round(seconds * self.field.sample_rate)
         return FieldAtContacts.at(self.field, contacts, samples=max(1, samples))
+
+    def _save(self) -> None:
+        values = {name: value.detach() for name, value in self.values.items()}
+        variables = {"values": values, "optimizer": self.optimizer.state_dict()}
+        self.checkpoint.save({"variables": variables, "step": self.step, "failed": self.failed, "scores": self.scores})
+
+
+def checkpoint_identity(
+    field: SoundField, contacts: Tensor, guide: dict[str, Any], settings: dict[str, Any]
+) -> dict[str, str]:
+    """Return a digest of each thing that decides an edit's result, by what errors call it.
+
+    `contacts` are places at which the field's gains are looked at; `guide` and `settings` plain values.
+    """
+    tensors = {f"bank.{name}": each for name, each in vars(field.bank).items()} | vars(field.known(contacts))
+    content = content_digest(*tensors, *tensors.values(), field.phase, field.gain_field.points)
+    field_values = [field.sample_rate, field.samples, content]
+    made_by = [version("avmsf"), source_digest("avmsf.editing.guided")]
+    values = {"field": field_values, "guide": guide, "settings": settings, "version of avmsf": made_by}
+    return {name: key_of({name: each}) for name, each in values.items()}

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import Seed, generator_of
+from avmsf._utils.caching import content_digest
 from avmsf.capture.audio import read_recording
 from avmsf.capture.measure import find_clipping, prepare_single
 from avmsf.capture.settings import CaptureSettings
@@ -115,7 +116,8 @@ class Reference:
 
     def describe(self) -> dict[str, Any]:
         """Return its identifying settings, as plain values."""
-        return {"reference": self.name, "lengths": list(self.lengths)}
+        samples = content_digest(self.clips)
+        return {"reference": self.name, "lengths": list(self.lengths), "samples_sha256": samples}
 
     def start(self, rendered: FieldAtContacts) -> ModalEdit:
         """Return the edit by a common pitch and damping, up to 8 and 64 times either way, of least spectral error.

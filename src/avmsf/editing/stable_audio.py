@@ -5,6 +5,8 @@ scheduler words the same with sigma = tan(a) in the latents z + sigma noise, and
 that a pipeline with another scheduler of that family is taken at its word.
 """
 
+import hashlib
+import json
 import math
 import warnings
 from dataclasses import dataclass
@@ -99,8 +101,26 @@ class StableAudio:
         return cls(pipeline, name=name, seconds=seconds)
 
     def describe(self) -> dict[str, Any]:
-        """Return the frames that it works at, and its precision."""
-        return {"frames": self._frames, "precision": str(self.dtype)}
+        """Return a digest of its weights and configurations, the frames that it works at, and its precision."""
+        return {"weights_sha256": self._digest, "frames": self._frames, "precision": str(self.dtype)}
+
+    @cached_property
+    def _digest(self) -> str:
+        """What tells it from others wherever its files are: of its settings and samples of its weights."""
+        found = hashlib.sha256()
+        for part in (*_NETWORKS, "scheduler"):
+            config = getattr(self.pipeline, part).config
+            settings = config if isinstance(config, dict) else config.to_dict()
+            # Those that begin with an underscore name the folder and the libraries' versions.
+            plain = {key: each for key, each in settings.items() if not key.startswith("_") and key not in _ON_SAVING}
+            found.update(f"{part} {json.dumps(plain, sort_keys=True, default=str)}".encode())
+        for part in _NETWORKS:
+            for key, weight in getattr(self.pipeline, part).state_dict().items():
+                rows = torch.linspace(0, weight.numel() - 1, min(weight.numel(), _SAMPLED), dtype=torch.float64).long()
+                sampled = weight.flatten()[rows.to(weight.device)].cpu().double()
+                found.update(f"{part} {key} {weight.dtype} {tuple(weight.shape)}".encode())
+                found.update(sampled.numpy().tobytes())
+        return found.hexdigest()
 
     def encode(self, waveforms: Waveforms) -> Latents:
         """Return the means of the autoencoder's latents, continued by silence to the frames that are worked at."""
@@ -238,6 +258,10 @@ def _reach(strides: list[int]) -> int:
 
 _NETWORKS: Final = ("vae", "text_encoder", "projection_model", "transformer")
 _PRECONDITIONING: Final = ("precondition_inputs", "precondition_noise", "precondition_outputs")
+_SAMPLED = 64
+"""Numbers of each weight that a digest looks at, evenly spaced."""
+_ON_SAVING: Final = ("architectures", "dtype", "torch_dtype", "transformers_version")
+"""Settings that transformers adds when it saves: they say nothing that the weights do not."""
 _HOW_TO_GET = (
     "accept the license at https://huggingface.co/{name}, create a token at https://huggingface.co/settings/tokens and "
     "run hf auth login; or, on a computer with a network, run hf download {name} --local-dir FOLDER --exclude "
