@@ -207,24 +207,6 @@ def test_the_gaussians_are_those_given_or_discs_on_the_surface(tmp_path):
         write_demo(field, tmp_path / "few", cloud=given.take(torch.arange(3)))
 
 
-def test_variants_of_the_same_gaussians_gather_in_one_folder(tmp_path):
-    first, second = cosines(), replace(cosines(), frequency=1.1 * cosines().frequency)
-    write_demo(first, tmp_path / "demo")
-    words = " ".join(write_demo(second, tmp_path / "demo", variant="glass", overwrite=True).remarks)
-    assert "other variants are unchanged: original" in words
-    assert json.loads((tmp_path / "demo" / "manifest.json").read_text())["variants"] == ["glass", "original"]
-    for name, field in (("original", first), ("glass", second)):
-        found = read_arrays(tmp_path / "demo" / name)["frequencies"]
-        torch.testing.assert_close(found.double(), field.frequency, rtol=1e-6, atol=0)
-    # Again, in its place.
-    write_demo(second, tmp_path / "demo", variant="original", overwrite=True)
-    assert len(list((tmp_path / "demo").glob("*/modal.bin"))) == 2
-    elsewhere = replace(first, points=first.points + 1)
-    with raises(ExportError, file=tmp_path / "demo", value=["glass"]):
-        write_demo(elsewhere, tmp_path / "demo", overwrite=True)
-    assert read_arrays(tmp_path / "demo" / "glass")["frequencies"][0] > 450
-
-
 def test_half_precision_keeps_three_digits_and_what_the_layout_cannot_hold_is_refused(tmp_path):
     field = cosines()
     report = write_demo(field, tmp_path / "demo", precision="float16")

@@ -1,9 +1,9 @@
 """The layout of the paper's web demo: Gaussians to pick, and a gain of every mode at each of them.
 
 A folder holds `manifest.json` and `picking.bin` (float32, little endian, one array after another: means [N, 3], scales
-[N, 3], quaternions [N, 4] as w x y z, opacities [N]), `scene.ply` with the same Gaussians, and one folder for each
-variant of the sound with its own `manifest.json` and `modal.bin`: frequencies [M] in Hz, gains [N, M] in float16 or
-float32, dampings [M] or [N, M] in 1/s. The demo's player starts every mode as a cosine and knows no noise.
+[N, 3], quaternions [N, 4] as w x y z, opacities [N]), `scene.ply` with the same Gaussians, and a folder for the sound
+with its own `manifest.json` and `modal.bin`: frequencies [M] in Hz, gains [N, M] in float16 or float32, dampings [M] or
+[N, M] in 1/s. The demo's player starts every mode as a cosine and knows no noise.
 """
 
 import json
@@ -34,8 +34,7 @@ def write_demo(
 ) -> Written:
     """Write the demo's folder; where there is no `cloud` whose centers are the field's points, with a disc at each.
 
-    Modes have the field's level and start as cosines, whatever their phase is in the field. With `overwrite`, other
-    variants of the same Gaussians stay in the folder. Raises `ExportError`, also where it holds variants of others, and
+    Modes have the field's level and start as cosines, whatever their phase is in the field. Raises `ExportError`, and
     without a `cloud` `SceneError` for fewer than four points.
     """
     folder, shown = Path(folder), cloud
@@ -68,32 +67,13 @@ def write_demo(
         "phase": "cosine",
         "arrays": tensors,
     }
-    others = _other_variants(folder, variant, picking)
-    files = {PICKING: picking, SCENE: splat_bytes(shown), **others, f"{variant}/{MODAL}": modal}
+    files = {PICKING: picking, SCENE: splat_bytes(shown), f"{variant}/{MODAL}": modal}
     files[f"{variant}/{MANIFEST}"] = (json.dumps(sound, indent=1) + "\n").encode()
-    variants = sorted({path.partition("/")[0] for path in files if "/" in path})
     manifest = {"name": field.name, "count": len(field), "file": PICKING, "arrays": places, "scene": SCENE}
-    sizes = write_folder(folder, files, {**manifest, "variants": variants}, overwrite=overwrite)
+    sizes = write_folder(folder, files, {**manifest, "variants": [variant]}, overwrite=overwrite)
     written = torch.from_numpy(gains.astype(np.float32))
     remarks = ["every mode starts as a cosine in the demo, with the field's level"]
     if field.noise.any():
         remarks.append("the residual noise is left out, since the demo has none")
-    if others:
-        left = ", ".join(name for name in variants if name != variant)
-        remarks.append(f"the folder's other variants are unchanged: {left}")
     error = approximation_error(field, torch.complex(torch.zeros_like(written), written), field.damping)
     return Written(sizes, tuple(remarks), *error)
-
-
-def _other_variants(folder: Path, variant: str, picking: bytes) -> dict[str, bytes]:
-    """Return the files of a folder's other variants. Raises `ExportError` where they are of other Gaussians."""
-    try:
-        names = sorted({path.parent.name for path in folder.glob(f"*/{MODAL}")} - {variant})
-        if names and not ((folder / PICKING).is_file() and (folder / PICKING).read_bytes() == picking):
-            wanted = "a free name, or variants of the same Gaussians,"
-            raise ExportError.expected(wanted, names, file=folder, advice="choose another folder")
-        paths = [path for name in names for path in (folder / name).rglob("*") if path.is_file()]
-        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ExportError.expected("a readable folder", reason, file=folder, advice="choose another folder") from error

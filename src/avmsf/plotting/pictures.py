@@ -10,14 +10,17 @@ import torch
 from jaxtyping import Bool, Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.ticker import StrMethodFormatter
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
 from avmsf.modal.modes import ModalBank
-from avmsf.plotting.clouds import plane_of
+from avmsf.plotting.clouds import in_front, name_axes, plane_of, view_from
 from avmsf.plotting.style import DIVERGING, FIRST, SECOND, scatter_surface, styled, titled_figure
+
+_SIDE = (-60.0, 38.0)
+"""From where gains are seen: a little above, into what is open there."""
 
 
 def save_picture(figure: Figure, path: Path) -> None:
@@ -78,7 +81,8 @@ def draw_gains(
 ) -> Figure:
     """Draw the signed gains of the modes of most energy on the object's points (object frame), each on its own scale.
 
-    `contacts` are marked by crosses. An object that is flat along an axis is drawn in its plane.
+    `contacts` are marked by crosses where no point is in front of them. An object that is flat along an axis is drawn
+    in its plane, any other from one side.
     """
     frequency = bank.frequency
     strongest = torch.argsort(gains.square().mean(0) / bank.damping, descending=True)[:most]
@@ -86,27 +90,28 @@ def draw_gains(
     rows = math.ceil(len(strongest) / columns)
     places, plane = points.double().numpy(), plane_of(points.double().numpy())
     marks = np.zeros((0, 3)) if contacts is None else contacts.double().numpy()
-    height = 3.7
-    if plane is not None:
-        wide, high, _ = np.ptp(places @ plane.T, axis=0)
-        height = float(np.clip(3.2 * high / wide + 0.8, 1.6, 5.0))
+    view = view_from(_SIDE) if plane is None else plane
+    seen, crosses = places @ view.T, marks @ view.T
+    crosses = crosses if plane is not None else crosses[in_front(seen, crosses)]
+    wide, high, _ = np.ptp(seen, axis=0)
+    height = float(np.clip(3.2 * high / wide + 0.8, 1.6, 5.0))
     figure = titled_figure(
         f"{title}\n(color: signed gain, in the unit of the recordings)", 4.4 * columns, height * rows + 0.5
     )
     for number, mode in enumerate(sorted(strongest.tolist(), key=lambda mode: float(frequency[mode]))):
         values = gains[:, mode].numpy()
         scale = {"cmap": DIVERGING, "vmin": -np.abs(values).max(), "vmax": np.abs(values).max()}
-        axes = figure.add_subplot(rows, columns, number + 1, projection="3d" if plane is None else None)
+        axes = figure.add_subplot(rows, columns, number + 1)
+        drawn = scatter_surface(axes, seen, values, inches=3.0, **scale)
+        axes.plot(crosses[:, 0], crosses[:, 1], "kx", markersize=5)
         if plane is None:
-            drawn, shrink, pad = _scatter_in_space(axes, places, values, marks, scale), 0.6, 0.16
+            axes.set_axis_off()
+            name_axes(axes, view)
         else:
-            seen, crosses = places @ plane.T, marks @ plane.T
-            drawn, shrink, pad = scatter_surface(axes, seen, values, inches=3.0, **scale), 0.8, 0.02
-            axes.plot(crosses[:, 0], crosses[:, 1], "kx", markersize=5)
             across, along = ("xyz"[int(row.argmax())] for row in plane[:2])
             axes.set(xlabel=f"{across} (m)", ylabel=f"{along} (m)")
         axes.set_title(f"{float(frequency[mode]):.4g} Hz")
-        figure.colorbar(drawn, ax=axes, shrink=shrink, pad=pad).ax.tick_params(labelsize=8)
+        figure.colorbar(drawn, ax=axes, shrink=0.8, pad=0.02).ax.tick_params(labelsize=8)
     return figure
 
 
@@ -118,17 +123,3 @@ def _apart(frequency: np.ndarray, energy: np.ndarray, *, most: int) -> list[int]
         if len(chosen) < most and all(abs(places[row] - places[one]) > 0.05 * np.ptp(places) for one in chosen):
             chosen.append(row)
     return chosen
-
-
-def _scatter_in_space(
-    axes: Any, points: np.ndarray, values: np.ndarray, marks: np.ndarray, scale: dict[str, Any]
-) -> Any:
-    drawn = axes.scatter(*points.T, c=values, s=4, linewidths=0, rasterized=True, **scale)
-    axes.scatter(*marks.T, c="black", marker="x", s=20, depthshade=False)
-    axes.set_box_aspect(np.maximum(np.ptp(points, axis=0), 0.15 * np.ptp(points, axis=0).max()), zoom=1.3)
-    axes.view_init(elev=38, azim=-60)
-    for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y"), (axes.zaxis, "z")):
-        axis.set_label_text(f"{name} (m)")
-        axis.set_major_locator(MaxNLocator(3))
-        axis.set_tick_params(labelsize=7)
-    return drawn
