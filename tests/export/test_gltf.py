@@ -92,7 +92,7 @@ def test_an_impulse_into_the_surface_sounds_as_the_blow(tmp_path, force):
     assert (np.diff((gains**2).sum(1) / model["decayRates"]) < 0).all()
 
 
-def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
+def test_what_the_draft_cannot_hold_is_said(tmp_path):
     field = table(phased=True, spatial=True, noisy=True, background_force=3.0)
     written = write_gltf(field, tmp_path / "thing.glb")
     words = " ".join(written.remarks)
@@ -101,19 +101,14 @@ def test_what_the_draft_cannot_hold_is_said_and_lies_in_extras(tmp_path):
     assert "noise" in words
     document, arrays = read(tmp_path / "thing.glb")
     model = modal(document, arrays)
-    extras = document["extensions"]["KHR_audio_rigid_bodies"]["modalModels"][0]["extras"]["avmsf"]
-    rows = [arrays[extras[name]].reshape(MODES, POINTS)[:, 5] for name in ("sine", "cosine", "decayRates")]
-    whole = summed(rows[0] + 1j * rows[1], model["frequencies"], rows[2]) + arrays[extras["noise"]]
-    assert apart(whole, field.render(torch.tensor([5]))[0]) < 3e-4
-    assert extras["backgroundForce"] == 3.0
     plain = [struck(model, row, -field.normals[row].double().numpy()) for row in field.spread(8).tolist()]
     true = field.render(field.spread(8)).double().numpy()
     assert written.error == pytest.approx(apart(plain, true), rel=0.01)
     # As loud as it was: every mode's amplitude is that of its sine and cosine together.
     size = np.linalg.norm(model["shapes"].reshape(MODES, POINTS, 3).astype(float), axis=2)
     size *= 2 * np.pi * model["frequencies"][:, None]
-    expected = np.hypot(arrays[extras["sine"]], arrays[extras["cosine"]]).reshape(MODES, POINTS)
-    np.testing.assert_allclose(size, expected, rtol=1e-5)
+    expected = np.sort(field.gains.abs().numpy().T, axis=0)
+    np.testing.assert_allclose(np.sort(size, axis=0), expected, rtol=1e-5)
 
 
 def test_phases_alone_change_the_waveform_and_hardly_the_spectrum(tmp_path):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _CONTACTS = ("position", "contact_table", "unit")
 _USED: dict[Format, tuple[str, ...]] = {
     "web": ("object", "object_unit", "capture", "no_noise"),
-    "gltf": ("object", "object_unit", "capture", "up", "no_noise", *_CONTACTS),
+    "gltf": ("object", "object_unit", "capture", "up", *_CONTACTS),
     "faust": ("no_noise", *_CONTACTS),
     "avmsf-demo": ("object", "variant", "precision"),
     "wavs": ("forces", "contact_times", "pulse", "seconds", "no_noise", *_CONTACTS),
@@ -93,7 +93,7 @@ class Options(Many):
     up: Axis = "z"
     """gltf: axis that points up."""
     no_noise: Flag = False
-    """web, gltf, faust, wavs: the modes without the residual noise."""
+    """web, faust, wavs: the modes without the residual noise."""
     functions: int = 16
     """uff: points with response functions."""
     variant: Annotated[str, tyro.conf.arg(metavar="NAME")] = "original"

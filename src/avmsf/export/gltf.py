@@ -3,7 +3,7 @@
 In the draft (as of 2026, not ratified) the sound of an impulse j at a point is the sum over modes of 2 pi f (shape . j)
 exp(-d t) sin(2 pi f t). Here an impulse of 1 N s perpendicular to the surface is an impact of force 1, so a shape is
 minus the normal times the gain over 2 pi f. The draft leaves the absolute level to the player. It has only sines, one
-damping for each mode, and no noise; phases, dampings at each contact and the noise are in `extras`.
+damping for each mode, and no noise: phases, differences of dampings between contacts and the noise are left out.
 """
 
 import json
@@ -76,22 +76,15 @@ def _document(
 ) -> tuple[dict[str, Any], bytes]:
     """Return the JSON and the binary chunk, whose arrays are in the order of the accessors' numbers."""
     order = torch.argsort(sampled.power.sum(0) / damping, descending=True, stable=True)
-    modal, extra = _modal(sampled, order, gains, damping), _extra(sampled, order)
+    modal = _modal(sampled, order, gains, damping)
     drawn = vertices | {"NORMAL": torch.nn.functional.normalize(vertices["NORMAL"], dim=1)}
     if "COLOR_0" in drawn:
         drawn["COLOR_0"] = _linear(drawn["COLOR_0"])
-    views, accessors, content = _packed([*modal.items(), *extra.items(), *drawn.items()])
+    views, accessors, content = _packed([*modal.items(), *drawn.items()])
     number = count()
-    facts = {
-        "generator": generator(),
-        "sampleRate": sampled.sample_rate,
-        "samples": sampled.samples,
-        "perNewton": sampled.per_newton,
-        "backgroundForce": sampled.background_force,
-        "impulse": "1 N s against the normal is an impact of force 1",
-    }
+    facts = {"perNewton": sampled.per_newton, "impulse": "1 N s against the normal is an impact of force 1"}
     model: dict[str, Any] = {"name": sampled.name or "object", **dict(zip(modal, number, strict=False))}
-    model["extras"] = {"avmsf": facts | dict(zip(extra, number, strict=False))}
+    model["extras"] = {"avmsf": facts}
     attributes = dict(zip(drawn, number, strict=False))
     indices = {name: attributes.pop(name) for name in ("indices",) if name in attributes}
     primitive = {"attributes": attributes, "mode": _TRIANGLES if indices else _POINTS, "material": 0, **indices}
@@ -127,19 +120,6 @@ def _modal(
     return arrays | {"shapes": shapes.reshape(-1, 3)}
 
 
-def _extra(sampled: SampledField, order: Int[Tensor, " modes"]) -> dict[str, Tensor]:
-    """Return the arrays that the draft has no place for, mode-major like the shapes."""
-    arrays: dict[str, Tensor] = {}
-    if sampled.has_phases:
-        gains = sampled.gains[:, order].T.reshape(-1)
-        arrays |= {"sine": gains.real, "cosine": gains.imag}
-    if not sampled.shared_damping:
-        arrays["decayRates"] = sampled.damping[:, order].T.reshape(-1)
-    if sampled.noise.any():
-        arrays["noise"] = sampled.noise
-    return arrays
-
-
 def _packed(named: Sequence[tuple[str, Tensor]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bytes]:
     """Return the buffer views, the accessors and the content of arrays, which become float32 or uint32."""
     arrays = {str(row): array.numpy() for row, (_, array) in enumerate(named)}
@@ -173,11 +153,11 @@ def _glb(document: Mapping[str, Any], content: bytes) -> bytes:
 def _remarks(sampled: SampledField) -> tuple[str, ...]:
     remarks = ["the draft leaves the absolute level to the player: an impulse of 1 N s is an impact of force 1 here"]
     if sampled.has_phases:
-        remarks.append("every mode starts as a sine, with the field's level; phases are in extras")
+        remarks.append("every mode starts as a sine, with the field's level")
     if not sampled.shared_damping:
-        remarks.append("each mode has one damping, its mean by energy; those of each point are in extras")
+        remarks.append("each mode has one damping, its mean by energy")
     if sampled.noise.any():
-        remarks.append("the residual noise is in extras only")
+        remarks.append("the residual noise is left out")
     return tuple(remarks)
 
 
