@@ -318,10 +318,10 @@ def test_at_full_scale_the_recordings_unit_does_not_matter():
     nearest, loudest = NearestRecording(train), float(impacts.sounds.abs().max())
     sounds, small = nearest.render(test.contacts), replace(test, sounds=1e-3 * test.sounds)
     values = partial(metric_values, renderer=nearest, truth=None)
-    full, raw = MetricSettings(cdpam=False), MetricSettings(level="raw", cdpam=False)
+    full = MetricSettings(cdpam=False)
     one, _ = values(full, sounds=sounds, test=test, loudest=loudest)
     other, _ = values(full, sounds=1e-3 * sounds, test=small, loudest=1e-3 * loudest)
-    unscaled, _ = values(raw, sounds=sounds, test=test, loudest=loudest)
+    unscaled, _ = values(full, sounds=sounds, test=test, loudest=1.0)
     for metric in ("l1", "envelope"):
         assert other[metric] == pytest.approx(one[metric], rel=1e-4)
         assert unscaled[metric] == pytest.approx([loudest * each for each in one[metric]], rel=1e-4)
@@ -335,7 +335,7 @@ def test_cdpam_is_taken_of_a_few_contacts(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("avmsf.evaluation.scores.shared_cdpam", Ear)
     train, test = split(plate_impacts(10), 0.2)
     sounds = NearestRecording(train).render(test.contacts)
-    settings = MetricSettings(level="raw", cdpam_contacts=3)
+    settings = MetricSettings(cdpam_contacts=3)
     values = metric_values(settings, NearestRecording(train), sounds, test, None, loudest=1.0)[0]["cdpam"]
     expected = (sounds - test.sounds).abs().sum(1)
     assert [row for row, value in enumerate(values) if value is not None] == [1, 4, 6]

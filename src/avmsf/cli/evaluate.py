@@ -148,7 +148,7 @@ def run(options: Options) -> int:
         settings=settings,
         views=ViewsConfig(source=options.visual_source),
         cache=(options.cache or folder / "features").resolve(),
-        metrics=MetricSettings(settings.amplitude_scale, cdpam, options.cdpam_contacts),
+        metrics=MetricSettings(cdpam, options.cdpam_contacts),
         seed=options.seed,
         device=options.device,
         time_zero=options.time_zero,

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from avmsf.evaluation.splits import Choosing
     from avmsf.evaluation.task import VisualInput
 
-AmplitudeScale = Literal["full-scale", "raw"]
 BASELINE = "knn3"
 """The method that all others are compared with."""
 
@@ -350,9 +349,6 @@ class EvaluationSettings:
 
     geometry: Geometry = "mesh"
     """Shape that finite elements use: the object's mesh, or the surface of Gaussians fitted to its views."""
-    amplitude_scale: AmplitudeScale = "full-scale"
-    """full-scale: an object's sounds times one factor that brings its loudest recording to a peak of one, so that
-    values of different objects can be averaged. raw: in the recordings' unit."""
     extraction: ExtractionMethod = "high-resolution"
     """How the modes that methods share are extracted; see `avmsf modes --help`. The methods `paper` have their own."""
     modes: int = 128
@@ -372,8 +368,6 @@ class EvaluationSettings:
 class MetricSettings:
     """Which metrics are computed."""
 
-    level: AmplitudeScale = "full-scale"
-    """As `EvaluationSettings.amplitude_scale`; methods do not depend on it."""
     cdpam: bool = True
     """Whether to compute CDPAM, the slowest metric."""
     cdpam_contacts: int = 8

@@ -157,7 +157,8 @@ def metric_values(
     if renderer.sample_rate != test.sample_rate:
         wanted = f"sounds at the recordings' {test.sample_rate:g} Hz"
         raise EvaluationError.expected(wanted, renderer.sample_rate, name="sample_rate")
-    unit = loudest if settings.level == "full-scale" and loudest > 0 else 1.0
+    # One factor brings the loudest recording to a peak of one, so that values of different objects can be averaged.
+    unit = loudest if loudest > 0 else 1.0
     sounds, scored = sounds / unit, replace(test, sounds=test.sounds / unit)
     values: Values = {metric: tuple(figures.tolist()) for metric, figures in score(sounds, scored).values.items()}
     if settings.cdpam:

@@ -282,7 +282,7 @@ class _Report:
                 "locate count as a random point. UMAP is the distance of edited modes from the center of the "
                 "objects of the new material. Lower is better, except for MAC and CLAP. L1, "
                 "L1-log and ENV follow the convention `paper` of docs/conventions.md; relative STFT does not depend on "
-                "unit and level. With the level full-scale, an object's sounds are multiplied by one factor that "
+                "unit and level. An object's sounds are multiplied by one factor that "
                 "brings its loudest recording to a peak of one.",
                 WARNING,
                 "Settings of metrics: {}. Of modes: {}.".format(*(_listed(self.identity[each]) for each in settings)),
