@@ -1,6 +1,7 @@
 """The verbs from the command line: help, check, modes, fit, render and info."""
 
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,9 +15,11 @@ import torch
 import avmsf
 from avmsf.capture import read_capture
 from avmsf.cli import VERBS, main
+from avmsf.cli.fit import Options as FitOptions
+from avmsf.cli.paths import OutputError
 from avmsf.cli.report import mode_rows, mode_table
 from avmsf.errors import CaptureError, FitError
-from avmsf.field.store import load
+from avmsf.field.store import load, save
 from avmsf.modal.config import PulseShape
 from avmsf.modal.modes import ForcePulse, ModalBank
 from factories.made_fields import directional, positional, saved, sounding
@@ -39,7 +42,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def field(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fields") / "plate.safetensors"
-    assert main(["fit", str(capture), "--output", str(path), "--train-count", "5", "--start", "1", *SMOOTH]) == 0
+    assert main(["fit", str(capture), "--output", str(path), "--train-count", "5", *SMOOTH]) == 0
     return path
 
 
@@ -54,12 +57,7 @@ def test_help_names_every_verb_and_imports_nothing_that_computes() -> None:
         assert f"\n  {verb} " in ran.stdout
 
 
-def test_common_options_may_stand_before_the_verb(capture: Path, capsys: Streams) -> None:
-    before, after = (
-        (main(words), capsys.readouterr())
-        for words in (["check", str(capture), "--json", "--quiet"], ["--json", "--quiet", "check", str(capture)])
-    )
-    assert before == after
+def test_the_version_is_printed(capsys: Streams) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.strip() == avmsf.__version__
 
@@ -128,13 +126,13 @@ def test_a_quiet_verb_prints_its_table_alone(capture: Path, capsys: Streams) -> 
 
 def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys: Streams) -> None:
     path = tmp_path / "deep" / "plate.safetensors"
-    words = ["fit", capture, "--output", path, "--train-fraction", "0.5", "--start", "2", "--plots", tmp_path / "plots"]
+    words = ["fit", capture, "--output", path, "--train-fraction", "0.5", "--plots", tmp_path / "plots"]
     told, _ = results_of(capsys, *words, "--gain-model", "network", "--without-shape", *TINY, "--seed", "3")
     field = load(path)
     assert told["modes"] == int(field.is_mode.sum()) > 0
     assert told["modes"] + told["supporting_poles"] == len(field.bank) <= 12
     assert told["trained_on"] == list(field.origin.trained_on)
-    assert told["trained_on"][0] == "003.wav"
+    assert told["trained_on"][0] == "001.wav"
     assert len(told["trained_on"]) == len(told["tested_on"]) == 4
     assert set(told["trained_on"]).isdisjoint(told["tested_on"])
     config = field.origin.config
@@ -154,6 +152,22 @@ def test_the_paper_leaves_visual_features_out_only_if_that_is_allowed(capture, t
         run_verb(*words)
     _, said = results_of(capsys, *words, "--allow-missing-features")
     assert "without visual features" in said
+
+
+def test_fit_replaces_nothing_but_a_field_of_the_same_capture(capture: Path, field: Path, tmp_path: Path) -> None:
+    output, own = tmp_path / "plate.safetensors", load(field)
+    words = ["--output", str(output)]
+    shutil.copy(field, output)
+    FitOptions.parse([str(capture), *words]).check_inputs()
+    with raises(OutputError, file=output, name="--overwrite"):
+        FitOptions.parse([str(capture), "--until", "features", *words]).check_inputs()
+    edited = replace(own, origin=replace(own.origin, report={**own.origin.report, "edits": [{"edit": "x"}]}))
+    other = replace(own, origin=replace(own.origin, capture="bowl"))
+    for content in (edited, other, b"sound"):
+        output.write_bytes(content) if isinstance(content, bytes) else save(content, output)
+        with raises(OutputError, file=output, name="--overwrite"):
+            FitOptions.parse([str(capture), *words]).check_inputs()
+        FitOptions.parse([str(capture), *words, "--overwrite"]).check_inputs()
 
 
 def test_fit_takes_a_single_recording_unless_it_is_silent(tmp_path: Path, capsys: Streams) -> None:
@@ -240,7 +254,7 @@ def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert told["compared_with"]["which"] == "not training recordings"
     assert set(told["compared_with"]["recordings"]).isdisjoint(fitted.origin.trained_on)
     assert len(told["compared_with"]["recordings"]) == 3
-    assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "002.wav")
+    assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "001.wav")
     assert (told["pipeline"]["extraction"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
     for name in ("modes", "gains", "spectrograms"):
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")

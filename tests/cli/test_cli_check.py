@@ -58,14 +58,9 @@ def test_settings_are_written_once_and_hold_from_then_on(rumbling: Path, capsys:
     assert settings.read_text() == "seconds = 0.5\n"
 
 
-def test_other_settings_are_not_mixed_with_written_ones_nor_with_a_dataset(rumbling: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other.toml"
-    other.write_text("seconds = 0.5\n")
+def test_no_settings_are_written_into_a_dataset(rumbling: Path, tmp_path: Path) -> None:
     assert main(["check", str(tmp_path)]) == 0
-    for words in (["--settings", str(other)], ["--write-settings"]):
-        assert main(["check", str(tmp_path), *words]) == 2
-    assert main(["check", str(rumbling), "--settings", str(other), "--write-settings"]) == 2
-    assert not (rumbling / "capture.toml").exists()
+    assert main(["check", str(tmp_path), "--write-settings"]) == 2
 
 
 def fill_five(folder: Path, *, own_phases: int | None = None) -> Path:
@@ -225,7 +220,7 @@ CAMERAS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
 def said_of(folder: Path) -> list[str]:
     """Return what is wrong with all that shows the object, alone and next to the contacts."""
     visual = found(folder)
-    return [*visual.problems, *map(str, misplaced(folder, None, visual))]
+    return [*visual.problems, *map(str, misplaced(folder, visual))]
 
 
 @pytest.mark.parametrize("case", CAMERAS)

@@ -88,10 +88,6 @@ def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, cap
 def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
     with raises(FitError, name="count", value=0):
         run_verb("suggest", str(field), "--count", "0")
-    settings = tmp_path / "capture.toml"
-    settings.write_text("")
-    with raises(FitError, name="--settings"):
-        run_verb("suggest", str(field), "--settings", str(settings))
     blocked = tmp_path / "file"
     blocked.write_text("")
     with raises(OutputError, file=blocked, value="file"):

@@ -135,21 +135,17 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "short.csv").write_text("x,y,z\n0,0\n")
     (folder / "twice.csv").write_text("file,x,y,z\na.wav,0,0,0\na,0.1,0,0\n")
     (folder / "outside.csv").write_text("file,x,y,z\n../a.wav,0,0,0\n")
-    (folder / "wrong.toml").write_text('unit = "miles"\n')
     (folder / "miles").mkdir()
     (folder / "miles" / "capture.toml").write_text('unit = "miles"\n')
     return folder
 
 
-LONG, TOO_LONG = 300 * "x", "File name too long"
 AT = "--position 0.1 0.05 0"
 TABLE = "render field.safetensors --output s --contact-table"
 EARLY: dict[str, dict[str, Any]] = {
-    "check plate --settings wrong.toml": {"file": "wrong.toml", "name": "unit", "value": "miles"},
     # What is wrong with the capture is said before what is wrong with the name of the output.
     "fit miles -o f": {"file": "miles/capture.toml", "name": "unit", "value": "miles"},
     "modes nowhere": {"file": "nowhere"},
-    "modes plate --settings nowhere.toml": {"file": "nowhere.toml"},
     "modes plate --modes 0": {"name": "modes", "value": 0},
     "fit nowhere -o f.safetensors": {"file": "nowhere"},
     "fit plate --output plate": {"file": "plate", "value": "folder"},
@@ -157,9 +153,7 @@ EARLY: dict[str, dict[str, Any]] = {
     "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": {"name": "--train-count"},
     "fit plate --output f.safetensors --set validation=2": {"name": "validation", "value": 2.0},
     "fit plate --output f.safetensors --material glass --train-count 4": {"name": "--train-count", "value": "glass"},
-    "fit plate --material glass --start 2": {"name": "--start", "value": "glass"},
     "fit plate --until gaussians --without-shape": {"name": "--without-shape", "value": "gaussians"},
-    "fit plate --start 5": {"name": "--start"},
     "fit plate --output f.safetensors --material wodo": {"name": "--material", "value": "wodo"},
     "fit plate/surface.ply --output f.safetensors": {"file": "surface.ply", "name": "--material"},
     "fit plate --until gaussians --output f.obj": {"file": "f.obj", "name": "suffix", "value": ".obj"},
@@ -175,9 +169,6 @@ EARLY: dict[str, dict[str, Any]] = {
     f"render field.safetensors {AT} --output s --contact-time 2": {"name": "--contact-time", "value": 2.0},
     f"render field.safetensors {AT} --output s --force -1": {"name": "--force", "value": -1.0},
     f"render field.safetensors {AT} --output s --force inf": {"name": "--force", "value": math.inf},
-    f"render field.safetensors {AT} --output {LONG}": {"file": LONG, "value": TOO_LONG},
-    f"edit field.safetensors --pitch 2 -o {LONG[:240]}.safetensors": {"value": TOO_LONG},
-    f"demo {LONG}": {"file": LONG, "value": TOO_LONG},
     "demo plate": {"file": "plate"},
     "fit cells -o f.safetensors": {"file": "impacts.csv", "row": 3, "name": "x", "value": "left"},
     "fit one": {"file": "002.wav"},
@@ -202,7 +193,6 @@ EARLY: dict[str, dict[str, Any]] = {
 """What is refused before torch, which takes seconds, is loaded."""
 LATE: dict[str, dict[str, Any]] = {
     "fit plate -o f.safetensors --device tpu": {"name": "device", "value": "tpu"},
-    "fit plate --output f.safetensors --train-count 4 --start 8": {"name": "start", "value": 8},
     "fit plate --output f.safetensors --train-count 8": {"name": "count", "value": 8},
     "fit plate --output f.safetensors --train-fraction 1.5": {"name": "train_size", "value": 1.5},
     "render field.safetensors --position 50 60 0 -o s": {"name": "--position", "row": 0, "value": [50.0, 60.0, 0.0]},

@@ -23,8 +23,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.store import load
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, ViewsConfig
-from avmsf.pipeline.fit import fit_in_stages
-from avmsf.pipeline.record import recorded, with_record
+from avmsf.pipeline.fit import RECORD, fit_in_stages, with_record
 from avmsf.pipeline.stages import Pipeline, Stage, StageFolder
 from factories.plate_capture import fill_plate
 from factories.plate_field import plate_impacts
@@ -163,7 +162,7 @@ def test_an_interrupted_stage_finds_its_checkpoint_unless_its_recipe_has_changed
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     make = Maker()
     (tmp_path / "cloud.ply.stage.json").mkdir()
-    with raises(CaptureError, file=tmp_path / "cloud.ply"):
+    with raises(CaptureError, file=tmp_path / "cloud.ply.stage.json"):
         StageFolder(tmp_path).keep(stage(make))
     assert make.runs == 0
 
@@ -278,20 +277,8 @@ def test_settings_out_of_range_and_another_start_of_sounds_than_the_presets_are_
         avmsf.fit(Capture("plate", plate_impacts()), config=PRESETS["paper"], progress=False)
 
 
-def test_settings_in_earlier_files_have_the_names_of_today() -> None:
+def test_a_field_knows_the_configuration_that_made_it() -> None:
     field = load(Path(__file__).parents[1] / "field" / "data" / "format-8" / "mixture.safetensors")
-    assert recorded(field) == {}
-    scene = {"splat": {"dissent": 0.1, "background": "found"}, "lift": {"background": "kept", "size": 0.3}}
-    report = {"pipeline": {"method": "short-time", "body": {"freedoms": 5000}, "scene": scene}}
-    earlier = replace(field, origin=replace(field.origin, report=report))
-    assert recorded(earlier) == {
-        "extraction": "short-time",
-        "body": {"dofs": 5000},
-        "scene": {
-            "splat": {"wrong_masks": 0.1, "background": "found"},
-            "lift": {"encoder_background": "kept", "feature_size": 0.3},
-        },
-    }
     config = PRESETS["paper"]
-    now = recorded(with_record(field, config, {"scene": asdict(config.scene)}))
+    now = with_record(field, config, {"scene": asdict(config.scene)}).origin.report[RECORD]
     assert {**now, "fit": asdict(config.fit)} == {**asdict(config), "encoder": None}

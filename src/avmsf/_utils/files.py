@@ -1,41 +1,21 @@
 """Files that are either as they were or as they shall be, never in between."""
 
-import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from avmsf.errors import AvmsfError, FieldFileError
 
 _LFS = b"version https://git-lfs.github.com/spec/"
-_WAYS_OUT: Mapping[int | None, str] = {
-    errno.ENOSPC: "free some space or choose another folder",
-    errno.EDQUOT: "free some space or choose another folder",
-    errno.EACCES: "get write permission for the folder or choose another folder",
-    errno.EPERM: "get write permission for the folder or choose another folder",
-    errno.EROFS: "choose a folder on a writable disk",
-    errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ENOENT: "choose another folder",
-    errno.EEXIST: "a parent folder is a file; choose another folder",
-    errno.ENOTDIR: "a parent folder is a file; choose another folder",
-    errno.EISDIR: "name a file in this folder or choose another name",
-}
-"""What to do where a file or a folder cannot be written, by what the system says."""
-
-
-def way_out(error: OSError) -> str:
-    """Return what a user can do where a file or a folder could not be written."""
-    return _WAYS_OUT.get(error.errno, "choose another folder")
 
 
 def unwritable(path: Path, error: Exception, *, raising: type[AvmsfError], unchanged: str = "") -> AvmsfError:
     """Return the error of a file or folder that could not be written, for the reason that the system gives."""
-    advice = way_out(error) if isinstance(error, OSError) else "choose another folder"
     reason = getattr(error, "strerror", None) or str(error)
-    return raising.expected("a writable path", reason, file=path, advice=unchanged + advice)
+    return raising.expected("a writable path", reason, file=path, advice=f"{unchanged}choose another folder or name")
 
 
 def is_lfs_pointer(path: Path) -> bool:

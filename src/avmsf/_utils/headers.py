@@ -80,20 +80,8 @@ class FileKind:
 
     def unreadable(self, path: Path) -> AvmsfError:
         """Return the error of a file that safetensors cannot read."""
-        try:
-            with open(path, "rb") as file:
-                start = file.read(9)
-        except OSError as error:
-            found, advice = f"an unreadable file ({error.strerror})", "check its permissions"
-            if path.is_dir():
-                found, advice = "a folder", "name the file in it"
-        else:
-            # Eight bytes of length, then the header's opening brace.
-            found, advice = "a truncated or damaged file", f"copy it again, or {self.advice}"
-            if not start:
-                found = "an empty file"
-            elif start[8:] != b"{":
-                found, advice = f"a file that starts with {start[:8]!r}", f"name another, or {self.advice}"
+        found = "a folder" if path.is_dir() else "another, an unreadable or a damaged file"
+        advice = f"check its name and permissions, or {self.advice}"
         return self.error.expected(self.what, found, got=found, file=path, advice=advice)
 
     def damaged(self, path: Path, error: Exception, *, name: str | None = None) -> AvmsfError:

@@ -19,7 +19,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from avmsf._utils.files import way_out, write_whole
+from avmsf._utils.files import write_whole
 from avmsf._utils.text import read_json_object
 from avmsf.errors import AvmsfError, FolderInUseError
 
@@ -85,7 +85,7 @@ def _expect_excused(error: OSError, path: Path) -> None:
     denied = error.errno in (errno.EACCES, errno.EPERM)
     if error.errno in (*_NO_PLACE, *_NO_LOCKS) or (denied and not os.access(path.parent, os.W_OK)):
         return
-    advice = "delete it if no process uses the folder" if denied else way_out(error)
+    advice = "delete it if no process uses the folder" if denied else "choose another folder"
     raise AvmsfError.expected("a lock", error.strerror or str(error), file=path, advice=advice) from error
 
 

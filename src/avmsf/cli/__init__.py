@@ -8,7 +8,6 @@ says what files and folders have to be, `many` runs a verb for each of several i
 `report` and `edit_report` say what fields and edits are, `output` prints.
 """
 
-import _thread
 import os
 import shutil
 import signal
@@ -20,11 +19,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
-from itertools import takewhile
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import avmsf
+from avmsf._utils.files import unwritable
 from avmsf._utils.text import printable
 from avmsf.cli.output import display, print_json, say, show_plainly
 from avmsf.errors import NO_MEMORY, AvmsfError, lacks_memory
@@ -49,12 +49,8 @@ BAD_INPUT = 2
 """The exit code of input that cannot be used."""
 INTERRUPTED, CLOSED, TERMINATED = 130, 141, 143
 """The exit codes that shells give a command ended by Ctrl-C, by the end of who reads its output, and by SIGTERM."""
-_COMMON = frozenset({"--quiet", "--verbose", "--json"})
-"""Options that may also stand before the verb."""
 _WIDEST = 120
 """Columns of the list of verbs, at most."""
-_AGAIN = 0.05
-"""Seconds after which an interruption that was dropped is raised again: a finalizer ends sooner, or it is repeated."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(sys, name) is None:
             # Python has no stream where the descriptor is closed, as by `>&-`; the next file would take its place.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
-    words = _verb_first(sys.argv[1:] if arguments is None else arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
     before = display.shown, display.verbose, display.json
     display.json = "--json" in words
     try:
@@ -107,11 +103,14 @@ def _run(words: list[str]) -> int:
             say(f"{name}interrupted{goes_on}", always=True)
             return TERMINATED if signal.SIGTERM in received else INTERRUPTED
         except Exception as error:
+            if lacks_memory(error):
+                return _fail(AvmsfError(NO_MEMORY), name)
+            if isinstance(error, OSError) and isinstance(error.filename, str | Path):
+                # What the system refuses at a path: its name is too long, or a folder may not be searched.
+                return _fail(unwritable(Path(error.filename), error, raising=AvmsfError), name)
             if isinstance(error, AvmsfError):
                 return _fail(error, name)
-            if not lacks_memory(error):
-                raise
-            return _fail(AvmsfError(NO_MEMORY), name)
+            raise
         finally:
             display.close()
 
@@ -131,13 +130,13 @@ def _fail(error: AvmsfError, place: str = "") -> int:
 
 @contextmanager
 def _interrupting() -> Iterator[list[int]]:
-    """Let SIGTERM interrupt a verb as Ctrl-C does, and let neither be lost; yields the signals that have come.
+    """Let SIGTERM interrupt a verb as Ctrl-C does; yields the signals that have come.
 
-    Python drops a KeyboardInterrupt in a finalizer, or in a function that compiled code calls back: it is raised once
-    more. A SIGTERM that is ignored, or handled outside of Python, stays so.
+    A SIGTERM that is ignored, or handled outside of Python, stays so.
     """
     received: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
+    before = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread() or before in (None, signal.SIG_IGN):
         yield received
         return
 
@@ -145,53 +144,24 @@ def _interrupting() -> Iterator[list[int]]:
         received.append(number)
         raise KeyboardInterrupt
 
-    def raise_again() -> None:
-        if running:
-            _thread.interrupt_main()
-
-    def retry(unraisable: "sys.UnraisableHookArgs") -> None:
-        if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            # Raised at once, it would be dropped with what this hook raises.
-            timer = threading.Timer(_AGAIN, raise_again)
-            timer.daemon = True
-            timer.start()
-        else:
-            report(unraisable)
-
-    report, sys.unraisablehook = sys.unraisablehook, retry
-    running = [True]
-    before = signal.getsignal(signal.SIGTERM)
-    if before not in (None, signal.SIG_IGN):
-        signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)
     try:
         yield received
     finally:
-        running.clear()
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)
-        sys.unraisablehook = report
-
-
-def _verb_first(words: Sequence[str]) -> list[str]:
-    """Return the words with options of all verbs that stand before the verb behind it."""
-    before = list(takewhile(_COMMON.__contains__, words))
-    verb, rest = words[len(before) : len(before) + 1], words[len(before) + 1 :]
-    return [*verb, *before, *rest]
+        signal.signal(signal.SIGTERM, before)
 
 
 def _explain(words: list[str]) -> int:
     """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
     if words and words[0] not in ("-h", "--help"):
-        given = None if words[0] in _COMMON else words[0]
         near = get_close_matches(words[0], VERBS, n=1)
         advice = f"did you mean {near[0]}? `avmsf --help` lists all" if near else "`avmsf --help` lists all"
-        return _fail(AvmsfError.expected("a command", given, name="avmsf", advice=advice))
+        return _fail(AvmsfError.expected("a command", words[0], name="avmsf", advice=advice))
     indent = max(map(len, VERBS)) + 4
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     print("usage: avmsf COMMAND [OPTIONS]\n")
     print("The sound of an impact anywhere on an object, from a few recordings.")
-    print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.")
-    print("--quiet, --verbose and --json may stand before or after the command.\n")
+    print("`avmsf COMMAND --help` explains a command; `avmsf demo` runs a complete example.\n")
     for name, sentence in {**VERBS, "--help": "Print this list.", "--version": "Print the version."}.items():
         print(textwrap.fill(sentence, width, initial_indent=f"  {name:{indent - 2}}", subsequent_indent=" " * indent))
     return 0

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.capture.settings import SETTINGS, TABLE, CaptureSettings
+from avmsf.capture.settings import TABLE, settings_of
 from avmsf.capture.table import read_rows
-from avmsf.cli.options import Common, Flag, read_settings
+from avmsf.cli.options import Common, Flag
 from avmsf.cli.output import decimals, doing, next_command, print_json, say, show, table
-from avmsf.cli.paths import ContactData, Existing, SettingsFile
+from avmsf.cli.paths import ContactData, Existing
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import CaptureError, ExtractionError
 
@@ -41,8 +41,6 @@ class Options(Common):
         Annotated[Path, tyro.conf.arg(metavar="CAPTURE|DATASET"), Existing("a capture or a dataset", ("a folder",))]
     ]
     """Folder with impacts.csv and the recordings that it names, or of a dataset."""
-    settings: SettingsFile = None
-    """Use this capture.toml instead of the folder's own."""
     write_settings: Flag = False
     """Write the proposed settings, with the reasons, to the folder's capture.toml, and check with them. An existing
     capture.toml is not changed."""
@@ -57,17 +55,14 @@ class Options(Common):
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        if self.write_settings and self.settings is not None:
-            wanted, advice = "--write-settings without it", f"the new {SETTINGS} would not contain its settings"
-            raise CaptureError.expected(wanted, got="both", file=self.settings, name="--write-settings", advice=advice)
         if self.is_dataset:
             detect_dataset(self.capture)
-            for option, given in (("--settings", self.settings), ("--write-settings", self.write_settings or None)):
-                if given is not None:
-                    raise CaptureError.expected("a capture with it", "a dataset", file=self.capture, name=option)
+            if self.write_settings:
+                wanted = "a capture with it"
+                raise CaptureError.expected(wanted, "a dataset", file=self.capture, name="--write-settings")
         elif not self.json:
             # JSON reports also what is wrong with the folder as a whole.
-            read_settings(self.capture, self.settings)
+            settings_of(self.capture)
             read_rows(self.capture)
 
 
@@ -81,18 +76,17 @@ def run(options: Options) -> int:
 
     if options.is_dataset:
         return _check_dataset(options)
-    settings = None if options.settings is None else CaptureSettings.read(options.settings)
     doing(f"reading {options.capture}")
-    visual = inputs(options.capture, settings)
-    outside = [] if visual is None else misplaced(options.capture, settings, visual)
+    visual = inputs(options.capture)
+    outside = [] if visual is None else misplaced(options.capture, visual)
     factor = next((each.value for each in outside if each.name == "unit"), None)
-    proposals = propose_settings(options.capture, settings, factor=factor)
+    proposals = propose_settings(options.capture, factor=factor)
     if proposals and options.write_settings:
         path = write_settings(options.capture, proposals)
         show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
         if any(each.key == "unit" for each in proposals):
             outside = [each for each in outside if each.name != "unit"]
-    report, impacts = check_and_read(options.capture, settings)
+    report, impacts = check_and_read(options.capture)
     doing("finding the modes that align the recordings")
     modes = None if impacts is None else _modes(impacts)
     aligned = None if modes is None or impacts is None else AlignmentReport.of(modes, impacts)

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import tyro
 
-from avmsf._utils.files import way_out
 from avmsf.cli.options import Common
 from avmsf.cli.output import show
 from avmsf.cli.paths import New, OutputError
@@ -21,8 +20,8 @@ BEGUN = ".begun"
 COMMANDS = (
     "check {0}/capture",
     "fit {0}/capture --train-count 12 --set splat.steps=500 --output {0}/mug.safetensors",
-    "fit {0}/capture --until gaussians --set splat.steps=500 --output {0}/mug.ply",
-    "fit {0}/capture --until surface --set splat.steps=500 --output {0}/mug-surface.ply",
+    "fit {0}/capture --until gaussians --set splat.steps=500 --output {0}/mug.ply --overwrite",
+    "fit {0}/capture --until surface --set splat.steps=500 --output {0}/mug-surface.ply --overwrite",
     "info {0}/mug.safetensors --capture {0}/capture --plots {0}/pictures",
     "render {0}/mug.safetensors --contact-table {0}/capture/impacts.csv --output {0}/sounds --normalize peak",
     "export {0}/mug.safetensors --to web --capture {0}/capture --object {0}/mug.ply --output {0}/mug.html --overwrite",
@@ -56,14 +55,10 @@ def run(options: Options) -> int:
     from avmsf.cli import main
 
     folder = options.folder
-    try:
-        if not (folder / "capture").is_dir():
-            begun = folder / BEGUN / "capture"
-            shutil.copytree(EXAMPLE_FOLDER, begun, dirs_exist_ok=True)
-            begun.rename(folder / "capture")
-    except OSError as error:
-        path, reason = error.filename or folder, error.strerror or str(error)
-        raise OutputError.expected("a writable path", reason, file=path, advice=way_out(error)) from error
+    if not (folder / "capture").is_dir():
+        begun = folder / BEGUN / "capture"
+        shutil.copytree(EXAMPLE_FOLDER, begun, dirs_exist_ok=True)
+        begun.rename(folder / "capture")
     given = {"--quiet": options.only_results, "--verbose": options.verbose, "--json": options.json}
     common = [name for name, present in given.items() if present]
     for command in COMMANDS:

@@ -11,7 +11,7 @@ from avmsf.cli.options import Configured
 from avmsf.cli.output import doing, next_command, print_json, say, show
 from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg
 from avmsf.cli.settings import with_settings
-from avmsf.editing.config import STABLE_AUDIO, EditSettings, MaterialSettings
+from avmsf.editing.config import STABLE_AUDIO, EditSettings
 from avmsf.errors import EditError
 from avmsf.fem.material import Material, material_named
 
@@ -96,34 +96,15 @@ class Options(Configured):
     def check_inputs(self) -> None:
         """Raise the package's errors for an edit that cannot be done or written, before anything is loaded."""
         super().check_inputs()
-        settings, usual, guides = self.all_settings, self.usual, self.guides
+        settings, guides = self.all_settings, self.guides
         if len(guides) > 1:
             wanted, advice = "one of --prompt, --like and --like-material", "use one after the other"
             raise EditError.expected(wanted, tuple(guides), name=guides[0], advice=advice)
         for option, name in (("--to", self.to), ("--from", self.old), ("--like-material", self.like_material)):
             if name is not None:
                 material_named(name, option=option)
-        law = settings.material.law != MaterialSettings.law
-        material, guide = (
-            "--to, --scale or a constant of a material with it",
-            "--prompt, --like or --like-material as well",
-        )
-        unused = {
-            "parameters": (not guides and settings.parameters != usual.parameters, guide),
-            "guide": (not guides and settings.guide != usual.guide, guide),
-            "--model": (self.prompt is None and self.model != STABLE_AUDIO, "--prompt as well"),
-            "prompt": (self.prompt is None and settings.prompt != usual.prompt, "--prompt as well"),
-            "material.law": (law and not self.changes_material, material),
-            "--from": (self.old is not None and not (self.changes_material or self.like_material), material),
-            "--position": (self.position is not None and self.plots is None, "--plots with it"),
-            "options": (
-                not (self.changes_material or self.changes_modes or guides),
-                "an edit, such as --to",
-            ),
-        }
-        for name, (wrong, wanted) in unused.items():
-            if wrong:
-                raise EditError.expected(wanted, name=name)
+        if not (self.changes_material or self.changes_modes or guides):
+            raise EditError.expected("an edit, such as --to", name="options")
         if self.prompt is not None:
             settings.check_prompt(self.prompt)
             if settings.prompt.generated is not None:
@@ -148,9 +129,9 @@ def run(options: Options) -> int:
         options.part(ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
     before, after = ModeLevels.of(old), ModeLevels.of(new)
-    rows = mode_changes(before, after)
+    modes, supporting = mode_changes(before, after, new.is_mode)
     notes = [f"note: {each}" for each in notes_on(edits, new, before, after, scale=options.scale)]
-    show("\n".join([changes_table(rows, before, after, new.is_mode), *notes]))
+    show("\n".join([changes_table(modes, before, after, new.is_mode), *notes]))
     if options.plots is not None:
         draw(options.plots, (old, contact), (new, options.scale * contact), edits[-1])
     show(f"wrote {options.output}")
@@ -161,7 +142,8 @@ def run(options: Options) -> int:
             "capture": new.origin.capture,
             "edits": edits,
             "silent_modes": int(silenced(new).sum()),
-            "modes": rows,
+            "modes": modes,
+            "supporting_poles": supporting,
         }
     )
     next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")

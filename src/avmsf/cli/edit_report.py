@@ -1,6 +1,7 @@
 """What an edit did to a field: a table of its modes, notes, pictures and sounds."""
 
 import math
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,10 @@ _FieldAt = tuple[SoundField, Float64[Tensor, " 3"]]
 """A field and a contact on it, meters."""
 
 
-def mode_changes(before: ModeLevels, after: ModeLevels) -> list[dict[str, Any]]:
-    """Return what became of each mode, in the field's order."""
+def mode_changes(
+    before: ModeLevels, after: ModeLevels, is_mode: Bool[Tensor, " modes"]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return what became of each mode, and of each supporting pole, in the field's order."""
     columns = {
         "frequency_before": before.frequency,
         "frequency_after": after.frequency,
@@ -39,26 +42,25 @@ def mode_changes(before: ModeLevels, after: ModeLevels) -> list[dict[str, Any]]:
         "silent": after.size == 0.0,
     }
     cells = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return [dict(zip(columns, row, strict=True)) for row in cells]
+    rows = [dict(zip(columns, row, strict=True)) for row in cells]
+    return list(compress(rows, is_mode.tolist())), list(compress(rows, (~is_mode).tolist()))
 
 
 def changes_table(
     rows: list[dict[str, Any]], before: ModeLevels, after: ModeLevels, is_mode: Bool[Tensor, " modes"]
 ) -> str:
-    """Return the modes of most energy, before or after, as a table; supporting poles are in none of its rows."""
-    count = int(is_mode.sum())
-    energy = (before.size.square() * before.t60).maximum(after.size.square() * after.t60)
-    most = energy.where(is_mode, -1.0).argsort(descending=True)
-    listed = most[: min(MAX_LISTED_MODES, count)].sort().values.tolist()
+    """Return the rows of the modes of most energy, before or after, as a table."""
+    energy = (before.size.square() * before.t60).maximum(after.size.square() * after.t60)[is_mode]
+    listed = energy.argsort(descending=True)[:MAX_LISTED_MODES].sort().values.tolist()
     cells = []
     for row in (rows[place] for place in listed):
         change = row["level_change_db"]
         level = "silent" if row["silent"] else decimals(change, 1) if math.isfinite(change) else "back"
         frequencies = [format_number(row[f"frequency_{when}"], 5) for when in ("before", "after")]
         cells.append([*frequencies, *(format_number(row[f"t60_{when}"]) for when in ("before", "after")), level])
-    title = f"the {MAX_LISTED_MODES} modes of most energy among {count}"
-    if count <= MAX_LISTED_MODES:
-        title = counted(count, "mode")
+    title = f"the {MAX_LISTED_MODES} modes of most energy among {len(rows)}"
+    if len(rows) <= MAX_LISTED_MODES:
+        title = counted(len(rows), "mode")
     columns = ["before (Hz)", "after (Hz)", "T60 before (s)", "T60 after (s)", "level change (dB)"]
     return table(f"{title}, before and after", columns, cells, words=0)
 

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -11,7 +12,7 @@ import tyro
 
 from avmsf._utils.text import format_number, listed
 from avmsf.capture.filenames import expect_views
-from avmsf.capture.settings import TABLE, CaptureSettings
+from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import (
     Configured,
@@ -22,14 +23,14 @@ from avmsf.cli.options import (
     Number,
     expect_capture,
     option_of,
-    read_settings,
 )
 from avmsf.cli.output import display, doing, next_command, next_step, print_json, print_result, show
-from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, SettingsFile, arg
+from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, arg
 from avmsf.cli.settings import with_settings
-from avmsf.errors import FitError
+from avmsf.errors import FieldFileError, FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import GainModelName
+from avmsf.field.header import FIELD
 from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset
 
 if TYPE_CHECKING:
@@ -71,12 +72,12 @@ class Options(Configured, Many):
     """Capture folders, or with --material meshes."""
     output: Annotated[Path | None, arg("FILE", "-o")] = None
     """The field (.safetensors), by default in the cache; with --until .ply, .obj, .glb, .safetensors."""
+    overwrite: Flag = False
+    """Replace also what is no unedited field of the same capture."""
     until: Annotated[Stage | None, arg("STAGE")] = None
     """Stop after gaussians, features or surface."""
     cache: CacheFolder = None
     """Cache of the stages, by default CAPTURE/.avmsf."""
-    settings: SettingsFile = None
-    """A capture.toml in place of the folder's own."""
     plots: PlotsFolder = None
     """Draw what is made, as `avmsf info --plots` does."""
     material: Name = None
@@ -85,8 +86,6 @@ class Options(Configured, Many):
     """Fit to this part of contacts, score the others."""
     train_count: Int = None
     """Fit to so many, spread; score the others."""
-    start: Annotated[int, arg("INT")] = 0
-    """Row of impacts.csv where this choice starts."""
     features: Annotated[
         Path | None,
         arg("FILE"),
@@ -155,6 +154,7 @@ class Options(Configured, Many):
         config = self.all_settings
         if one and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
+            self._check_free(self.output)
         if self.material is not None:
             material_named(self.material, option="--material")
         self._check_unused(config)
@@ -162,12 +162,28 @@ class Options(Configured, Many):
     def _check_capture(self) -> None:
         """Raise for a capture that is not there, or not whole."""
         if self.until is not None or (self.material is not None and self.capture.is_dir()):
-            expect_views(self.capture, read_settings(self.capture, self.settings))
+            expect_views(self.capture, settings_of(self.capture))
         elif self.material is None:
             if not self.capture.is_dir():
                 wanted, advice = "a capture folder", "--material NAME computes a field of a mesh without recordings"
                 raise FitError.expected(wanted, got="a file", file=self.capture, name="--material", advice=advice)
-            expect_capture(self.capture, self.settings)
+            expect_capture(self.capture)
+
+    def _check_free(self, path: Path) -> None:
+        """Raise `OutputError` for a file that only --overwrite replaces: all but an unedited field of the capture."""
+        if self.overwrite or not path.exists():
+            return
+        source, found = self.capture, "another file"
+        own = settings_of(source).name or (source.resolve().name if source.is_dir() else source.resolve().stem)
+        # What is no field of this version is a file like any other.
+        with suppress(FieldFileError):
+            origin = FIELD.parse(FIELD.read_text(path), path)["origin"]
+            edited = bool(origin["report"].get("edits"))
+            if origin["capture"] == own and not edited and self.until is None:
+                return
+            found = f"{'an edited' if edited else 'a'} field of {origin['capture']!r}"
+        advice = "choose another, or add --overwrite to replace it"
+        raise OutputError.expected("a free name", found, got=found, file=path, name="--overwrite", advice=advice)
 
     def _check_unused(self, config: PipelineConfig) -> None:
         """Raise FitError for options that nothing would read."""
@@ -175,7 +191,7 @@ class Options(Configured, Many):
         given |= {name for name in ("gain_model", "time_zero") if getattr(config, name) != getattr(self.usual, name)}
         given -= {"gain_model"} if config.gain_model in ("auto", "elastic") else set()
         given |= {"body.supports"} if config.body.supports == "try" else set()
-        fitted = ("train_fraction", "train_count", "start", "features", "without_shape")
+        fitted = ("train_fraction", "train_count", "features", "without_shape")
         for other, chosen, names in (
             ("until", self.until, fitted),
             ("material", self.material, (*fitted, "until", "time_zero", "gain_model", "body.supports")),
@@ -185,8 +201,6 @@ class Options(Configured, Many):
                 raise FitError.expected(wanted, chosen, name=option_of(name), advice=advice)
         if self.train_count is not None and self.train_fraction is not None:
             raise FitError.expected("it or --train-fraction", got="both", name="--train-count", advice="leave one out")
-        if self.start and self.train_fraction is None and self.train_count is None:
-            raise FitError.expected("--train-fraction or --train-count with it", got="neither", name="--start")
 
 
 def run(options: Options) -> int:
@@ -196,7 +210,7 @@ def run(options: Options) -> int:
     from avmsf._utils.device import TRAINABLE, usable_device
 
     usable_device(options.all_settings.device, raising=FitError, kinds=TRAINABLE)
-    settings = read_settings(options.capture, options.settings).starting(options.all_settings.time_zero)
+    settings = settings_of(options.capture).starting(options.all_settings.time_zero)
     if options.until is not None:
         _make_stage(options, settings)
     elif options.material is not None:
@@ -220,7 +234,7 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
 
     capture = read_capture(options.capture, settings)
     size = options.train_count if options.train_fraction is None else options.train_fraction
-    train, test = (capture.impacts, None) if size is None else split(capture.impacts, size, start=options.start)
+    train, test = (capture.impacts, None) if size is None else split(capture.impacts, size)
     if options.without_shape:
         capture = replace(capture, surface=None, folder=None)
     elif options.features is None:

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.options import Common, Flag, expect_capture, read_settings
+from avmsf.cli.options import Common, Flag, expect_capture
 from avmsf.cli.output import doing, next_command, print_json, say, show
-from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, SettingsFile, kind_of
+from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, kind_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -24,8 +24,6 @@ _DRAWN_POINTS, _LISTED_POINTS = 4000, 500
 _DRAWN_CONTACTS = 4
 _BATCH = 1024
 """Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
-_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-Axis = Literal["x", "y", "z"]
 
 
 @dataclass(frozen=True)
@@ -44,20 +42,16 @@ class Options(Common):
     """Field: list all modes, not only those of most energy."""
     capture: OtherCapture = None
     """Field: compare it with a capture's recordings that it was not fitted to, or with all if there are none."""
-    settings: SettingsFile = None
-    """Field: use this capture.toml instead of the capture's own."""
     plots: PlotsFolder = None
     """Write figures to this folder. Field: modes.png, gains.png; uncertainty.png if the gains have a posterior;
     surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians: cloud.png.
     Features: features.png. Mesh: surface.png."""
-    up: Axis = "z"
-    """Gaussians and features: axis that points up."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         if self.capture is not None:
-            expect_capture(self.capture, self.settings)
+            expect_capture(self.capture)
 
 
 def run(options: Options) -> int:
@@ -65,7 +59,7 @@ def run(options: Options) -> int:
     if kind_of(options.file) == "a sound field":
         _describe_field(options)
         return 0
-    print_json(describe_shape(options.file, options.plots, up=options.up))
+    print_json(describe_shape(options.file, options.plots))
     if options.plots is None:
         next_command("avmsf info", options.file, "--plots plots")
     return 0
@@ -85,8 +79,7 @@ def _describe_field(options: Options) -> None:
     compared = None
     if options.capture is not None:
         doing("comparing the field with the capture's recordings")
-        settings = read_settings(options.capture, options.settings)
-        compared, what = _held_out(read_capture(options.capture, settings).impacts, field)
+        compared, what = _held_out(read_capture(options.capture).impacts, field)
         compared = field.aligned(compared)
         scores = evaluate(field, compared)
         title = f"{counted(len(compared), 'contact')}, {what}; lower is better"
@@ -119,7 +112,7 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
     """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
     from avmsf.field.posterior import has_posterior, relative_gain_std
     from avmsf.mesh.points import farthest_points
-    from avmsf.pipeline.record import modes_words
+    from avmsf.pipeline.fit import modes_words
     from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
     from avmsf.plotting.spectrograms import draw_spectrograms
     from avmsf.plotting.surfaces import draw_surface
@@ -164,7 +157,7 @@ def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
 
 
 def describe_shape(
-    path: Path, plots: Path | None, *, up: Axis = "z", contacts: "Float[Tensor, 'contacts 3'] | None" = None
+    path: Path, plots: Path | None, *, contacts: "Float[Tensor, 'contacts 3'] | None" = None
 ) -> dict[str, Any]:
     """Print what Gaussians, features or a surface hold, draw them in the folder `plots`, and return plain values."""
     from avmsf.gaussians.ply import holds_gaussians
@@ -172,9 +165,9 @@ def describe_shape(
 
     drawn = plots is not None
     if kind_of(path) == "features":
-        text, values, picture = _features(path, drawn, up)
+        text, values, picture = _features(path, drawn)
     elif holds_gaussians(path):
-        text, values, picture = _gaussians(path, drawn, up)
+        text, values, picture = _gaussians(path, drawn)
     else:
         text, values, picture = _surface(path, drawn, contacts)
     show(text)
@@ -185,19 +178,19 @@ def describe_shape(
     return {"file": str(path), **values}
 
 
-def _gaussians(path: Path, drawn: bool, up: Axis) -> "tuple[str, dict[str, Any], Figure | None]":
+def _gaussians(path: Path, drawn: bool) -> "tuple[str, dict[str, Any], Figure | None]":
     from avmsf.gaussians.ply import read_splats
     from avmsf.plotting.clouds import draw_cloud
 
     cloud = read_splats(path)
     extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
     title = f"{path.name}: {counted(len(cloud), 'Gaussian')}"
-    picture = draw_cloud(cloud.centers, {"color": cloud.colors}, title=title, up=_UP[up]) if drawn else None
+    picture = draw_cloud(cloud.centers, {"color": cloud.colors}, title=title) if drawn else None
     values = {"kind": "gaussians", "count": len(cloud), "extent_meters": extent}
     return f"{title}, {' x '.join(f'{side:.3g}' for side in extent)} m", values, picture
 
 
-def _features(path: Path, drawn: bool, up: Axis) -> "tuple[str, dict[str, Any], Figure | None]":
+def _features(path: Path, drawn: bool) -> "tuple[str, dict[str, Any], Figure | None]":
     from avmsf.cli.report import features_lines
     from avmsf.features.feature_field import GEOMETRY
     from avmsf.features.store import load_features, read_report
@@ -214,7 +207,7 @@ def _features(path: Path, drawn: bool, up: Axis) -> "tuple[str, dict[str, Any], 
         # The positions would outweigh the other features.
         positions = 3 if features.encoder.startswith(f"{GEOMETRY} and ") else 0
         rows = {"features": component_colors(features.features[:, positions:])}
-        picture = draw_cloud(features.points, rows, title=lines[0], symmetries=symmetries, up=_UP[up])
+        picture = draw_cloud(features.points, rows, title=lines[0], symmetries=symmetries)
     return "\n".join([*lines, *(features_lines(report) if "encoder" in report else [])]), values, picture
 
 

@@ -5,9 +5,10 @@ from dataclasses import asdict, dataclass, replace
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.options import Common, Flag, Int, expect_capture, read_settings
+from avmsf.capture.settings import settings_of
+from avmsf.cli.options import Common, Flag, Int, expect_capture
 from avmsf.cli.output import doing, next_command, print_json, say, show
-from avmsf.cli.paths import CaptureFolder, PlotsFolder, SettingsFile
+from avmsf.cli.paths import CaptureFolder, PlotsFolder
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 
@@ -32,8 +33,6 @@ class Options(Common):
     """Start of the sounds: onset, or peak (paper); by default that of capture.toml."""
     preset: Preset = "default"
     """Defaults of all settings; paper: the published method, from the peak on."""
-    settings: SettingsFile = None
-    """Use this capture.toml instead of the folder's own."""
     all: Flag = False
     """List all modes, not only those of most energy."""
     plots: PlotsFolder = None
@@ -43,7 +42,7 @@ class Options(Common):
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
         _ = self.pipeline
-        expect_capture(self.capture, self.settings)
+        expect_capture(self.capture)
 
     @property
     def pipeline(self) -> PipelineConfig:
@@ -62,7 +61,7 @@ def run(options: Options) -> int:
     from avmsf.modal.extraction.quality import measure_quality
 
     config = options.pipeline
-    capture = read_capture(options.capture, read_settings(options.capture, options.settings).starting(config.time_zero))
+    capture = read_capture(options.capture, settings_of(options.capture).starting(config.time_zero))
     impacts = capture.impacts
     count = counted(len(impacts), "recording")
     doing(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 import tyro
 
 from avmsf.capture.issues import Issues
-from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.settings import settings_of
 from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.cli.paths import InputError, arg, path_mark
 from avmsf.cli.settings import Assignments, SettingsTable, as_toml, nested_settings
@@ -108,7 +108,7 @@ class Configured(Common, ABC):
     def parse(cls: type[S], words: Sequence[str]) -> S:
         """Return the options that the words spell; with --print-config print the settings and leave by SystemExit.
 
-        Raises `InputError` also for an option of earlier versions that is a setting now.
+        Raises `InputError` also for a setting that is written as an option.
         """
         own = {each.name for each in fields(cls)}
         for word in words:
@@ -138,11 +138,6 @@ def option_of(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def read_settings(folder: Path, settings: Path | None) -> CaptureSettings:
-    """Return the settings of a file, or without one those of a capture folder."""
-    return settings_of(folder) if settings is None else CaptureSettings.read(settings)
-
-
-def expect_capture(folder: Path, settings: Path | None) -> None:
-    """Raise `CaptureError` where a capture folder's settings, or those of a file, or its table cannot be used."""
-    present_impacts(folder, read_impacts(folder, read_settings(folder, settings), Issues()), Issues())
+def expect_capture(folder: Path) -> None:
+    """Raise `CaptureError` where a capture folder's settings or its table cannot be used."""
+    present_impacts(folder, read_impacts(folder, settings_of(folder), Issues()), Issues())

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
-from avmsf._utils.files import temporary_path, unwritable
 from avmsf._utils.headers import FEATURES_KEY, read_metadata
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.capture.table import REQUIRED, read_table
@@ -55,13 +54,8 @@ class Existing:
 
     def check(self, path: Path) -> None:
         """Raise `InputError` for no file or one of another kind, and as the readers of fields and of tables."""
-        try:
-            found = None if path.exists() else "no such file or folder"
-        except OSError as error:
-            # Its name is too long, or a folder above it may not be searched.
-            found = str(error.strerror).lower()
-        if found is not None:
-            raise InputError.expected(self.what, got=found, file=path, advice="check the name")
+        if not path.exists():
+            raise InputError.expected(self.what, got="no such file or folder", file=path, advice="check the name")
         kind = kind_of(path)
         if kind is not None and kind not in self.kinds:
             cached = path / CACHE / CACHED_FIELD
@@ -84,7 +78,7 @@ class New:
 
     def check(self, path: Path) -> None:
         """Raise `OutputError` for a path where nothing can be written, and for the ending of another format."""
-        suffix, folder = path.suffix.lower(), is_folder(path)
+        suffix, folder = path.suffix.lower(), path.is_dir()
         if (self.or_folder or not self.suffixes) and (folder or suffix not in _FILE_SUFFIXES):
             expect_writable(path / "file")
             return
@@ -133,26 +127,13 @@ PositionList = Annotated[tyro.conf.UseAppendAction[tuple[tuple[float, float, flo
 
 def expect_writable(path: Path) -> None:
     """Raise `OutputError` where no file can be written at `path`: before work of minutes."""
-    if is_folder(path):
+    if path.is_dir():
         raise OutputError.expected("the name of a file", "folder", got="a folder", file=path)
     folder = path.parent
     existing = next(place for place in (folder, *folder.resolve().parents) if place.exists())
     if not existing.is_dir():
         advice = f"choose another folder for {path.name}"
         raise OutputError.expected("a folder", "file", got="a file", file=existing, advice=advice)
-
-
-def is_folder(path: Path) -> bool:
-    """Return whether a folder is at the path of an output. Raises `OutputError` where the system accepts no such path.
-
-    Its name may be too long, or a folder above it may not be searched.
-    """
-    try:
-        # Files are written under a longer name first.
-        (temporary_path(path) if path.name else path).exists()
-        return path.is_dir()
-    except OSError as error:
-        raise unwritable(path, error, raising=OutputError) from error
 
 
 def path_mark(hint: Any) -> Existing | New | None:

@@ -24,7 +24,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.quality import ModeQuality
 from avmsf.modal.modes import ModalBank
-from avmsf.pipeline.record import RECORD, modes_words, recorded
+from avmsf.pipeline.fit import RECORD, modes_words
 from avmsf.symmetry.symmetries import Symmetries
 
 MAX_LISTED_MODES = 15
@@ -49,7 +49,7 @@ def describe(field: SoundField) -> dict[str, Any]:
         "residual_rms": float(field.residual.magnitude.square().mean().sqrt()),
         "per_newton": field.origin.per_newton,
         "trained_on": list(field.origin.trained_on),
-        "pipeline": {**recorded(field), "fit": asdict(field.origin.config)},
+        "pipeline": {**field.origin.report.get(RECORD, {}), "fit": asdict(field.origin.config)},
         "body": None if field.body is None else field.body.record(),
         "report": {name: value for name, value in field.origin.report.items() if name != RECORD},
     }
@@ -89,7 +89,7 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
             rows.append(("extraction", f"{made['extraction']}, {made['modes']} modes at most"))
             rows.append(("gain model", made["gain_model"]))
     if field.body is not None:
-        rows.append(("body", f"{field.body} (the most probable one{_gained(report)})"))
+        rows.append(("body", f"{field.body} (the most probable one)"))
         rows += [("warning", field.body.warning)] if field.body.warning else []
         if (evidence := report.get("support_evidence")) and evidence["held"] < evidence["free"]:
             rows.append(("warning", "the recordings fit a free body better than one that is held there: check held"))
@@ -108,13 +108,6 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
     return [f"field of {name}", *(f"  {title:10} {words}" for title, words in rows)]
 
 
-def _gained(report: Mapping[str, Any]) -> str:
-    if "credibility" not in report:
-        return ""
-    gained = report["credibility"]["with_body"] - report["credibility"]["without_body"]
-    return f"; it raises the log likelihood of the gains at left-out contacts by {gained:.1f} per mode"
-
-
 def _gains_words(gains: dict[str, Any]) -> str:
     if gains.get("inner", gains["kind"]) == AttentionGains.kind:
         return f"attention network on features: {gains['encoder']}"
@@ -124,26 +117,11 @@ def _gains_words(gains: dict[str, Any]) -> str:
     return f"Gaussian process over {families} kernels, by {counted(gains['contacts'], 'contact')}"
 
 
-def _edit_words(edit: dict[str, Any]) -> str:
-    """Return the description of an edit, without settings that change nothing."""
-    parts = [str(edit.get("edit"))]
-    if "from" in edit:
-        parts.append(f"from {edit['from']['name']} to {edit['to']['name']}")
-    parts += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
-    usual = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
-    for name in [name for name, same in usual.items() if edit.get(name, same) != same]:
-        # One value, or one for each mode; None is one that is muted.
-        values = edit[name] if isinstance(edit[name], list) else [edit[name]]
-        known = [each for each in values if each is not None] or [-math.inf]
-        ends = dict.fromkeys(f"{each:.4g}" for each in (min(known), max(known)))
-        mute = f", {values.count(None)} muted" if None in values else ""
-        parts.append(f"{name} {' to '.join(ends)}{' by mode' * (len(values) > 1)}{mute}")
-    parts += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
-    beyond = {"silent_hertz": "beyond half the sample rate", "overdamped_hertz": "overdamped"}
-    parts += [f"modes {what}: {len(edit[name])}" for name, what in beyond.items() if edit.get(name)]
-    if scores := edit.get("clap", {}).get("scores"):
-        parts.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
-    return ", ".join(parts)
+def _edit_words(edit: Mapping[str, Any]) -> str:
+    """Return what an edit is, and those of its settings that are one value; --json has all."""
+    materials = [f"from {edit['from']['name']} to {edit['to']['name']}"] if "from" in edit else []
+    single = [f"{name} {value}" for name, value in edit.items() if isinstance(value, str | int | float) and value]
+    return ", ".join([*single, *materials])
 
 
 def quality_words(field: SoundField, path: Path) -> list[str]:

@@ -3,6 +3,7 @@
 import os
 import sys
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ import tyro
 from avmsf.cli.options import Common, Flag, Int
 from avmsf.cli.output import print_json, say
 from avmsf.cli.paths import Existing, FileKind, ShapeFile, arg
-from avmsf.errors import StudioError
+from avmsf.errors import StudioError, from_extra
 from avmsf.modal.config import expect_modes
 from avmsf.pipeline.config import Preset
 
@@ -56,15 +57,13 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Serve the page until Ctrl-C."""
-    try:
-        from avmsf.studio.opening import open_target
-        from avmsf.studio.server import serve
-        from avmsf.studio.studio import StudioConfig
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] not in ("anyio", "starlette", "uvicorn"):
-            raise
-        wanted, advice = "starlette and uvicorn for the page's server", "pip install 'avmsf[studio]'"
-        raise StudioError.expected(wanted, name=error.name, advice=advice) from error
+    with from_extra("studio", "starlette and uvicorn", raising=StudioError):
+        import_module("starlette")
+        import_module("uvicorn")
+    from avmsf.studio.opening import open_target
+    from avmsf.studio.server import serve
+    from avmsf.studio.studio import StudioConfig
+
     assert options.target is not None
     opened = open_target(options.target, object=options.object, capture=options.capture)
     serve(

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avmsf._utils.text import counted, csv_text, format_number
-from avmsf.cli.options import Common, Flag, expect_capture, read_settings
+from avmsf.cli.options import Common, Flag, expect_capture
 from avmsf.cli.output import doing, next_step, print_json, say, show, table
-from avmsf.cli.paths import FieldFile, OtherCapture, PictureFolder, SettingsFile
+from avmsf.cli.paths import FieldFile, OtherCapture, PictureFolder
 from avmsf.errors import FitError
 
 if TYPE_CHECKING:
@@ -42,20 +42,16 @@ class Options(Common):
     reaches from outside, at most 45 degrees from perpendicular."""
     unseen: Flag = False
     """Suggest on all of the body's surface, also where no photograph shows it, such as the side that it stood on."""
-    settings: SettingsFile = None
-    """Use this capture.toml instead of the candidates' own."""
     output: PictureFolder = None
     """Folder for suggested.csv, the list of contacts, and suggested.png, the contacts on the object."""
 
     def check_inputs(self) -> None:
         """Raise the package's errors for options that cannot be used, before anything is loaded."""
         super().check_inputs()
-        if self.settings is not None and self.candidates is None:
-            raise FitError.expected("--candidates with it", name="--settings", advice="leave it out")
         if self.unseen and self.candidates is not None:
             raise FitError.expected("no --candidates with it", got="both", name="--unseen", advice="leave one out")
         if self.candidates is not None:
-            expect_capture(self.candidates, self.settings)
+            expect_capture(self.candidates)
 
 
 def run(options: Options) -> int:
@@ -71,7 +67,7 @@ def run(options: Options) -> int:
     if options.candidates is None:
         found = suggest(field, options.count, unseen=options.unseen, progress=False)
     else:
-        impacts = read_capture(options.candidates, read_settings(options.candidates, options.settings)).impacts
+        impacts = read_capture(options.candidates).impacts
         places, ways = impacts.contacts, impacts.directions
         found = suggest(field, options.count, candidates=places, directions=ways, progress=False)
         straight = straight if ways is None else ""

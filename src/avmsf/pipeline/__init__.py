@@ -11,7 +11,7 @@ comes a `SoundField`. Start reading at `fit.fit`, which `avmsf.fit` and `avmsf f
   contacts, mesh, masks and Gaussians are of one object in one frame. `visual_checks`: what `avmsf check` says of them.
 - `bodies`: the finite-element models that a surface may enclose, and the field of one of a known material without
   recordings. `fit`: modes and gains.
-- `config`: settings of all stages, and the presets `default` and `paper`. `record`: what a field's file says of them.
+- `config`: settings of all stages, and the presets `default` and `paper`.
 
 Raises AvmsfError, by its kind: CaptureError, SceneError, SimulationError, ExtractionError, FitError, FolderInUseError.
 """

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from avmsf._utils.caching import once
 from avmsf._utils.progress import ProgressDisplay, ProgressListener
 from avmsf._utils.text import counted
@@ -29,9 +31,9 @@ from avmsf.field.training import Progress
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_once
+from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.bodies import candidate_bodies, expect_no_recordings, guess_field
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE, PipelineConfig
-from avmsf.pipeline.record import modes_words, supporting_poles, with_record
 from avmsf.pipeline.scene import SceneStages
 from avmsf.pipeline.shape import FitShape, is_mesh, object_shape, pipeline_of, shape_of
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
@@ -41,6 +43,8 @@ MODES, FIELD = "modes.safetensors", CACHED_FIELD
 """What the last stages call their outputs."""
 BODIES = "bodies"
 """Folder of elastic modes in the cache, kept by content."""
+RECORD = "pipeline"
+"""What a field's report calls the configuration that made it."""
 _FEW = 8
 """Recordings below which little is known of the gains between contacts."""
 
@@ -306,6 +310,31 @@ def guess_in_stages(
         recipe = {"guess": asdict(material), "surface": digest, "modes": config.modes, "body": asdict(config.body)}
         recipe |= {"fit": asdict(config.fit), "settings": asdict(settings), "name": name}
         return Pipeline(stages, listener=listener).add(Stage(FIELD, guess, recipe=lambda: recipe)).path
+
+
+def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str, Any]) -> SoundField:
+    """Return a field whose report has the configuration that made it, but for the fit's own, which it has anyway.
+
+    `features` is the report of the features' file: it names the encoder that was taken and how the features were made,
+    which decide where `config.scene` does not, as for a file from elsewhere. Empty where there is none.
+    """
+    values = asdict(config)
+    del values["fit"]
+    values["scene"] = features.get("scene")
+    values["encoder"] = features.get("encoder")
+    return replace(made, origin=replace(made.origin, report={**made.origin.report, RECORD: values}))
+
+
+def supporting_poles(modes: Extraction, impacts: Impacts) -> list[int]:
+    """Return the rows of the poles that are no modes of the object, from the recordings that they were found in."""
+    quality = measure_quality(modes.aligned(impacts).sounds, modes, sample_rate=impacts.sample_rate)
+    return torch.nonzero(~quality.is_mode).flatten().tolist()
+
+
+def modes_words(poles: int, supporting: int) -> str:
+    """Return how many of the poles of a model are modes of the object: "16 modes and 38 supporting poles"."""
+    modes = counted(poles - supporting, "mode")
+    return f"{modes} and {counted(supporting, 'supporting pole')}" if supporting else modes
 
 
 def _configured(

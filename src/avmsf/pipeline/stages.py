@@ -9,7 +9,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 
 import avmsf
 from avmsf._utils.caching import discard, source_digest
-from avmsf._utils.files import way_out, write_whole
+from avmsf._utils.files import write_whole
 from avmsf._utils.processes import WAIT, write_lock
 from avmsf._utils.progress import ProgressListener
 from avmsf._utils.text import read_json
@@ -99,36 +99,24 @@ class StageFolder:
         wanted = json.loads(json.dumps(key, sort_keys=True))
         known = _read(record)
         same = known.get("recipe") == wanted
-        with self._explaining(name):
-            current = same and path.exists() and digest_of(path) == known.get("digest")
-            if not same:
-                self.checkpoint(name).unlink(missing_ok=True)
+        current = same and path.exists() and digest_of(path) == known.get("digest")
+        if not same:
+            self.checkpoint(name).unlink(missing_ok=True)
         if current and (stage.usable is None or stage.usable(path)):
             return Kept(path, known["digest"], float(known["seconds"]), fresh=False, values=known.get("values", {}))
-        with self._explaining(name):
-            _write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
+        self._write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
         values = stage.make(path, *(kept.path for kept in inputs.values())) or {}
-        with self._explaining(name):
-            digest, seconds = digest_of(path), time.monotonic() - begun
-            _write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3), "values": values})
+        digest, seconds = digest_of(path), time.monotonic() - begun
+        self._write(record, {"recipe": wanted, "digest": digest, "seconds": round(seconds, 3), "values": values})
         discard(self.checkpoint(name))
         return Kept(path, digest, seconds, fresh=True, values=values)
 
-    @contextmanager
-    def _explaining(self, name: str) -> Iterator[None]:
-        """Turn an OSError into a CaptureError with advice."""
+    def _write(self, record: Path, values: Mapping[str, Any]) -> None:
         try:
-            yield
-        except (OSError, CaptureError) as error:
-            cause = error.__cause__ if isinstance(error, CaptureError) else error
-            if not isinstance(cause, OSError):
-                raise
-            reason = cause.strerror or str(cause)
-            path = self.path(name)
-            raise CaptureError.expected(
-                "a readable and writable path", reason, file=path, advice=f"{way_out(cause)} by {self.option}"
-            ) from cause
+            write_whole(record, json.dumps(values, indent=1), raising=CaptureError)
+        except CaptureError as error:
+            raise CaptureError(f"{error}, by {self.option}", **error.attributes) from error
 
 
 class Pipeline:
@@ -185,11 +173,6 @@ def digest_files(paths: Iterable[Path], *, root: Path) -> str:
             for block in iter(partial(file.read, _BLOCK), b""):
                 digest.update(block)
     return digest.hexdigest()
-
-
-def _write(record: Path, values: Mapping[str, Any]) -> None:
-    words = json.dumps(values, indent=1)
-    write_whole(record, words, raising=CaptureError)
 
 
 def _read(record: Path) -> dict[str, Any]:

@@ -61,7 +61,7 @@ class VisualInputs:
         return f"the object is shown by: {'; '.join(found) or 'no photographs, video, mesh or Gaussians'}"
 
 
-def inputs(folder: Path, settings: CaptureSettings | None) -> VisualInputs | None:
+def inputs(folder: Path, settings: CaptureSettings | None = None) -> VisualInputs | None:
     """Return what in a folder shows the object; None for a folder or settings that cannot be read."""
     try:
         settings = settings or settings_of(folder)
@@ -119,14 +119,13 @@ def expect_shape(capture: Capture) -> None:
         )
 
 
-def misplaced(folder: Path, settings: CaptureSettings | None, visual: VisualInputs) -> list[AvmsfWarning | AvmsfError]:
+def misplaced(folder: Path, visual: VisualInputs) -> list[AvmsfWarning | AvmsfError]:
     """Return what `avmsf fit` would warn of or raise of cameras, masks, Gaussians and contacts together.
 
     It opens some of the photographs, at a low resolution.
     """
     try:
-        settings = settings or settings_of(folder)
-        rows = read_rows(folder)[0]
+        settings, rows = settings_of(folder), read_rows(folder)[0]
         contacts = contacts_of(rows, settings)
     except CaptureError:
         return []

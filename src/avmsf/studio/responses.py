@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from starlette.responses import JSONResponse
 
-from avmsf._utils.files import way_out
 from avmsf.errors import AvmsfError, FolderInUseError, RecordingLengthError, StudioError, lacks_memory
 
 UNUSABLE = 422
@@ -65,7 +64,7 @@ def error_response(error: Exception) -> RequestError:
         reason = error.strerror or str(error)
         return RequestError(
             507 if error.errno in _FULL else 503,
-            f"{where}expected a file to read or write, got {reason!r}; {way_out(error)}",
+            f"{where}expected a file to read or write, got {reason!r}; choose another folder or name",
             file=error.filename if isinstance(error.filename, str | Path) else None,
             value=reason,
         )
