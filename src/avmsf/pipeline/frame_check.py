@@ -2,12 +2,12 @@
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from scipy import ndimage
 from torch import Tensor
 
@@ -15,92 +15,56 @@ from avmsf.capture.placement import FACTORS, WRONG_ROWS, check_placement
 from avmsf.capture.settings import CaptureSettings, unit_named
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.surface import Surface
-from avmsf.photographs.cameras import Camera, View
+from avmsf.photographs.cameras import View
 from avmsf.photographs.folder import check_cameras
-from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.photographs.visual_hull import Votes, carve
 from avmsf.pipeline.views import spread_views
 
 MAX_VIEWS = 12
 """Views that are compared, as far apart as they stand."""
-LONGEST, COARSE = 256, 64
-"""Pixels of the longer side of what is compared, and of what units are tried by."""
+LONGEST = 256
+"""Pixels of the longer side of photographs that are compared."""
 MASK_PIXELS = 2.0
 """Pixels of a photograph by which its mask's edge may be wrong."""
-BEYOND = 0.005
-"""Part of an outline's area that may differ beyond that: thin parts, which masks lose."""
 SAME_SHAPE = 0.3
-"""Difference of outlines below which a change of unit explains a greater one. A ball beside a cube of its size has
-.2."""
+"""Difference of boxes below which a change of unit explains a greater one: units differ by 3.28 times and more."""
 
 
-@dataclass(frozen=True)
-class OutlineDifference:
-    """How a mesh's outlines differ from masks, medians over the views, so that single wrong masks do not matter."""
+def expect_mesh_in_views(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> None:
+    """Raise CaptureError where a mesh and the cameras of photographs are in different units.
 
-    difference: float
-    """Area that only one of them has over the area that at least one has: 0 to 1."""
-    beyond: float
-    """Likewise, without what lies within `MASK_PIXELS` of the mask's edge."""
-    size: float
-    """Square root of the outline's area over the mask's."""
+    Nothing made of the photographs would lie on the mesh then. The error's `value` is the factor on the mesh by which
+    it appears as large as the masks; `settings` are those that both were read by. Views without masks say nothing.
+    """
+    chosen, points = _masked(views), surface.vertices.double()
+    if not chosen or not len(surface.faces):
+        return
+    found = _box_difference(points, chosen)
+    others = {each: _box_difference(each * points, chosen) for each in FACTORS if each != 1}
+    factor = min(others, key=others.__getitem__)
+    if others[factor] < min(SAME_SHAPE, 0.5 * found):
+        raise CaptureError(
+            f"expected the mesh and the cameras in one unit; the mesh appears as large as the photographs' masks when "
+            f"multiplied by {factor:.4g}; {_mending(factor, settings)}",
+            name="surface_unit",
+            value=factor,
+        )
 
 
-def compare_outlines(
-    tracer: MeshTracer, views: Sequence[View], *, longest: int = LONGEST, factor: float = 1.0
-) -> OutlineDifference:
-    """Compare a mesh, times a factor, with the masks of views, which all have one that shows something."""
+def _box_difference(points: Float64[Tensor, "points 3"], views: Sequence[View]) -> float:
+    """Return the part of both boxes in an image that the points' and the mask's do not share; the median over views."""
     found = []
     for view in views:
-        assert view.mask is not None
-        scale = min(1.0, longest / max(view.camera.width, view.camera.height))
-        width, height = max(1, round(scale * view.camera.width)), max(1, round(scale * view.camera.height))
-        camera = _scaled(view.camera.resized(width, height), 1.0 / factor)
-        outline = torch.isfinite(tracer.depth(camera)).numpy()
-        mask = cv2.resize(view.mask.numpy(), (width, height), interpolation=cv2.INTER_AREA) > 127
-        either, differs = outline | mask, outline ^ mask
-        # Each pixel's distance to the nearest one on the other side of the mask's edge.
-        sides = (each.astype(np.uint8) for each in (mask, ~mask))
-        far = sum(cv2.distanceTransform(each, cv2.DIST_L2, 5) for each in sides) > 1.0 + MASK_PIXELS * scale
-        area = max(1, int(either.sum()))
-        found.append((differs.sum() / area, (differs & far).sum() / area, (outline.sum() / max(1, mask.sum())) ** 0.5))
-    return OutlineDifference(*np.median(np.array(found), axis=0).tolist())
-
-
-def check_outlines(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> CaptureWarning | None:
-    """Return a warning for a mesh that differs from the masks of photographs by more than their accuracy.
-
-    Its `value` is the difference as a part of the area. None where they agree, and where no view has a mask; `settings`
-    are those that both were read by. Raises CaptureError where cameras and mesh are in different units, with the factor
-    on the mesh that fits as `value`: nothing made of the photographs would lie on the mesh.
-    """
-    chosen = _masked(views)
-    if not chosen or not len(surface.faces):
-        return None
-    tracer = MeshTracer(surface)
-    found = compare_outlines(tracer, chosen)
-    if found.beyond <= BEYOND:
-        return None
-    words = f"the mesh's outlines and the photographs' masks differ by {_percent(found.difference)} of their area"
-    if found.difference > SAME_SHAPE:
-        factor, best = min(
-            ((each, compare_outlines(tracer, chosen, longest=COARSE, factor=each)) for each in FACTORS if each != 1),
-            key=lambda pair: pair[1].difference,
-        )
-        if best.difference < min(SAME_SHAPE, 0.5 * found.difference):
-            raise CaptureError(
-                f"expected the mesh and the cameras in one unit; {words}, and by {_percent(best.difference)} with the "
-                f"mesh times {factor:.4g}; {_mending(factor, settings)}",
-                name="surface_unit",
-                value=factor,
-            )
-    size = f"{_percent(abs(found.size - 1))} {'larger' if found.size > 1 else 'smaller'}"
-    return CaptureWarning(
-        f"{words}, {_percent(found.beyond)} beyond {MASK_PIXELS:g} pixels of the masks' edges, and the mesh is {size}; "
-        "check that both are of one object, in one unit and frame (the mesh is used as the object's shape)",
-        name="surface",
-        value=found.difference,
-    )
+        pixels, _ = view.camera.project(points)
+        mask, edges = np.argwhere(view.foreground)[:, ::-1], (view.camera.width, view.camera.height)
+        if not bool(torch.isfinite(pixels).all()):
+            found.append(1.0)
+            continue
+        seen = np.clip([pixels.amin(0).numpy(), pixels.amax(0).numpy()], 0, edges)
+        boxes = np.stack([seen, [mask.min(0), mask.max(0) + 1]])
+        shared = np.clip(boxes[:, 1].min(0) - boxes[:, 0].max(0), 0, None).prod()
+        found.append(1 - shared / ((boxes[:, 1] - boxes[:, 0]).prod(axis=1).sum() - shared))
+    return float(np.median(found))
 
 
 def expect_contacts_in_views(
@@ -221,14 +185,3 @@ def _mending(factor: float, settings: CaptureSettings) -> str:
     if contacts is not None and mesh is not None:
         return f'write unit = "{contacts}" and surface_unit = "{mesh}" in capture.toml'
     return "scale the cameras or the mesh"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
-
-
-def _scaled(camera: Camera, factor: float) -> Camera:
-    """Return the camera with its distance from the origin times a factor."""
-    pose = camera.world_to_camera.clone()
-    pose[:3, 3] *= factor
-    return replace(camera, world_to_camera=pose)

@@ -1,6 +1,5 @@
 """The object's shape as a fit reads it: from a mesh, from views, or from positions alone."""
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import read_surface, surface_points, write_surface
 from avmsf.photographs import read_views
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
-from avmsf.pipeline.frame_check import check_outlines, expect_contacts_in_views, expect_on_object
+from avmsf.pipeline.frame_check import expect_contacts_in_views, expect_mesh_in_views, expect_on_object
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
 from avmsf.pipeline.views import VIEWS
@@ -149,9 +148,8 @@ def _shape_of_views(
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         views = read_views(scene[VIEWS].path)
-        warning = None if capture.surface is None else check_outlines(capture.surface, views, settings)
-        if warning is not None:
-            warnings.warn(warning, stacklevel=2)
+        if capture.surface is not None:
+            expect_mesh_in_views(capture.surface, views, settings)
         expect_contacts_in_views(impacts.contacts, views, settings)
     if scene.splats is not None:
         points = read_splats(scene[CLOUD].path).centers

@@ -20,7 +20,13 @@ from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs.folder import mask_paths, read_camera_file, read_views
 from avmsf.photographs.segmentation import find_foreground
-from avmsf.pipeline.frame_check import LONGEST, MAX_VIEWS, check_outlines, expect_contacts_in_views, expect_on_object
+from avmsf.pipeline.frame_check import (
+    LONGEST,
+    MAX_VIEWS,
+    expect_contacts_in_views,
+    expect_mesh_in_views,
+    expect_on_object,
+)
 from avmsf.pipeline.scene import scaled, without_far
 from avmsf.pipeline.views import find_source, find_splats
 
@@ -140,8 +146,8 @@ def misplaced(folder: Path, visual: VisualInputs) -> list[AvmsfWarning | AvmsfEr
                 views = read_views(folder, longest=LONGEST, max_views=MAX_VIEWS, meters=settings.views_meters)
                 views = find_foreground(views)
                 surface = None if visual.mesh is None else find_surface(folder, settings)
-                outlines = None if surface is None else check_outlines(surface, views, settings)
-                found += [] if outlines is None else [outlines]
+                if surface is not None:
+                    expect_mesh_in_views(surface, views, settings)
                 expect_contacts_in_views(contacts, views, settings)
             if visual.gaussians is not None:
                 cloud = without_far(scaled(read_splats(folder / visual.gaussians), settings.views_meters))
