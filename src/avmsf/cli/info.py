@@ -1,5 +1,6 @@
 """`avmsf info`: what a field, Gaussians, features or a surface hold, as text and pictures."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
     from avmsf.capture import Impacts
     from avmsf.field.sound_field import SoundField
+
+    _Described = tuple[str, dict[str, Any], Callable[[], Figure]]
+    """Text and values on a file, and what draws it."""
 
 _DRAWN_POINTS, _LISTED_POINTS = 4000, 500
 """Of the surface: for pictures, and for the mean levels in a table."""
@@ -156,41 +160,34 @@ def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
     return impacts.take(rows), "not training recordings" if len(rows) < len(impacts) else "none a training recording"
 
 
-def describe_shape(
-    path: Path, plots: Path | None, *, contacts: "Float[Tensor, 'contacts 3'] | None" = None
-) -> dict[str, Any]:
+def describe_shape(path: Path, plots: Path | None) -> dict[str, Any]:
     """Print what Gaussians, features or a surface hold, draw them in the folder `plots`, and return plain values."""
     from avmsf.gaussians.ply import holds_gaussians
     from avmsf.plotting.pictures import save_picture
 
-    drawn = plots is not None
-    if kind_of(path) == "features":
-        text, values, picture = _features(path, drawn)
-    elif holds_gaussians(path):
-        text, values, picture = _gaussians(path, drawn)
-    else:
-        text, values, picture = _surface(path, drawn, contacts)
+    describe = _features if kind_of(path) == "features" else _gaussians if holds_gaussians(path) else _surface
+    text, values, draw = describe(path)
     show(text)
-    if plots is not None and picture is not None:
-        stem = "cloud" if values["kind"] == "gaussians" else values["kind"]
-        save_picture(picture, plots / f"{stem}.png")
-        say(f"wrote {plots / stem}.png")
+    if plots is not None:
+        picture = plots / ("cloud.png" if values["kind"] == "gaussians" else f"{values['kind']}.png")
+        save_picture(draw(), picture)
+        say(f"wrote {picture}")
     return {"file": str(path), **values}
 
 
-def _gaussians(path: Path, drawn: bool) -> "tuple[str, dict[str, Any], Figure | None]":
+def _gaussians(path: Path) -> "_Described":
     from avmsf.gaussians.ply import read_splats
     from avmsf.plotting.clouds import draw_cloud
 
     cloud = read_splats(path)
     extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
     title = f"{path.name}: {counted(len(cloud), 'Gaussian')}"
-    picture = draw_cloud(cloud.centers, {"color": cloud.colors}, title=title) if drawn else None
     values = {"kind": "gaussians", "count": len(cloud), "extent_meters": extent}
-    return f"{title}, {' x '.join(f'{side:.3g}' for side in extent)} m", values, picture
+    text = f"{title}, {' x '.join(f'{side:.3g}' for side in extent)} m"
+    return text, values, lambda: draw_cloud(cloud.centers, {"color": cloud.colors}, title=title)
 
 
-def _features(path: Path, drawn: bool) -> "tuple[str, dict[str, Any], Figure | None]":
+def _features(path: Path) -> "_Described":
     from avmsf.cli.report import features_lines
     from avmsf.features.feature_field import GEOMETRY
     from avmsf.features.store import load_features, read_report
@@ -199,21 +196,20 @@ def _features(path: Path, drawn: bool) -> "tuple[str, dict[str, Any], Figure | N
 
     features, report = load_features(path), read_report(path)
     count, dim = features.features.shape
-    lines = [f"{path.name}: {dim} features of {features.encoder} on {count} points"]
+    title = f"{path.name}: {dim} features of {features.encoder} on {count} points"
     values = {"kind": "features", "encoder": features.encoder, "points": count, "dim": dim, "report": report}
-    picture = None
-    if drawn:
+
+    def draw() -> "Figure":
         symmetries = Symmetries.from_dict(report["symmetries"]) if "symmetries" in report else None
         # The positions would outweigh the other features.
         positions = 3 if features.encoder.startswith(f"{GEOMETRY} and ") else 0
         rows = {"features": component_colors(features.features[:, positions:])}
-        picture = draw_cloud(features.points, rows, title=lines[0], symmetries=symmetries)
-    return "\n".join([*lines, *(features_lines(report) if "encoder" in report else [])]), values, picture
+        return draw_cloud(features.points, rows, title=title, symmetries=symmetries)
+
+    return "\n".join([title, *(features_lines(report) if "encoder" in report else [])]), values, draw
 
 
-def _surface(
-    path: Path, drawn: bool, contacts: "Float[Tensor, 'contacts 3'] | None"
-) -> "tuple[str, dict[str, Any], Figure | None]":
+def _surface(path: Path) -> "_Described":
     import trimesh
 
     from avmsf.mesh.surface import read_surface
@@ -224,5 +220,5 @@ def _surface(
     extent = " x ".join(f"{1000 * side:.3g}" for side in surface.vertices.amax(0) - surface.vertices.amin(0))
     closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
     text = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2, {closed}"
-    picture = draw_surface(surface, title=f"{path.name}: surface", contacts=contacts) if drawn else None
-    return f"{path.name}: {text}", {"kind": "surface", "triangles": len(surface.faces)}, picture
+    values = {"kind": "surface", "triangles": len(surface.faces)}
+    return f"{path.name}: {text}", values, lambda: draw_surface(surface, title=f"{path.name}: surface")

@@ -48,11 +48,6 @@ class ModeLevels:
         """The longest T60 of the modes that sound, s; zero without one."""
         return max([0.0, *self.t60[self.size > 0].tolist()])
 
-    @property
-    def total_db(self) -> float:
-        """The level of all modes together, dB; -inf without one that sounds."""
-        return float(20.0 * self.size.norm().log10())
-
     def level_db(self, reference: float) -> Float64[Tensor, " modes"]:
         """Return levels over an amplitude, dB; -inf for silent modes."""
         return 20.0 * torch.log10(self.size / max(reference, torch.finfo(torch.float64).tiny))
