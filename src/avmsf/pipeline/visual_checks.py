@@ -154,10 +154,9 @@ def misplaced(folder: Path, visual: VisualInputs) -> list[AvmsfWarning | AvmsfEr
                 expect_on_object(contacts, cloud.centers, names=names, what="Gaussians")
         except (CaptureError, SceneError) as error:
             found.append(error)
-    # The error says what the cameras' axes show, and which photographs are missing the camera file's check.
-    left_out = ("missing images", "cameras", *(["axes"] if found else []))
     warned = [each.message for each in caught if isinstance(each.message, CaptureWarning)]
-    return [*(each for each in warned if each.name not in left_out), *found]
+    # Which photographs are missing the camera file's check says.
+    return [*(each for each in warned if each.name not in ("missing images", "cameras")), *found]
 
 
 def _photographs(
