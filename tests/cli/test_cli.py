@@ -159,8 +159,9 @@ def test_fit_replaces_nothing_but_a_field_of_the_same_capture(capture: Path, fie
     words = ["--output", str(output)]
     shutil.copy(field, output)
     FitOptions.parse([str(capture), *words]).check_inputs()
-    with raises(OutputError, file=output, name="--overwrite"):
-        FitOptions.parse([str(capture), "--until", "features", *words]).check_inputs()
+    for other_kind in (["--until", "features"], ["--material", "glass"]):
+        with raises(OutputError, file=output, name="--overwrite"):
+            FitOptions.parse([str(capture), *other_kind, *words]).check_inputs()
     edited = replace(own, origin=replace(own.origin, report={**own.origin.report, "edits": [{"edit": "x"}]}))
     other = replace(own, origin=replace(own.origin, capture="bowl"))
     for content in (edited, other, b"sound"):

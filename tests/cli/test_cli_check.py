@@ -211,10 +211,10 @@ Y_UP = np.array([[1.0, 0, 0, 0.3], [0, 0, 1, 0.1], [0, -1, 0, -0.2], [0, 0, 0, 1
 CAMERAS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "as they are": (lambda pose: pose, ""),
     "moved": (lambda pose: Y_UP @ pose, "contacts on the object in the photographs, got most outside"),
-    "world to camera": (np.linalg.inv, "once each pose is inverted (world to camera"),
+    "world to camera": (np.linalg.inv, "check the poses of the cameras"),
     "OpenCV's axes": (
         lambda pose: pose @ np.diag([1.0, -1, -1, 1]),
-        "expected contacts on the object in the photographs",
+        "check the poses of the cameras",
     ),
     "transposed": (lambda pose: pose.T, "perhaps the matrix is transposed"),
 }

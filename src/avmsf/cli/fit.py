@@ -179,7 +179,8 @@ class Options(Configured, Many):
         with suppress(FieldFileError):
             origin = FIELD.parse(FIELD.read_text(path), path)["origin"]
             edited = bool(origin["report"].get("edits"))
-            if origin["capture"] == own and not edited and self.until is None:
+            same_kind = self.until is None and (self.material is None or "guess" in origin["report"])
+            if origin["capture"] == own and same_kind and not edited:
                 return
             found = f"{'an edited' if edited else 'a'} field of {origin['capture']!r}"
         advice = "choose another, or add --overwrite to replace it"
