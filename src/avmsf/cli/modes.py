@@ -13,8 +13,8 @@ from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
 
 _EXPLANATION = (
-    "±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in all. "
-    "left out: energy explained by leave-one-out, 50 % by chance."
+    "±: spread over recordings. energy: share of all. phase: coherence over recordings, 1 if the same in all. orders: "
+    "part of the model orders that find the pole. left out: energy explained by leave-one-out, 50 % by chance."
 )
 
 

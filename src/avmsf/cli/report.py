@@ -236,6 +236,7 @@ def mode_rows(
         columns |= {
             "frequency_spread_hertz": quality.frequency_spread,
             "damping_spread_per_second": quality.damping_spread,
+            "stable_orders": quality.stable_orders,
             "phase_coherence": quality.coherence,
             "energy_share": quality.energy_share,
             "explained_left_out": quality.explained_left_out,
@@ -254,7 +255,7 @@ def mode_table(of: str, rows: Sequence[dict[str, Any]], supporting: int, *, ever
     which = "by energy" if len(most) == len(rows) else f"the {MAX_LISTED_MODES} of most energy (--all lists all)"
     columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
     scored = any("energy_share" in row for row in rows)
-    columns += ["energy", "phase", "left out"] if scored else []
+    columns += ["energy", "phase", "orders", "left out"] if scored else []
     cells = []
     for row in most:
         cell = [str(row["number"]), decimals(row["frequency_hertz"], 2), format_number(row["damping_per_second"])]
@@ -263,7 +264,7 @@ def mode_table(of: str, rows: Sequence[dict[str, Any]], supporting: int, *, ever
             cell[1] += f" ± {format_number(row['frequency_spread_hertz'], 2)}"
             cell[2] += f" ± {format_number(row['damping_spread_per_second'], 2)}"
             cell += [f"{100 * row['energy_share']:.2f} %", decimals(row["phase_coherence"], 2)]
-            cell.append(f"{100 * row['explained_left_out']:.0f} %")
+            cell += [f"{100 * row['stable_orders']:.0f} %", f"{100 * row['explained_left_out']:.0f} %"]
         cells.append(cell)
     poles = f"\n{counted(supporting, 'supporting pole')} in the model, but not modes (--json lists all)"
     return table(f"{counted(len(rows), 'mode')}{of}, {which}", columns, cells) + (poles if supporting else "")

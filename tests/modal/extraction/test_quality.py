@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avmsf.capture import CaptureSettings, read_capture
 from avmsf.errors import CaptureWarning
+from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.least_squares import fit_gains
@@ -79,6 +80,7 @@ def test_known_sines_in_noise_are_modes_and_nothing_else_is_found(contacts: int)
     assert float(quality.coherence.min()) > 0.99
     # Noise of a hundredth of the amplitude: a recording's own pole explains hardly more than the others' pole.
     assert float(quality.explained_left_out.min()) > 0.99
+    assert float(quality.stable_orders.min()) > 0.8
 
 
 def test_spreads_over_recordings_are_the_cramer_rao_bound() -> None:
@@ -140,6 +142,13 @@ def test_coherence_is_one_for_one_phase_modulo_pi_and_low_for_random_phases() ->
     sounds = synthesize(turned, bank.frequency, bank.damping, samples=SAMPLES, sample_rate=RATE)
     # Of 64 random phases the resultant is 1/8 in the root mean square.
     assert float(quality_of(sounds, bank).coherence) < 0.35
+
+
+def test_a_pole_that_is_not_there_is_stable_at_no_order() -> None:
+    sounds = record(TRUTH, shapes(4, 3))
+    stable = stable_orders(sounds, bank_of((400.0, 8.0), (550.0, 10.0)), sample_rate=RATE)
+    assert float(stable[0]) > 0.8
+    assert float(stable[1]) < 0.2
 
 
 @pytest.mark.slow

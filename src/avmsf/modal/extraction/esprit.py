@@ -11,7 +11,7 @@ import math
 from typing import no_type_check
 
 import torch
-from jaxtyping import Complex, Complex128, Float
+from jaxtyping import Complex, Complex128, Float, Float64
 from torch import Tensor
 
 from avmsf._utils.compiled import compiled
@@ -30,6 +30,17 @@ _LEAST_FALL = 0.1
 """Nepers over its length by which a sound must fall for its damping to be measured at all."""
 _ABOVE_NOISE = 10.0
 """Eigenvalues this far above the noise's belong to the signal. Low, for what is wrongly let in is sifted later."""
+
+_ORDERS = range(2, 33, 2)
+"""Model orders of a stability diagram, poles in a band."""
+_FALL = 5.0
+"""Nepers by which a mode falls over the beginning that it is looked for in, at least: less than a hundredth is left."""
+_SHALLOW = 128
+"""Samples of the band that a mode is looked for in: a third of them exceeds the highest order."""
+_STABLE = 0.25
+"""Distance of a pole from the mode's, over its damping, at which it counts as found. Stability diagrams allow 1 % of
+frequency and 5 % of damping as a rule (B. Peeters and G. De Roeck, Mechanical Systems and Signal Processing 13(6),
+1999); here modes may lie closer than 1 % of their frequency, and the width sets the scale."""
 
 
 def candidates(
@@ -107,13 +118,65 @@ def _search(
     return torch.cat(found)
 
 
+def stable_orders(
+    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float
+) -> Float64[Tensor, " modes"]:
+    """Return the part of the model orders at which each mode is found again, from 0 to 1: its stability diagram.
+
+    Orders from 2 to 32 of a matrix pencil in a band about the mode, in a beginning of the sounds over which it dies.
+    """
+    stable = torch.zeros(len(bank), dtype=torch.float64)
+    samples = sounds.shape[1]
+    lengths = [samples]
+    while lengths[-1] >= 2 * SHORTEST:
+        lengths.append(lengths[-1] // 2)
+    wanted = _FALL * sample_rate / bank.damping
+    # The shortest beginning that is long enough, or the whole.
+    chosen = (torch.tensor(lengths)[:, None] >= wanted).sum(0).clamp_min(1) - 1
+    for place, length in enumerate(lengths):
+        padded = 1 << (2 * length - 1).bit_length()
+        size = min(round(_SHALLOW * padded / length), padded // 2)
+        fade = torch.hann_window(size, periodic=False, dtype=torch.float64).sqrt()
+        modes = torch.nonzero(chosen == place).flatten()
+        spectrum = torch.fft.rfft(sounds[:, :length], padded) if len(modes) else None
+        for mode in modes.tolist():
+            assert spectrum is not None
+            first = round(float(bank.frequency[mode]) * padded / sample_rate) - size // 2
+            index = torch.arange(first, first + size)
+            inside = (index >= 0) & (index < padded // 2)
+            band = torch.fft.ifft(spectrum[:, index.clamp(0, padded // 2 - 1)] * (inside * fade))
+            band = band[:, _RINGING : size * length // padded]
+            span = band.shape[1] // 3
+            _, vectors = _subspace(band, span)
+            turn = 2 * math.pi * (bank.frequency[mode] - first * sample_rate / padded)
+            pole = torch.exp(torch.complex(-bank.damping[mode], turn) * (padded / size / sample_rate))
+            reach = _STABLE * bank.damping[mode] * padded / size / sample_rate
+            # Sounds too short for the higher orders have none of them.
+            orders = [order for order in _ORDERS if order < span]
+            near = [bool((torch.log(_rotation(vectors[:, :order]) / pole).abs() < reach).any()) for order in orders]
+            stable[mode] = sum(near) / len(_ORDERS)
+    return stable
+
+
 def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " poles"]:
     """Return the poles shared by complex signals, by the rotational invariance of their signal subspace."""
     span = band.shape[1] // 3
-    values, vectors = torch.linalg.eigh(_correlation(band.to(torch.complex128), span))
-    values, vectors = values.flip(0), vectors.flip(1)
+    values, vectors = _subspace(band, span)
     noise = values[span // 2 :].clamp_min(float(values[0]) * 1e-13).median()
-    subspace = vectors[:, : min(int((values > _ABOVE_NOISE * noise).sum()), span // 2)]
+    order = min(int((values > _ABOVE_NOISE * noise).sum()), span // 2)
+    return _rotation(vectors[:, :order])
+
+
+def _subspace(
+    band: Complex[Tensor, "contacts times"], span: int
+) -> tuple[Float64[Tensor, " span"], Complex128[Tensor, "span span"]]:
+    """Return eigenvalues and eigenvectors of the signals' correlation, greatest first."""
+    values, vectors = torch.linalg.eigh(_correlation(band.to(torch.complex128), span))
+    return values.flip(0), vectors.flip(1)
+
+
+def _rotation(subspace: Complex128[Tensor, "span order"]) -> Complex128[Tensor, " poles"]:
+    """Return the eigenvalues of the rotation that takes a signal subspace's upper rows to its lower ones."""
     # By normal equations, for the upper rows of orthonormal columns are all but orthonormal: torch's complex lstsq
     # rounds otherwise from call to call, and a selection among hundreds of candidates makes that visible.
     upper, lower = subspace[:-1], subspace[1:]
