@@ -19,7 +19,7 @@ from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.photographs import read_views
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
+from avmsf.simulate.ground_truth import read_truth
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
 from avmsf.simulate.imperfections import recording_starts, stream
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER, Hammer, Imperfections, ObjectRecipe
@@ -83,16 +83,6 @@ def test_the_truth_names_the_impact_in_every_file(simulation: Simulation, tmp_pa
     assert float(late.median()) < 3.0
     # Jitter: starts differ by many samples.
     assert float(truth.starts.std()) > 5.0
-
-
-def test_a_truth_without_starts_is_of_the_first_format(simulation: Simulation, tmp_path: Path) -> None:
-    path = tmp_path / TRUTH
-    write_truth(replace(simulation.truth, starts=None), path)
-    path.write_bytes(path.read_bytes().replace(b'\\"format\\": 2', b'\\"format\\": 1'))
-    assert b'\\"format\\": 1' in path.read_bytes()
-    old = read_truth(path)
-    assert old.starts is None
-    assert torch.equal(old.gains, simulation.truth.gains)
 
 
 def test_the_truth_after_some_time_is_what_is_left_then(simulation: Simulation) -> None:

@@ -20,7 +20,7 @@ from avmsf.photographs.folder import read_views
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from avmsf.simulate.recipe import Imperfections, ObjectRecipe, named_recipe
 from avmsf.simulate.simulation import Simulation, simulate_object
-from avmsf.simulate.simulation_folder import is_written, simulate_set, write_simulation, write_textured
+from avmsf.simulate.simulation_folder import is_written, simulate_set, write_painted, write_simulation
 from avmsf.simulate.strikes import MIN_NORMAL_HEIGHT, draw_strikes, nearest_on
 from factories.looked_at import surface_of
 from factories.made_sheet import tile
@@ -223,21 +223,20 @@ def test_the_same_recipe_gives_the_same_bytes(recipe: ObjectRecipe, tmp_path: Pa
 
 def test_painted_and_pictured_meshes_are_read_back_in_their_colors(tmp_path: Path) -> None:
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.2]])
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    faces, path = torch.tensor([[0, 1, 2], [0, 2, 3]]), tmp_path / "surface.ply"
     colors = torch.tensor([[[1.0, 0, 0]] * 3, [[0, 0.2, 1.0]] * 3])
-    painted = TexturedMesh.build(corners, faces, colors=colors)
-    write_textured(painted, tmp_path)
-    back = read_textured_mesh(tmp_path / "surface.ply")
-    assert torch.equal(back.vertices[back.faces], painted.vertices[painted.faces])
-    assert torch.allclose(back.colors, painted.colors, atol=0.5 / 255)
     texture = torch.randint(0, 256, (8, 8, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    places = torch.tensor([[[0.0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]])
-    pictured = TexturedMesh.build(corners, faces, coordinates=places, textures=[texture])
-    write_textured(pictured, tmp_path)
-    back = read_textured_mesh(tmp_path / "surface.glb")
-    assert torch.equal(back.textures[0], texture)
-    assert torch.allclose(back.coordinates, pictured.coordinates)
-    assert torch.allclose(back.colors, torch.ones(2, 3, 3))
+    places = torch.tensor([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]])
+    # From the left, and from below.
+    shown = texture[[7, 7, 0, 0], [0, 7, 7, 0]] / 255.0
+    for mesh, expected in (
+        (TexturedMesh.build(corners, faces, colors=colors), colors),
+        (TexturedMesh.build(corners, faces, coordinates=places[faces], textures=[texture]), shown[faces]),
+    ):
+        write_painted(mesh, path)
+        back = read_textured_mesh(path)
+        assert torch.equal(back.vertices[back.faces], mesh.vertices[mesh.faces])
+        assert torch.allclose(back.colors, expected, atol=0.5 / 255)
 
 
 def test_a_folder_that_holds_something_else_is_left_alone(simulation: Simulation, tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 A file `truth.safetensors` holds the tensors under the names of their fields, and in its header one JSON:
 {"format": 2, "version": "0.1.0", "names": ["001.wav", ...], "recipe": {...}}
-
-Format 1 is the same without `starts`; it is read too.
 """
 
 import math
@@ -26,7 +24,7 @@ _KIND = FileKind(
     "the ground truth of a simulated object",
     "make the object with avmsf simulate",
     SimulationError,
-    formats=(1, 2),
+    formats=(2,),
 )
 _OPTIONAL = ("contacts", "starts", "shifts")
 _RENAMED = {"modes": "elastic_modes", "contacts": "impacts"}

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from PIL import Image
 
 from avmsf._utils.files import new_folder
 from avmsf.capture.folder import write_capture
@@ -29,8 +28,8 @@ def write_simulation(
     """Write a folder that `read_capture`, `read_views` and `read_truth` read, and any tool that takes captures.
 
     It holds impacts.csv, the wav files, capture.toml, truth.safetensors, and where the recipe asks for them the surface
-    in its colors (surface.ply, or surface.glb where it has textures) and transforms.json with images and masks. The
-    folder appears whole or not at all. `progress` is called with the number of pictures rendered and their total.
+    with the colors at its vertices (surface.ply) and transforms.json with images and masks. The folder appears whole or
+    not at all. `progress` is called with the number of pictures rendered and their total.
     Raises SimulationError where the folder exists and is not empty, and where it cannot be written.
     """
     folder, recipe, mesh = Path(folder), simulation.recipe, simulation.mesh
@@ -42,7 +41,7 @@ def write_simulation(
             seconds = capture.settings.seconds if capture.settings.align else None
             write_capture(replace(capture, surface=None, impacts=impacts), begun, onsets_within=seconds)
             if recipe.surface:
-                write_textured(mesh, begun)
+                write_painted(mesh, begun / "surface.ply")
             if recipe.views:
                 cameras = orbit_cameras(
                     mesh.surface, size=recipe.view_size, azimuths=recipe.views // _CIRCLES, up=AXES[recipe.up]
@@ -75,49 +74,23 @@ def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:
     return True
 
 
-def write_textured(mesh: TexturedMesh, folder: Path) -> None:
-    """Write a mesh in its colors: as `surface.ply` where they stand at its vertices, else as `surface.glb`."""
-    if all(texture.shape[:2] == (1, 1) for texture in mesh.textures):
-        _write_painted(mesh, folder / "surface.ply")
-    else:
-        _write_pictured(mesh, folder / "surface.glb")
-
-
-def _write_painted(mesh: TexturedMesh, path: Path) -> None:
+def write_painted(mesh: TexturedMesh, path: Path) -> None:
     """Write colors at vertices; where a vertex has another color in each face, every face gets corners of its own."""
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
-    pixels = np.stack([texture[0, 0].numpy() for texture in mesh.textures])[mesh.materials.numpy()]
-    corners = np.rint(mesh.colors.numpy() * pixels[:, None]).astype(np.uint8)
+    pixels = np.zeros((*faces.shape, 3))
+    for number, texture in enumerate(mesh.textures):
+        chosen, size = mesh.materials.numpy() == number, np.array(texture.shape[1::-1])
+        # Images count rows downwards, v counts up.
+        places = np.floor(mesh.coordinates.numpy()[chosen] * (1, -1) * size).astype(np.int64)
+        column, row = np.moveaxis(places % size, -1, 0)
+        pixels[chosen] = texture.numpy()[row, column]
+    corners = np.rint(mesh.colors.numpy() * pixels).astype(np.uint8)
     colors = np.zeros((len(vertices), 3), dtype=np.uint8)
     colors[faces.ravel()] = corners.reshape(-1, 3)
     if not np.array_equal(colors[faces], corners):
         vertices, colors = vertices[faces].reshape(-1, 3), corners.reshape(-1, 3)
         faces = np.arange(len(vertices)).reshape(-1, 3)
-    _export([trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)], path)
-
-
-def _write_pictured(mesh: TexturedMesh, path: Path) -> None:
-    """Write one part for each texture, tinted by the mean of the colors that its faces have besides."""
-    parts = []
-    for number, texture in enumerate(mesh.textures):
-        chosen = np.flatnonzero(mesh.materials.numpy() == number)
-        if not len(chosen):
-            continue
-        corners = mesh.vertices.numpy()[mesh.faces.numpy()[chosen]].reshape(-1, 3)
-        tint = np.rint(255.0 * mesh.colors.numpy()[chosen].mean(axis=(0, 1))).astype(np.uint8)
-        material = trimesh.visual.material.PBRMaterial(  # type: ignore[no-untyped-call]
-            baseColorTexture=Image.fromarray(texture.numpy()), baseColorFactor=[*tint.tolist(), 255]
-        )
-        places = mesh.coordinates.numpy()[chosen].reshape(-1, 2)
-        visual = trimesh.visual.TextureVisuals(uv=places, material=material)  # type: ignore[no-untyped-call]
-        faces = np.arange(len(corners)).reshape(-1, 3)
-        parts.append(trimesh.Trimesh(corners, faces, visual=visual, process=False))
-    _export(parts, path)
-
-
-def _export(parts: list[trimesh.Trimesh], path: Path) -> None:
-    shape = parts[0] if len(parts) == 1 else trimesh.Scene(parts)
-    shape.export(path, file_type=path.suffix[1:])
+    trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False).export(path, file_type="ply")
 
 
 def simulate_set(
