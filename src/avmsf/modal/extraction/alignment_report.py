@@ -6,7 +6,6 @@ from avmsf._utils.text import listed
 from avmsf.capture import Impacts
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.recorder_faults import (
-    gain_changes,
     inverted_recordings,
     noise_drop,
     rate_factors,
@@ -34,8 +33,6 @@ class AlignmentReport:
     """By how much a slice sounds fall more than vibrations do; None where they do not."""
     noise_drop_db: float | None
     """By how much noise is louder before the impacts than after; None where it is not."""
-    gain_changes_db: dict[str, float]
-    """Recordings of another gain, and by how much it is higher."""
 
     @classmethod
     def of(cls, modes: Extraction, impacts: Impacts) -> "AlignmentReport | None":
@@ -46,14 +43,13 @@ class AlignmentReport:
         left = [name for name, likely in zip(found.names, found.agreement.tolist(), strict=True) if likely < 0.5]
         delays = dict(zip(found.names, found.delays.tolist(), strict=True))
         aligned, inverted = modes.aligned(impacts), list(inverted_recordings(modes, impacts))
-        faults = rate_factors(modes, aligned), uneven_decay(modes, aligned)
-        levels = noise_drop(modes, impacts), gain_changes(impacts)
-        return cls(found.coherence_before, found.coherence_after, delays, left, inverted, *faults, *levels)
+        faults = rate_factors(modes, aligned), uneven_decay(modes, aligned), noise_drop(modes, impacts)
+        return cls(found.coherence_before, found.coherence_after, delays, left, inverted, *faults)
 
     @property
     def doubtful(self) -> set[str]:
         """The recordings that something is wrong with."""
-        return {*self.not_aligned, *self.inverted, *self.rate_factors, *self.gain_changes_db}
+        return {*self.not_aligned, *self.inverted, *self.rate_factors}
 
     def sentences(self) -> list[str]:
         """Return the faults of recordings, and how coherent the modes' phases are."""
@@ -74,11 +70,6 @@ class AlignmentReport:
             "sample rate that its file gives; convert it from that rate, or remove its row"
             for name, factor in self.rate_factors.items()
         ]
-        found += [
-            f"{name}: its noise and its sound are both about {abs(change):.0f} dB {'above' if change > 0 else 'below'} "
-            "the others': another gain or scale; export it as the others, record it again, or remove its row"
-            for name, change in self.gain_changes_db.items()
-        ]
         if self.uneven_decay_db is not None:
             found.append(
                 f"the sounds fall by {self.uneven_decay_db:.0f} dB more, within a twelfth of their length, than "
@@ -97,16 +88,15 @@ class AlignmentReport:
                 "response channel"
             )
             return found
-        if self.not_aligned:
-            found.append(
-                f"not aligned: {listed(self.not_aligned, most=_SHOWN)}; the phases of their modes agree with those of "
-                "no other recording"
-            )
-        if self.inverted:
-            found.append(
-                f"inverted polarity: {listed(self.inverted, most=_SHOWN)} have the opposite sign of the recordings "
-                "near them; check the cable and the file, or the direction in impacts.csv"
-            )
+        for names, words, remedy in (
+            (self.not_aligned, "not aligned: {}", "the phases of their modes agree with those of no other recording"),
+            (
+                self.inverted,
+                "inverted polarity: {} have the opposite sign of the recordings near them",
+                "check the cable and the file, or the direction in impacts.csv",
+            ),
+        ):
+            found += [f"{words.format(listed(names, most=_SHOWN))}; {remedy}"] if names else []
         return found
 
     @property

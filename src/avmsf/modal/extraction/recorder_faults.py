@@ -25,9 +25,7 @@ _SLICES = 12
 _SURROGATES = 8
 """Sounds of the same modes and other noise that each recording is compared with."""
 _MIN_RECORDINGS = 6
-"""Recordings below which the spread of their noise, or of the correlations of their gains, is not known."""
-_NAMED = 0.0228
-"""Probability that a recording of the same gain is named: that of two standard errors of a normal distribution."""
+"""Recordings below which the spread of the correlations of their gains is not known."""
 _FALSE_ALARM = 1e-3
 """Probability that a capture without the fault is said to have it."""
 _LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -102,36 +100,6 @@ def noise_drop(modes: Extraction, impacts: Impacts) -> float | None:
     after = left[:, part : _SLICES // 2 * part].mean(1)
     silent = torch.minimum(before, after) <= 1e-14 * sounds.square().amax(1)
     return None if bool(silent.any()) else _surely_positive(10 * torch.log10(before / after))
-
-
-def gain_changes(impacts: Impacts) -> dict[str, float]:
-    """Return by how many dB the gain of a recording is higher than the others', where its noise and its sound are.
-
-    An impact may be soft, and a room quiet; a gain changes both. The noise before the onset has to differ from that of
-    the other recordings by more than chance (Student's predictive distribution, Bonferroni's correction) and by more
-    than two standard deviations of their levels, less being what impacts do; and the sound has to be nearer to theirs
-    without that difference. `impacts` are not yet aligned.
-    """
-    count = len(impacts)
-    if count < _MIN_RECORDINGS or impacts.before is None:
-        return {}
-    before = impacts.before[:, : impacts.before.shape[1] * 3 // 4].double().square().mean(1)
-    sound = impacts.sounds.double().square().mean(1)
-    if not bool((before > 1e-14 * sound.max()).all()):
-        return {}
-    (noise, noise_std), (level, level_std) = (_from_others(10 * torch.log10(each)) for each in (before, sound))
-    chance = 2 * count * torch.from_numpy(stdtr(count - 2, -(noise.abs() / noise_std).numpy()))
-    named = (chance < _NAMED) & (noise.abs() > 2 * level_std) & ((level - noise).abs() < level.abs())
-    return {impacts.names[row]: float(noise[row]) for row in torch.nonzero(named).flatten().tolist()}
-
-
-def _from_others(
-    values: Float64[Tensor, " contacts"],
-) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"]]:
-    """Return each value's difference from the mean of the others, and the standard deviation that it should have."""
-    count = len(values)
-    rest = values.expand(count, count)[~torch.eye(count, dtype=torch.bool)].reshape(count, count - 1)
-    return values - rest.mean(1), (rest.std(1) * math.sqrt(1 + 1 / (count - 1))).clamp_min(1e-9)
 
 
 def _surely_positive(values: Float64[Tensor, " contacts"]) -> float | None:
