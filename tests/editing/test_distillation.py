@@ -8,9 +8,9 @@ import torch
 
 from avmsf.editing.config import DistillationConfig
 from avmsf.editing.distillation import DecoderDistillation, noised, partial_denoising
-from avmsf.errors import AvmsfWarning, EditError
+from avmsf.errors import EditError
 from avmsf.modal.clips import levelled
-from factories.raising import raises, warns
+from factories.raising import raises
 from factories.ringing_field import RATE, ringing_field, sound_of
 
 HOP = 8
@@ -31,7 +31,6 @@ class Known:
     channels: int = 2
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     dtype: torch.dtype = torch.float32
-    batches: list[int] = field(default_factory=list)
     asked: list = field(default_factory=list)
 
     def describe(self):
@@ -40,7 +39,6 @@ class Known:
     def encode(self, waveforms):
         if len(waveforms) > self.room:
             raise torch.OutOfMemoryError("CUDA out of memory")
-        self.batches.append(len(waveforms))
         assert waveforms.shape[1] == 2
         mono = waveforms.mean(1)
         return torch.nn.functional.pad(mono, (0, -mono.shape[1] % HOP)).reshape(len(mono), -1, HOP).mT
@@ -48,8 +46,8 @@ class Known:
     def decode(self, latents, *, samples):
         return latents.mT.flatten(1)[:, None, :samples].expand(-1, 2, -1)
 
-    def embed(self, prompt, negative, *, seconds):
-        self.asked.append((prompt, negative, seconds))
+    def embed(self, prompt, *, seconds):
+        self.asked.append((prompt, seconds))
         return prompt
 
     def denoised(self, latents, level, conditioning, *, guidance):
@@ -114,22 +112,9 @@ def test_another_rate_is_resampled_there_and_back():
     model.scale = 1e4  # Which takes everything for signal.
     targets = guide(model, lowest=0.001, highest=0.001).targets(sounds, 0, seeded())
     assert targets.shape == sounds.shape
-    assert model.asked[0][2] == pytest.approx(0.5, abs=1e-4)
+    assert model.asked[0][1] == pytest.approx(0.5, abs=1e-4)
     # A noise of a thousandth of a quarter turn beside a sound whose peak is .5, and the filters' edge.
     assert float((targets - sounds).square().mean().sqrt() / sounds.square().mean().sqrt()) < 0.05
-
-
-def test_out_of_memory_halves_the_batch():
-    sounds = torch.cat([sound_of(ringing_field(pitch=1 + 0.1 * row)) for row in range(8)])
-    whole, tight = guide(Gaussian()).targets(sounds, 0, seeded()), Gaussian(room=3)
-    small = guide(tight, batch=8)
-    with warns(AvmsfWarning, name="batch") as caught:
-        found = small.targets(sounds, 0, seeded())
-    assert [each.message.value for each in caught] == [4, 2]
-    assert torch.equal(found, whole)
-    # It stays so, without another word.
-    small.targets(sounds, 1, seeded())
-    assert tight.batches == [2] * 8
 
 
 @pytest.mark.parametrize(

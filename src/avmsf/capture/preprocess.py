@@ -34,7 +34,6 @@ class _Tolerances:
     """By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes
     up to .3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz)."""
     usual_range_db: float = 80.0  # from the median: near nodes of most modes it is 40, of a soft impact 30
-    usual_gap_db: float = 12.0  # of the loudest to the next, of six or more: at most 7 in 24 captures
     range_db: float = 140.0  # of the loudest to the faintest: float32, in which they are fitted, rounds at 144
     equal_peaks: int = 4  # recordings that were scaled to one peak, since struck ones differ by decibels
     same_peak_db: float = 0.05
@@ -184,17 +183,12 @@ def check_levels(sounds: dict[str, tuple[bytes, float]]) -> list[CaptureWarning]
         return []
     names, peaks = list(sounds), [peak for _, peak in sounds.values()]
     levels = 20 * np.log10(peaks)
-    away, extent, order = levels - np.median(levels), float(np.ptp(levels)), np.argsort(levels, kind="stable")
-    row, advice = int(np.abs(away).argmax()), "check its gain, its scale and its force"
+    away, extent = levels - np.median(levels), float(np.ptp(levels))
+    row, most = int(np.abs(away).argmax()), _TOLERANCES.range_db
     found = f"{away[row]:+.0f} dB from that of most recordings ({np.median(peaks):.3g})"
-    wanted = f"at most {_TOLERANCES.usual_range_db:g} dB"
-    if extent > _TOLERANCES.range_db:
-        wanted, advice = (
-            f"at most {_TOLERANCES.range_db:g} dB",
-            "export it at the scale of the others, or remove its row",
-        )
-        got = f"{extent:.0f}; its peak, {peaks[row]:.3g}, is {found}"
-        wanted = f"{wanted} between the loudest and the faintest"
+    if extent > most:
+        wanted = f"at most {most:g} dB between the loudest and the faintest"
+        got, advice = f"{extent:.0f}; its peak, {peaks[row]:.3g}, is {found}", "export it at the scale of the others"
         raise CaptureError.expected(wanted, peaks[row], got=got, file=names[row], name="peak", advice=advice)
     if len(levels) >= _TOLERANCES.equal_peaks and extent < _TOLERANCES.same_peak_db:
         message = (
@@ -202,10 +196,8 @@ def check_levels(sounds: dict[str, tuple[bytes, float]]) -> list[CaptureWarning]
             "each scaled to one peak, which loses how strong the modes are at each contact; export them unscaled"
         )
         return [CaptureWarning(message, file=names[0], name="peak", value=peaks[0])]
-    if len(levels) >= 6 and (gap := levels[order[-1]] - levels[order[-2]]) > _TOLERANCES.usual_gap_db:
-        row, wanted = int(order[-1]), f"at most {_TOLERANCES.usual_gap_db:g} dB"
-        found = f"{gap:.0f} dB above that of the next loudest recording"
-    elif abs(away[row]) <= _TOLERANCES.usual_range_db:
+    if abs(away[row]) <= _TOLERANCES.usual_range_db:
         return []
+    wanted, advice = f"at most {_TOLERANCES.usual_range_db:g} dB", "check its gain, its scale and its force"
     message = f"{names[row]}: its peak, {peaks[row]:.3g}, is {found}; expected {wanted}; {advice}"
     return [CaptureWarning(message, file=names[row], name="peak", value=peaks[row])]

@@ -240,8 +240,6 @@ def _prompted(prompt: str, options: Options, sample_rate: float) -> Any:
         # Seconds of a sound that is generated from a prompt only.
         seconds = 3.0 if settings.model_seconds is None else settings.model_seconds
         seed = options.all_settings.guide.seed
-        made = model.generate(prompt, seconds=seconds, seed=seed, negative=settings.negative)
+        made = model.generate(prompt, seconds=seconds, seed=seed)
         write_sound(settings.generated, made, sample_rate=model.sample_rate)
-    return DecoderDistillation(
-        model, prompt, sample_rate=sample_rate, negative=settings.negative, config=settings.distillation
-    )
+    return DecoderDistillation(model, prompt, sample_rate=sample_rate, config=settings.distillation)

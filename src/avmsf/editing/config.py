@@ -65,7 +65,7 @@ class DistillationConfig:
     highest: float = 0.875
     """Highest initial noise level, below 1."""
     batch: int = 10
-    """Sounds in one batch of the model; halved when memory runs out."""
+    """Sounds in one batch of the model."""
 
     def __post_init__(self) -> None:
         """Raise `EditError` for values out of range."""
@@ -108,8 +108,6 @@ class MaterialSettings:
 class PromptSettings:
     """Targets from a text-to-audio model."""
 
-    negative: str | None = None
-    """Text that describes what to move away from."""
     model_seconds: float | None = None
     """Length that the model works at; by default all that it was trained for, and time grows in proportion."""
     device: str | None = None

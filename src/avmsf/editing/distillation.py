@@ -7,7 +7,6 @@ the model: the decoded result is a target like a recording.
 """
 
 import math
-import warnings
 from typing import Any
 
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 from avmsf.editing.config import DistillationConfig, check_prompt
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.stable_audio import Latents, StableAudio
-from avmsf.errors import AvmsfWarning, EditError
+from avmsf.errors import EditError
 from avmsf.modal.clips import Sounds, levelled, resampled, with_length
 
 
@@ -55,24 +54,17 @@ class DecoderDistillation:
         prompt: str,
         *,
         sample_rate: float,
-        negative: str | None = None,
         config: DistillationConfig | None = None,
     ) -> None:
-        """Set a prompt for sounds of `sample_rate` Hz, that of the field, and a negative prompt.
-
-        Raises `EditError` for an empty prompt.
-        """
-        self.model, self.prompt, self.negative = model, check_prompt(prompt), negative
-        self.sample_rate = sample_rate
+        """Set a prompt for sounds of `sample_rate` Hz, that of the field. Raises `EditError` for an empty prompt."""
+        self.model, self.prompt, self.sample_rate = model, check_prompt(prompt), sample_rate
         self.config = DistillationConfig() if config is None else config
-        self.batch = self.config.batch
         self._conditioning: tuple[int, Any] | None = None
 
     def describe(self) -> dict[str, Any]:
         """Return its identifying settings, as plain values."""
         return {
             "prompt": self.prompt,
-            "negative": self.negative,
             "model": self.model.name,
             **self.model.describe(),
             "guidance": self.config.guidance,
@@ -87,8 +79,7 @@ class DecoderDistillation:
     def targets(self, sounds: Sounds, step: int, generator: torch.Generator) -> Sounds:
         """Return the model's denoised versions of rendered sounds, at their level; failed rows are not finite.
 
-        A batch that does not fit into the GPU's memory is halved, with a warning, for all later steps too. Raises
-        `EditError` where one sound does not fit, and for sounds too long for the model.
+        Raises `EditError` where a batch does not fit into the memory, and for sounds too long for the model.
         """
         with torch.no_grad():
             clips = resampled(sounds, sample_rate=self.sample_rate, wanted=self.model.sample_rate)
@@ -96,20 +87,16 @@ class DecoderDistillation:
             level = lowest + (highest - lowest) * torch.rand(len(sounds), generator=generator)
             # One seed a sound, so that the noise depends neither on the batch nor on the device.
             seeds = torch.randint(1 << 62, (len(sounds),), generator=generator).tolist()
-            made: list[Tensor] = []
-            while len(made) < len(sounds):
-                rows = slice(len(made), len(made) + self.batch)
-                try:
-                    made += self._cleaned(clips[rows], level[rows], seeds[rows]).unbind()
-                    continue
-                except torch.OutOfMemoryError as error:
-                    if self.batch == 1:
-                        wanted = f"memory on {self.model.device} for one sound of {self.model.name}"
-                        advice = "use fewer seconds, free memory, or choose the device cpu"
-                        raise EditError.expected(wanted, 1, got="too little", name="batch", advice=advice) from error
-                # Not before the error is gone: its traceback holds the tensors that filled the memory.
-                self._halve()
-            back = resampled(torch.stack(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
+            size, made = self.config.batch, list[Tensor]()
+            try:
+                for begin in range(0, len(sounds), size):
+                    rows = slice(begin, begin + size)
+                    made.append(self._cleaned(clips[rows], level[rows], seeds[rows]))
+            except torch.OutOfMemoryError as error:
+                wanted = f"memory on {self.model.device} for {size} sounds of {self.model.name} at once"
+                advice = "lower distillation.batch, use fewer seconds, or choose the device cpu"
+                raise EditError.expected(wanted, size, got="too little", name="batch", advice=advice) from error
+            back = resampled(torch.cat(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
             return levelled(with_length(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
 
     def _cleaned(
@@ -117,7 +104,7 @@ class DecoderDistillation:
     ) -> Float[Tensor, "batch samples"]:
         model, samples = self.model, clips.shape[1]
         if self._conditioning is None or self._conditioning[0] != samples:
-            words = model.embed(self.prompt, self.negative, seconds=samples / model.sample_rate)
+            words = model.embed(self.prompt, seconds=samples / model.sample_rate)
             self._conditioning = (samples, words)
         # The model was trained on audio at full scale: the peak becomes .5.
         peak = clips.abs().amax(dim=1, keepdim=True).clamp_min(torch.finfo(clips.dtype).tiny)
@@ -134,10 +121,3 @@ class DecoderDistillation:
             guidance=self.config.guidance,
         )
         return model.decode(clean, samples=samples).mean(dim=1).float().cpu()
-
-    def _halve(self) -> None:
-        self.batch //= 2
-        if self.model.device.type == "cuda":
-            torch.cuda.empty_cache()
-        message = f"{self.model.name}: out of memory on {self.model.device}; continuing with batches of {self.batch}"
-        warnings.warn(AvmsfWarning(message, name="batch", value=self.batch), stacklevel=3)

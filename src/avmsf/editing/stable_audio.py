@@ -34,7 +34,7 @@ Waveforms = Float[Tensor, "contacts channels samples"]
 
 @dataclass(frozen=True, eq=False)
 class Conditioning:
-    """What the denoiser is conditioned on, without the words (or with the negative ones) and with them."""
+    """What the denoiser is conditioned on, without the words and with them."""
 
     text: Float[Tensor, "2 words dim"]
     """Embedded words and times, for cross-attention."""
@@ -147,17 +147,16 @@ class StableAudio:
             decoded: Tensor = self.pipeline.vae.decode(latents[:, :, :frames].float()).sample
         return decoded[:, :, :samples]
 
-    def embed(self, prompt: str, negative: str | None, *, seconds: float) -> Conditioning:
+    def embed(self, prompt: str, *, seconds: float) -> Conditioning:
         """Return the embedding of a prompt, for a sound that starts at 0 and lasts `seconds`."""
         pipeline, device = self.pipeline, self.device
         with torch.no_grad():
-            words = pipeline.encode_prompt(prompt, device, negative is not None, negative)
+            words = pipeline.encode_prompt(prompt, device, False, None)
             times = pipeline.encode_duration(0.0, seconds, device, False, 1)
-            parts = [torch.cat([each, *times], dim=1) for each in words.split(1)]
-        # Without negative words the denoiser has no condition, the times of the cross-attention included.
-        without, conditional = parts if negative is not None else (torch.zeros_like(parts[0]), parts[0])
+            conditional = torch.cat([words, *times], dim=1)
         both = torch.cat(times, dim=2)
-        return Conditioning(torch.cat([without, conditional]), torch.cat([both, both]))
+        # Without words the denoiser has no condition, the times of the cross-attention included.
+        return Conditioning(torch.cat([torch.zeros_like(conditional), conditional]), torch.cat([both, both]))
 
     def denoised(
         self, latents: Latents, level: Float[Tensor, " contacts"], conditioning: Conditioning, *, guidance: float
@@ -197,7 +196,6 @@ class StableAudio:
         *,
         seconds: float,
         seed: Seed = None,
-        negative: str | None = None,
         steps: int = 100,
         guidance: float = 7.0,
     ) -> Float[Tensor, " samples"]:
@@ -217,7 +215,6 @@ class StableAudio:
                 latents = self.pipeline(
                     words,
                     audio_end_in_s=seconds,
-                    negative_prompt=negative,
                     num_inference_steps=steps,
                     guidance_scale=guidance,
                     generator=generator_of(seed),

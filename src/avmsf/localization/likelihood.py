@@ -22,9 +22,7 @@ import torch
 from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf.errors import LocationError
-from avmsf.localization.preprocess import location_errors
 from avmsf.modal.cosine_distance import delayed_back
 
 RELATIVE_ERRORS = (0.8, 0.15, 0.03)
@@ -82,23 +80,6 @@ class Force:
     """Relative to the force at which the field's rendered sounds are as loud as the recording."""
     spread_db: float = 3.0
     """Standard deviation, dB."""
-
-    @classmethod
-    def of(cls, given: "Force | float | int | ArrayLike") -> "Force":
-        """Return the prior of a force that is given as a number, or as an array of one; a prior as it is.
-
-        Raises LocationError for other values.
-        """
-        if isinstance(given, Force):
-            return given
-        with location_errors():
-            values = as_floats(given, "force")
-        if values.numel() != 1:
-            shape = list(values.shape)
-            raise LocationError.expected(
-                "one peak force", shape, got=f"an array {shape}", name="force", advice="locate each recording by itself"
-            )
-        return cls(values.item())
 
     def __post_init__(self) -> None:
         for name, value in (("expected", self.expected), ("spread_db", self.spread_db)):

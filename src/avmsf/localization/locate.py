@@ -12,7 +12,6 @@ from jaxtyping import Float64
 from scipy.fft import irfft, next_fast_len, rfft
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike
 from avmsf._utils.progress import ProgressDisplay
 from avmsf._utils.text import counted
 from avmsf.capture.audio import check_not_silent
@@ -43,9 +42,7 @@ def locate(
     *,
     sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
-    points: ArrayLike | None = None,
-    directions: ArrayLike | None = None,
-    force: Force | float | int | ArrayLike | None = None,
+    force: Force | float | int | None = None,
     locator: Locator | None = None,
     progress: bool = True,
 ) -> ContactPosterior:
@@ -58,10 +55,8 @@ def locate(
         recording: Path of a sound file, a Recording, or the samples of one channel.
         sample_rate: Of bare samples, Hz; by default the field's.
         settings: Take the place of those of the capture that the field was fitted to (see `preprocess_recording`).
-        points: Candidates [points, 3] on the surface, meters, as for `Locator.of`; by default the field's.
-        directions: Unit vectors [points, 3] of impacts at the candidates; by default straight into the surface.
         force: Peak force of the impact, a number or `Force`, see `Locator.locate`.
-        locator: One made of the field before, with points of its own.
+        locator: One made of the field before, perhaps with points of its own; by default over the field's.
         progress: Whether a terminal shows that it works.
 
     Returns:
@@ -69,19 +64,15 @@ def locate(
             a `refusal` in place of a position, see `assess_match`.
 
     Raises:
-        LocationError: As `preprocess_recording` and `Locator.locate`, and for a locator of another field or given with
-            points.
+        LocationError: As `preprocess_recording` and `Locator.locate`, and for a locator of another field.
     """
-    if locator is not None and (locator.field is not field or points is not None or directions is not None):
-        what = "points or directions" if locator.field is field else "another field"
-        wanted = "one of this field, without points and directions"
-        raise LocationError.expected(wanted, what, got=f"one with {what}", name="locator", advice="leave it out")
+    if locator is not None and locator.field is not field:
+        got, advice = "one of another field", "leave it out"
+        raise LocationError.expected("one of this field", "another field", got=got, name="locator", advice=advice)
     with ProgressDisplay(shown=progress) as display:
         display.doing("locating the impact; the first of a field takes seconds to minutes")
         impact = preprocess_recording(recording, field, sample_rate=sample_rate, settings=settings)
-        if locator is None and points is None and directions is None:
-            locator = _locator_of(field)
-        finder = Locator.of(field, points=points, directions=directions) if locator is None else locator
+        finder = _locator_of(field) if locator is None else locator
         found = finder.locate(impact.sound, highest=impact.highest, force=force)
     return assess_match(replace(found, notes=(*impact.notes, *found.notes)))
 
@@ -142,7 +133,7 @@ def locate_impacts(
     *,
     sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
-    force: Force | float | int | ArrayLike | None = None,
+    force: Force | float | int | None = None,
     locator: Locator | None = None,
 ) -> list[tuple[float, ContactPosterior]]:
     """Return the onset of each impact in a recording, seconds, and its map, in order.

@@ -91,7 +91,7 @@ class Locator:
         sound: Float[Tensor, " samples"],
         *,
         highest: float | None = None,
-        force: Force | float | int | ArrayLike | None = None,
+        force: Force | float | int | None = None,
     ) -> ContactPosterior:
         """Return the posterior of the contact for a sound that starts at its onset, at the field's rate.
 
@@ -107,7 +107,7 @@ class Locator:
         Raises LocationError for sounds that are too short, silent or not finite, and where the modes explain no more
         than they would of noise.
         """
-        known = None if force is None else Force.of(force)
+        known = force if force is None or isinstance(force, Force) else Force(float(force))
         used = sound.detach().cpu()[: self.field.samples]
         check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)

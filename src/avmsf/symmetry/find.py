@@ -16,21 +16,16 @@ from avmsf.symmetry.motions import Vector
 from avmsf.symmetry.search import find_group
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 
-LIMIT = 8000
-"""Most points of a cloud that are used."""
+MAX_POINTS = 8000
+"""Points of a cloud that are used, at most."""
 _MIN_POINTS = 10 * NEIGHBORS
 
 
-def find_symmetries(
-    points: Float[Tensor, "points 3"],
-    *,
-    seed: Seed = None,
-    limit: int = LIMIT,
-) -> Symmetries:
+def find_symmetries(points: Float[Tensor, "points 3"], *, seed: Seed = None) -> Symmetries:
     """Return the rotations and mirror planes that carry a cloud of an object's surface onto itself.
 
-    The cloud may be noisy, cover the object unevenly, and lie in any pose. At most `limit` points are used, drawn so
-    that dense parts lose most. What is returned is one point group, the largest that holds: candidates come from the
+    The cloud may be noisy, cover the object unevenly, and lie in any pose. At most `MAX_POINTS` points are used, drawn
+    so that dense parts lose most. What is returned is one point group, the largest that holds: candidates come from the
     principal axes and from pairs of points with similar surfaces around them, and those that hold generate groups.
 
     **The error.** Each quarter of the points is moved onto the surface that the others sample. The error is the root
@@ -48,12 +43,10 @@ def find_symmetries(
     listed; of a ball, two of its axes are. Raises SceneError for points that are too few (240), not finite, or on one
     line.
     """
-    if limit < _MIN_POINTS:
-        raise SceneError.expected(f"at least {_MIN_POINTS} points", limit, name="limit")
     random = np.random.default_rng(int(torch.randint(2**31 - 1, (1,), generator=generator_of(seed))))
     places, middle, diagonal = _normalized(points)
-    if len(places) > limit:
-        places = places[draw_by_area(local_planes(places), limit, random, max_ratio=9.0)]
+    if len(places) > MAX_POINTS:
+        places = places[draw_by_area(local_planes(places), MAX_POINTS, random, max_ratio=9.0)]
     test = SymmetryTest(places, random)
     group, rejected = None, [math.inf]
     if test.tolerance > 0.0:

@@ -87,7 +87,7 @@ class Symmetries:
         return bool(self.rotations or self.mirrors)
 
     def summary(self) -> str:
-        """Return sentences on the symmetries found, their errors, and how clear these are."""
+        """Return sentences on the symmetries found and their errors."""
         found: list[RotationalSymmetry | MirrorSymmetry] = [*self.rotations, *self.mirrors]
         measure = f"in point spacings of {1000 * self.spacing:.2g} mm; accepted up to {self.tolerance:.2f}"
         nearest = f"the best rejected candidate has an error of {self.rejected:.2f}"
@@ -97,14 +97,8 @@ class Symmetries:
             return "no symmetry found: the points are too few or too noisy to tell one, or fill a volume"
         if not found:
             return f"no symmetry found: {nearest} ({measure})"
-        lines = [f"{each}: error {each.error:.2f}, {self._confidence(each.error)}" for each in found]
+        lines = [f"{each}: error {each.error:.2f}" for each in found]
         return "\n".join([*lines, f"errors are {measure}; {nearest}"])
-
-    def _confidence(self, error: float) -> str:
-        if error > 0.7 * self.tolerance:
-            return "close to the limit"
-        clear = self.rejected > 2 * max(error, 0.5 * self.tolerance)
-        return "sure" if clear else "likely, but other candidates come close"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, lists and strings, as JSON holds them; `from_dict` reads them back to the last bit."""

@@ -129,31 +129,26 @@ def extract_sounds(
 
 def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ExtractionError:
     """Return the error for sounds without modes: `name` is the property at fault, `value` how large it is."""
-    samples = sounds.shape[1]
-    duration = samples / sample_rate
+    samples, count = sounds.shape[1], len(sounds)
+    duration, lowest = samples / sample_rate, lowest_frequency(samples, sample_rate)
+    more = "use more seconds after the onset"
     if samples < SHORTEST:
-        got, advice = f"{samples} ({duration:.3g} s)", "use more seconds after the onset"
-        return ExtractionError.expected(f"{SHORTEST} samples or more", samples, got=got, name="samples", advice=advice)
-    moving = sounds.to(torch.float64) - sounds.mean(1, keepdim=True)
-    tenth = samples // 10
+        got = f"{samples} ({duration:.3g} s)"
+        return ExtractionError.expected(f"{SHORTEST} samples or more", samples, got=got, name="samples", advice=more)
+    moving, tenth = sounds.to(torch.float64) - sounds.mean(1, keepdim=True), samples // 10
     head, tail = (float(part.square().mean()) for part in (moving[:, :tenth], moving[:, -tenth:]))
-    if head + tail == 0:
-        got = f"silence in all {len(sounds)} recordings"
-        return ExtractionError.expected("sound", 0.0, got=got, name="sounds", advice="check the channel")
-    lowest = lowest_frequency(samples, sample_rate)
-    band = f"{lowest:.0f} to {sample_rate / 2:.0f} Hz"
-    wanted = f"modes from {band} in {len(sounds)} recordings of {duration:.3g} s"
     fall = 10 * math.log10(max(head, 1e-30) / max(tail, 1e-30))
-    if fall < 6:
-        advice = "check the onset and the noise (avmsf check), or record louder impacts"
-        got = f"noise or hum that decays by {fall:.0f} dB"
-        return ExtractionError.expected(wanted, fall, got=got, name="decay", advice=advice)
     power = torch.fft.rfft(moving).abs().square().sum(0)
     below = float(power[: math.ceil(lowest * duration)].sum() / power.sum())
-    if below > 0.5:
-        advice = "use more seconds after the onset, which lowers this limit"
-        got = f"{100 * below:.0f} % of the energy below {lowest:.0f} Hz"
-        return ExtractionError.expected(wanted, below, got=got, name="energy", advice=advice)
+    wanted = f"modes from {lowest:.0f} to {sample_rate / 2:.0f} Hz in {count} recordings of {duration:.3g} s"
+    loud = "check the onset and the noise (avmsf check), or record louder impacts"
+    for fault, value, got, name, advice in (
+        (head + tail == 0, 0.0, f"silence in all {count} recordings", "sounds", "check the channel"),
+        (fall < 6, fall, f"noise or hum that decays by {fall:.0f} dB", "decay", loud),
+        (below > 0.5, below, f"{100 * below:.0f} % of the energy below {lowest:.0f} Hz", "energy", more),
+    ):
+        if fault:
+            return ExtractionError.expected(wanted, value, got=got, name=name, advice=advice)
     advice = "record at a higher rate, closer, or a less damped object"
     return ExtractionError.expected(wanted, 0, got="none above the noise", name="modes", advice=advice)
 
