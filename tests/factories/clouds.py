@@ -1,5 +1,7 @@
 """Random Gaussians, and recordings of made-up objects."""
 
+from functools import partial
+
 import torch
 
 from avmsf.capture.impacts import Impacts
@@ -12,10 +14,7 @@ SECONDS = 0.5
 def random_cloud(points: torch.Tensor | int, *, degree: int = 0, seed: int = 0) -> GaussianCloud:
     """Return Gaussians at given points, or so many at random ones, with shapes, opacities and colors of chance."""
     generator = torch.Generator().manual_seed(seed)
-
-    def draw(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
+    draw = partial(torch.randn, generator=generator)
     centers = draw(points, 3) if isinstance(points, int) else points
     count = len(centers)
     return GaussianCloud(centers, draw(count, 4), draw(count, 3), draw(count), draw(count, (degree + 1) ** 2, 3))

@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,7 @@ def table(
 def struck_table(*, shared: bool, modes: int = 40, points: int = 6, seconds: float = 3.0) -> SampledField:
     """Return contacts on a ball whose many modes ring between some milliseconds and all of the time."""
     generator = torch.Generator().manual_seed(0)
-
-    def drawn(*size: int) -> torch.Tensor:
-        return torch.rand(*size, dtype=torch.float64, generator=generator)
-
+    drawn = partial(torch.rand, dtype=torch.float64, generator=generator)
     frequency = (60.0 * (0.45 * STRUCK_RATE / 60.0) ** drawn(modes)).sort().values
     damping = 0.5 * 400.0 ** drawn(modes)
     if not shared:

@@ -1,6 +1,7 @@
 import math
 import sys
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,10 +25,7 @@ BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 def cloud_of(count: int = 250, *, degree: int = 1, seed: int = 0) -> GaussianCloud:
     """Gaussians with axes of 1 to 30 mm in a ball of about 0.1 m; a third of them opaque, some beyond the camera."""
     generator = torch.Generator().manual_seed(seed)
-
-    def draw(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
+    draw = partial(torch.randn, generator=generator)
     centers = 0.1 * draw(count, 3)
     centers[::9] *= 4
     opacities = 2 * draw(count)

@@ -1,5 +1,7 @@
 """Gains of a body whose modes are known, at contacts with the errors of a careful hand."""
 
+from functools import partial
+
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -17,10 +19,7 @@ from avmsf.modal.residual_noise import Residual
 def known_gains(true: ElasticModes) -> tuple[GainData, Float64[Tensor, "others 3"], Float64[Tensor, "others 3"]]:
     """Return gains at 12 contacts with errors of place, direction and force, and 200 other contacts with directions."""
     generator = torch.Generator().manual_seed(0)
-
-    def drawn(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+    drawn = partial(torch.randn, generator=generator, dtype=torch.float64)
     points = true.nodes[torch.randperm(len(true.nodes), generator=generator)[:212]]
     ways = -true.normals(points)
     known, others = points[:12], points[12:]
