@@ -32,6 +32,7 @@ from avmsf.errors import (
 from avmsf.evaluation import score
 from avmsf.field import FitConfig, SoundField
 from avmsf.pipeline import PipelineConfig
+from factories.delayed_plate import delays, strikes
 from factories.plate_capture import fill_plate
 from factories.plate_field import RATE, plate_impacts
 from factories.raising import raises, warns
@@ -152,19 +153,8 @@ def test_a_recording_is_located_by_its_path_or_its_samples(tmp_path):
 
 
 def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
-    late = 40
-    sounds = torch.nn.functional.pad(plate_impacts().sounds, (late, late))
-    generator = torch.Generator().manual_seed(0)
-    starts = late - torch.randint(0, 3, (len(sounds),), generator=generator)
-    rows = list(zip(sounds, starts.tolist(), strict=True))
-    whole: Impacts = replace(
-        plate_impacts(),
-        sounds=torch.stack([row[start : start + 2000] for row, start in rows]),
-        before=torch.stack([row[start - 32 : start] for row, start in rows]),
-        after=torch.stack([row[start + 2000 : start + 2032] for row, start in rows]),
-    )
-    train, test = avmsf.split(avmsf.Capture("plate", whole))
-    made = avmsf.fit(train, config=PipelineConfig(modes=8), progress=False)
+    train, test = avmsf.split(avmsf.Capture("plate", strikes(12, starts=delays(12))))
+    made = avmsf.fit(train, config=PipelineConfig(modes=5), progress=False)
     assert made.alignment is not None
     made.save(tmp_path / "field.safetensors")
     read = avmsf.load(tmp_path / "field.safetensors")

@@ -37,12 +37,12 @@ def opengl_pose(camera: Camera) -> np.ndarray:
     return pose
 
 
-def write_image(path: Path, image: np.ndarray | None = None, *, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+def write_image(path: Path, image: np.ndarray | None = None) -> None:
     """Red, green, blue (and alpha); by default noise that differs from file to file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if image is None:
         seed = sum(map(ord, path.name))
-        image = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+        image = np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     if image.ndim == 3:
         image = image[..., [2, 1, 0, 3][: image.shape[2]]]
     assert cv2.imwrite(str(path), image)

@@ -274,13 +274,9 @@ def test_folders_with_distorted_images_give_pinholes(tmp_path: Path) -> None:
     names = ["a.png", "b.png", "c.png"]
     for name in names:
         write_image(tmp_path / "images" / name, image)
-    numbers = " ".join(map(repr, (*FOCAL, *CENTER, *coefficients)))
-    (tmp_path / "cameras.txt").write_text(f"1 OPENCV {WIDTH} {HEIGHT} {numbers}\n")
-    rows = [
-        f"1 {' '.join(map(repr, (*quaternion(camera), *camera.world_to_camera[:3, 3].tolist())))} 1 {name}\n\n"
-        for camera, name in zip(ring(3), names, strict=True)
-    ]
-    (tmp_path / "images.txt").write_text("".join(rows))
+    write_colmap_text(tmp_path, ring(3), names, ("OPENCV", (*FOCAL, *CENTER, *coefficients)))
+    cameras = (tmp_path / "cameras.txt").read_text()
+    (tmp_path / "cameras.txt").write_text(cameras.replace(" 40 30 ", f" {WIDTH} {HEIGHT} "))
     for longest, tolerance in ((None, 1.5), (32, 4.0)):
         view: View = read_views(tmp_path, longest=longest)[0]
         camera = view.camera
