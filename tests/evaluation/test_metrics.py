@@ -209,9 +209,8 @@ def test_every_metric_of_the_corpus_says_what_it_said():
         for name, entry in REGISTERED.items()
         if entry.function is not None
     }
-    scalings = {"cdpam.cdpam": "benchmark", "cdpam.cdpam_scaled": "authors"}
     # Six figures are kept; CDPAM is computed in float32, whose rounding goes with the processor.
-    tolerances = {"cdpam.cdpam": 1e-3, "cdpam.cdpam_scaled": 1e-4}
+    tolerances = {"cdpam.cdpam": 1e-3}
     assert len(expected) == 21
     for pair, figures in expected.items():
         name, what = pair.split()
@@ -219,9 +218,9 @@ def test_every_metric_of_the_corpus_says_what_it_said():
         predicted = truth if what == "same" else corpus_sound(f"{name}_{what}")[0]
         scores = {key: float(function(predicted, truth, sample_rate=rate)) for key, function in functions.items()}
         # CDPAM takes longer than all others together: one object will do.
-        for key, scaling in scalings.items() if cdpam is not None and name == "bowl" else ():
-            scores[key] = float(cdpam.distance(predicted, truth, sample_rate=rate, scaling=scaling))
-        assert set(figures) - set(scores) <= set(scalings)
+        if cdpam is not None and name == "bowl":
+            scores["cdpam.cdpam"] = float(cdpam.distance(predicted, truth, sample_rate=rate))
+        assert set(figures) - set(scores) <= set(tolerances)
         for key, value in scores.items():
             assert value == pytest.approx(figures[key], rel=tolerances.get(key, 1e-5), abs=1e-12), (pair, key)
 

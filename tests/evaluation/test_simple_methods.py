@@ -75,7 +75,6 @@ def test_nearest_and_means_are_those_of_a_full_search():
 def test_means_of_more_than_there_are_are_of_all_and_of_none_are_refused():
     train, test = split(plate_impacts(), 0.2)
     mean = MeanWaveform(train, count=len(train) + 1)
-    assert mean.report == {"neighbors": len(train)}
     assert torch.allclose(mean.render(test.contacts), train.sounds.mean(0).expand(len(test), -1), atol=1e-6)
     with raises(EvaluationError, name="count", value=0):
         MeanWaveform(train, count=0).render(test.contacts)
@@ -149,7 +148,6 @@ def test_a_linear_field_comes_back_exactly(directions: int, count: int) -> None:
     slopes = torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     points, elsewhere = (flattened(each, directions) for each in (scattered(count), 3.0 * scattered(30, seed=1)))
     found = spline(points, points @ slopes + 2.0)
-    assert found.report == {"kernel": "thin plate", "directions": directions, "sites": count}
     assert torch.allclose(gains_of(found, elsewhere), elsewhere @ slopes + 2.0, rtol=0, atol=1e-9)
 
 
@@ -171,9 +169,7 @@ def test_few_sites_make_a_function_that_does_not_run_away() -> None:
     far = 1e3 * (scattered(20, seed=1) - scattered(1))
     for count in (3, 4, 7):
         few = spline(scattered(count), bumps(scattered(count)))
-        assert few.report["kernel"] == "distance"
         assert float(gains_of(few, far).abs().max()) < 20.0
-    assert spline(flattened(scattered(6), 2), bumps(scattered(6))).report["kernel"] == "thin plate"
 
 
 def test_a_spline_belongs_to_the_object_and_not_to_its_frame_or_order() -> None:

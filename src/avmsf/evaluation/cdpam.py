@@ -1,12 +1,9 @@
 """CDPAM: how different two sounds are perceived, by a network trained on listeners' answers.
 
 Manocha, Jin, Zhang and Finkelstein, "CDPAM: Contrastive learning for perceptual audio similarity", ICASSP 2021; the
-network and its weights are those of their package `cdpam`, at 22,050 Hz. It is not free of level, and two scalings of
-one and the same sound are in use, whose values differ by orders of magnitude:
-
-- `benchmark`: sounds as fractions of full scale, -1 to 1. The ObjectFolder benchmark calls it so, and values near
-  1e-4, as the paper has them, come about in no other way. [inferred]
-- `authors`: samples as 16-bit integers, so the same times 32768 and rounded, as the network was trained.
+network and its weights are those of their package `cdpam`, at 22,050 Hz. It is not free of level: sounds are fractions
+of full scale, -1 to 1. The ObjectFolder benchmark calls it so, and values near 1e-4, as the paper has them, come about
+in no other way [inferred], although the network was trained on 16-bit integers.
 """
 
 import hashlib
@@ -14,7 +11,6 @@ import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Float64
@@ -25,7 +21,6 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.metrics import PerContact, validate, validate_sounds
 from avmsf.modal.clips import resampled
 
-Scaling = Literal["benchmark", "authors"]
 SAMPLE_RATE = 22050.0
 """Hz that sounds are resampled to (polyphase)."""
 _LAYERS = 16
@@ -110,16 +105,13 @@ class Cdpam:
         truth: Float[Tensor, "..."],
         *,
         sample_rate: float,
-        scaling: Scaling = "benchmark",
     ) -> PerContact:
         """Return each contact's distance; sounds are fractions of full scale. Raises as `validate` and `embed`."""
         validate(predicted, truth)
-        embeddings = [self.embed(sounds, sample_rate=sample_rate, scaling=scaling) for sounds in (predicted, truth)]
+        embeddings = [self.embed(sounds, sample_rate=sample_rate) for sounds in (predicted, truth)]
         return (embeddings[0] - embeddings[1]).abs().sum(dim=1)
 
-    def embed(
-        self, sounds: Float[Tensor, "..."], *, sample_rate: float, scaling: Scaling = "benchmark"
-    ) -> Float64[Tensor, "contacts features"]:
+    def embed(self, sounds: Float[Tensor, "..."], *, sample_rate: float) -> Float64[Tensor, "contacts features"]:
         """Return the features that the distance compares; they are cached by the sounds' samples.
 
         Sounds [contacts, samples] are fractions of full scale. Raises EvaluationError for sounds that are empty or not
@@ -128,18 +120,14 @@ class Cdpam:
         validate_sounds(sounds, sample_rate=sample_rate, wanted=SAMPLE_RATE)
         rows = []
         for sound in sounds.detach().cpu().double():
-            key = hashlib.sha256(f"{scaling} {float(sample_rate)!r} ".encode() + sound.numpy().tobytes()).hexdigest()
+            key = hashlib.sha256(f"{float(sample_rate)!r} ".encode() + sound.numpy().tobytes()).hexdigest()
             if key not in self._embeddings:
-                self._embeddings[key] = self._computed(sound, sample_rate, scaling)
+                self._embeddings[key] = self._computed(sound, sample_rate)
             rows.append(self._embeddings[key])
         return torch.stack(rows)
 
-    def _computed(
-        self, sound: Float64[Tensor, " samples"], sample_rate: float, scaling: Scaling
-    ) -> Float64[Tensor, " features"]:
+    def _computed(self, sound: Float64[Tensor, " samples"], sample_rate: float) -> Float64[Tensor, " features"]:
         scaled = resampled(sound[None], sample_rate=sample_rate, wanted=SAMPLE_RATE)[0]
-        if scaling == "authors":
-            scaled = torch.round(scaled * 32768.0)
         with torch.no_grad():
             features = self._features(scaled.float())
         if not bool(torch.isfinite(features).all()):

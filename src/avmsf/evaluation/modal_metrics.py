@@ -140,15 +140,12 @@ class ModalRenderer(Protocol):
 
 def compare_modes(
     renderer: ModalRenderer, contacts: Contacts, truth: Truth, *, directions: Contacts | None = None
-) -> dict[str, float | None]:
+) -> dict[str, float]:
     """Compare a method's modes and its gains at the contacts with the true ones, row for row.
 
     Returns means over the true modes, each weighing by its part of the energy: `found` (part of the energy whose modes
-    were found), `frequency_error` (absolute, relative to the true one) and `damping_error` (absolute, of logarithms),
-    both over the modes found and None if there are none, `gain_error` (root of the mean square; of a mode the norm over
-    contacts of the amplitudes' difference, over the true norm: 0 is perfect, 1 is silence), `mac` (the squared
-    correlation over contacts, 0 to 1), and of the method's modes that were taken for none their number `false_modes`
-    and `false_energy`, their energy at the contacts over the true energy.
+    were found), `gain_error` (root of the mean square; of a mode the norm over contacts of the amplitudes' difference,
+    over the true norm: 0 is perfect, 1 is silence) and `mac` (the squared correlation over contacts, 0 to 1).
 
     `directions` are the unit vectors of the impacts, which the true gains belong to. Raises EvaluationError where rows
     differ in number, for values that are not finite, and where the truth is silence at all contacts.
@@ -166,27 +163,17 @@ def compare_modes(
         raise EvaluationError.expected("modes with energy", 0.0, got="zero gains at all contacts", name="truth")
     weight, match = energy / total, match_modes(bank, ModalBank(truth.frequency, truth.damping))
     found = match >= 0
-    partner, part = match[found], float(weight[found].sum())
-    frequency = (bank.frequency.detach()[partner] / truth.frequency[found] - 1).abs()
-    damping = torch.log(bank.damping.detach()[partner] / truth.damping[found]).abs()
     paired = torch.zeros_like(true)
-    paired[:, found] = predicted[:, partner]
+    paired[:, found] = predicted[:, match[found]]
     cross = _free_agreement(paired.conj() * true, 1 / (4 * truth.damping))
     squares, true_squares = paired.abs().square().sum(dim=0), true.abs().square().sum(dim=0)
     # A mode that is silent at all contacts weighs nothing; any figure will do.
     tiny = torch.finfo(torch.float64).tiny
     errors = (squares + true_squares - 2 * cross).clamp(min=0.0) / true_squares.clamp(min=tiny)
-    false = torch.ones(len(bank), dtype=torch.bool)
-    false[partner] = False
-    false_energy = (predicted.abs().square().sum(dim=0) / (4 * bank.damping.detach()))[false].sum()
     return {
-        "found": part,
-        "frequency_error": float((weight[found] * frequency).sum()) / part if part > 0.0 else None,
-        "damping_error": float((weight[found] * damping).sum()) / part if part > 0.0 else None,
+        "found": float(weight[found].sum()),
         "gain_error": math.sqrt(float((weight * errors).sum())),
         "mac": float((weight * (cross.square() / (squares * true_squares).clamp(min=tiny))).sum()),
-        "false_modes": float(false.sum()),
-        "false_energy": float(false_energy / total),
     }
 
 
