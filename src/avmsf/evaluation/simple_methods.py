@@ -7,7 +7,6 @@ import zlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -53,11 +52,6 @@ class _Neighbors:
         if self.count < 1:
             raise EvaluationError.expected("1 or more training impacts", self.count, name="count")
         return min(self.count, len(self.train))
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """How many are averaged, as plain values."""
-        return {"neighbors": self.neighbors}
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,13 +217,6 @@ class SplineGains(ModalBaseline):
         kernel, degree = ("thin_plate_spline", 1) if self._bends else ("linear", 0)
         spline = RBFInterpolator(along.numpy(), means.numpy(), kernel=kernel, degree=degree)
         return torch.from_numpy(np.asarray(spline(asked.numpy()))).to(self.amplitudes)
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """What the spline is, as plain values: its kernel, directions and distinct positions."""
-        directions = self._axes.along(self._positions[0]).shape[1]
-        kernel = "thin plate" if self._bends else "distance"
-        return {"kernel": kernel, "directions": directions, "sites": len(self._positions[0])}
 
     @cached_property
     def _positions(self) -> tuple[Float64[Tensor, "positions 3"], Complex128[Tensor, "positions modes"]]:

@@ -19,10 +19,6 @@ from avmsf.studio.responses import RequestError, bad_request
 
 SUFFIX = ".safetensors"
 _NAME = re.compile(r"\w[\w .()+-]{0,99}(?<![. ])")
-_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
-"""Names that are no files on Windows, where a capture may be opened next."""
-_MAX_NAME_BYTES = 200
-"""Files' names have 255 at most, of which the ending and what a half-written file is called need some."""
 _MAX_UNDONE = 100
 """Maximum number of undo steps."""
 
@@ -158,9 +154,6 @@ def _write_new(field: SoundField, path: Path) -> None:
 def file_name(name: str) -> str:
     """Return the file of a name that the user gave. Raises RequestError (400) for a name with a path."""
     stem = name.strip().removesuffix(SUFFIX)
-    if not _NAME.fullmatch(stem) or _DEVICES.fullmatch(stem):
+    if not _NAME.fullmatch(stem):
         raise bad_request("name", "letters, digits, spaces, - and _, such as bowl in wood", name)
-    size = len(stem.encode())
-    if size > _MAX_NAME_BYTES:
-        raise bad_request("name", f"at most {_MAX_NAME_BYTES} bytes", size, advice="choose a shorter one")
     return f"{stem}{SUFFIX}"

@@ -7,7 +7,6 @@ is by AdamW with a warm-up, then a linear decay.
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -89,7 +88,6 @@ class TunedRenderer:
     samples: int
     generate: Callable[[Float[Tensor, "1 3"], int], Float[Tensor, " samples"]]
     """Makes the sound of a place in the cube by so many Euler steps, always from the same noise."""
-    report: Mapping[str, Any]
     steps: int = STEPS
 
     @torch.no_grad()
@@ -113,15 +111,9 @@ def tune(
     generate: Callable[[Float[Tensor, "1 3"], int], Float[Tensor, " samples"]],
 ) -> TunedRenderer:
     """Train a network's parameters in place on an object's recordings, and return the renderer of its sounds."""
-    losses = train(parameters, loss, len(impacts), config, seed=seed)
+    train(parameters, loss, len(impacts), config, seed=seed)
     network.eval()
-    part = max(1, len(losses) // 10)
-    report = {
-        "first_loss": round(sum(losses[:part]) / part, 4),
-        "last_loss": round(sum(losses[-part:]) / part, 4),
-        "steps": len(losses),
-    }
-    return TunedRenderer(seen, impacts.sample_rate, impacts.sounds.shape[1], generate, report)
+    return TunedRenderer(seen, impacts.sample_rate, impacts.sounds.shape[1], generate)
 
 
 def expect_sound(loudest: float, impacts: Impacts) -> None:
