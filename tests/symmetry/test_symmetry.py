@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 from avmsf.errors import SceneError
 from avmsf.mesh.surface import read_surface
 from avmsf.symmetry.alignment import TOLERANCE, SymmetryTest
-from avmsf.symmetry.find import find_symmetries
+from avmsf.symmetry.find import find_group, find_symmetries
 from avmsf.symmetry.motions import Motions, reflections, rotations
 from avmsf.symmetry.point_group import generate
-from avmsf.symmetry.search import find_group
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.looked_at import mesh_of
 from factories.raising import raises

@@ -104,10 +104,7 @@ class Recording:
         return sound - constant_offset(sound, sample_rate=self.sample_rate)
 
     def _agree(self, reference: int, other: int) -> bool:
-        """Return whether a channel is the reference times a constant, up to rounding, dither or 1 % of itself.
-
-        What is left of it then lies 40 dB down. Two microphones, or a sample's delay, leave far more.
-        """
+        """Return whether a channel is the reference times a constant, up to rounding, dither or 1 % of itself."""
         first, second = (self.channels[number - 1] for number in (reference, other))
         first, second = first - first.mean(), second - second.mean()
         power = float(first @ first)

@@ -227,10 +227,7 @@ def _find_mismatch(
     placement: Placement,
     resolution: float,
 ) -> FrameMismatch | None:
-    """Return the similarity of the least description length; None where that changes nothing.
-
-    Below the `resolution`, meters, contacts lie equally well.
-    """
+    """Return the similarity of the least description length; None where that changes nothing."""
     widest, tolerance = max(2 * resolution, float(placement.distances.max())), placement.tolerance
     steps = math.ceil(math.log(widest / resolution, 1.5)) + 1
     deviations = np.geomspace(resolution, widest, steps)[:, None]

@@ -9,7 +9,6 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from avmsf.capture.measure import HIGHEST_NOISE_DB, decibels, noise_level
 from avmsf.capture.onset import SECONDS_BEFORE, find_onset, find_pulse
 from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import prepare, remove_rumble
-from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of, unit_named
+from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.table import Impact, Row, parse_rows, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh.surface import surface_points
@@ -69,15 +68,12 @@ class Proposal:
         return f"{self.key} = {json.dumps(self.value)}"
 
 
-def propose_settings(
-    folder: str | Path, settings: CaptureSettings | None = None, *, factor: float | None = None
-) -> tuple[Proposal, ...]:
+def propose_settings(folder: str | Path, settings: CaptureSettings | None = None) -> tuple[Proposal, ...]:
     """Return the settings other than the present ones that would help to read a folder, with the reasons.
 
     `settings`, where given, take the place of the folder's `capture.toml`. A key that the file holds, or that differs
-    from its default, was chosen and is left alone. `factor`, where given, is the one that the contacts have to be
-    multiplied by to lie on the object in its photographs: it decides the unit where there is no surface. Recordings
-    that cannot be read are passed over; raises nothing for bad input.
+    from its default, was chosen and is left alone. Recordings that cannot be read are passed over; raises nothing for
+    bad input.
     """
     folder, found = Path(folder), list[Proposal]()
     try:
@@ -88,7 +84,7 @@ def propose_settings(
         return ()
     chosen |= {key for key, value in vars(settings).items() if value != vars(CaptureSettings())[key]}
     for keys, propose in (
-        ({"unit", "surface_unit"}, partial(_units, factor=factor)),
+        ({"unit", "surface_unit"}, _units),
         ({"force_channel", "response_channel"}, _channels),
         ({"highpass"}, _highpass),
     ):
@@ -123,14 +119,11 @@ def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tenso
     return torch.tensor(contacts, dtype=torch.float64).reshape(-1, 3)
 
 
-def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings, *, factor: float | None) -> list[Proposal]:
+def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
     """Return the units in which contacts lie on the object, where the present ones cannot be meant."""
     contacts, surface = contacts_of(rows, settings), None
     with suppress(CaptureError):
         surface = find_surface(folder, settings)
-        if surface is None and factor is not None and (unit := unit_named(factor * settings.meters)):
-            reason = "The contacts then lie on the object in the photographs; in the present unit most are outside it."
-            return [Proposal("unit", unit, reason)]
     if surface is None or not len(contacts):
         return []
     placement = check_placement(contacts, surface_points(surface))
@@ -195,11 +188,7 @@ def _push_and_level(channel: Float64[np.ndarray, " frames"], rate: float) -> tup
 
 
 def _highpass(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
-    """Return the lowest cutoff that removes most of the noise and nothing of the object's.
-
-    Or the lowest where most of what follows the impacts lies below it, as of a sensor that settles. Recordings that
-    cannot be prepared are passed over; those of different rates, which are refused as a capture, show nothing.
-    """
+    """Return the lowest cutoff that removes most of the noise and nothing of the object's."""
     lowest, rates, durations, noise, low = _TOLERANCES.cutoffs_hz[0], set(), [], [], []
     for impact, recording in _recordings(folder, rows, settings):
         with suppress(CaptureError):

@@ -164,10 +164,7 @@ class CaptureSettings:
 
 
 def _typed(key: str, value: Any, known: Mapping[str, Any]) -> Any:
-    """Return the value as its key's type; whole numbers serve as numbers, and `true` as neither.
-
-    The `value` of the error of an unknown key is the most similar known one, if any.
-    """
+    """Return the value as its key's type; whole numbers serve as numbers, and `true` as neither."""
     if key not in known:
         similar = next(iter(get_close_matches(key, known, n=1)), None)
         advice = "" if similar is None else f"did you mean {similar}?"

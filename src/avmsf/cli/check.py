@@ -84,8 +84,6 @@ def run(options: Options) -> int:
     if proposals and options.write_settings:
         path = write_settings(options.capture, proposals)
         show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
-        if any(each.key == "unit" for each in proposals):
-            outside = [each for each in outside if each.name != "unit"]
     report, impacts = check_and_read(options.capture)
     doing("finding the modes that align the recordings")
     modes = None if impacts is None else _modes(impacts)

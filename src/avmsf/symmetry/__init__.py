@@ -11,9 +11,9 @@ characters by which mode shapes are even or odd.
 2. `alignment`: the error of motions, by cross-validation, and the iterative closest point method (point to plane,
    Geman-McClure weights) that moves one motion or a whole group to its least error.
 3. `point_group`: the group that a few motions generate: the closed subgroups of O(3).
-4. `search`: orders of axes by their evidence, and the largest group that holds.
+4. `find`: orders of axes by their evidence, and the largest group that holds.
 
-Start reading with `search.find_group`; `motions.Motions` are what all of these pass on.
+Start reading with `find.find_group`; `motions.Motions` are what all of these pass on.
 """
 
 import lazy_loader

@@ -13,7 +13,7 @@ In go `Impacts`; out comes an `Extraction`: a `ModalBank`, each recording's comp
 3. `least_squares.fit_gains`: the complex gains of these modes in each recording, whichever method found them; at poles
    of each recording's own where frequencies shift between recordings (`frequency_shifts`).
 
-`quality` judges how well the recordings support each mode; `recorder_faults` finds what is wrong with recordings. Start
+`quality` judges how well the recordings support each mode, `alignment_report` what is wrong with recordings. Start
 reading at `extract.extract_modes`.
 
 A new method is a subclass of `finders.ModeFinder`, its entry in `extract.FINDERS` and its name in

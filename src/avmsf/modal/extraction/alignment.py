@@ -228,11 +228,7 @@ def _weighted_median(values: Float64[Tensor, " contacts"], weights: Float64[Tens
 def _common_onset(
     impacts: Impacts, delays: Float64[Tensor, " contacts"], agreement: Float64[Tensor, " contacts"]
 ) -> float:
-    """Return how much later than their common start aligned recordings leave the noise, all together, samples.
-
-    That is where their mean power, between samples too, first reaches a hundredth of its maximum and ten times the
-    noise before.
-    """
+    """Return how much later than their common start aligned recordings leave the noise, all together, samples."""
     assert impacts.before is not None
     assert impacts.after is not None
     lead = impacts.before.shape[1]
@@ -313,10 +309,7 @@ def _climb(
     vague: float = _USUAL_RECORDINGS,
     known: Sequence[_Fit] = (),
 ) -> _Fit:
-    """Return the delays of a highest posterior, climbed from all recordings aligned with one, or as they are.
-
-    One of `known` as soon as no delay is farther from it than a step of the grid: the climb would end there as well.
-    """
+    """Return the delays of a highest posterior, climbed from all recordings aligned with one, or as they are."""
     spread = torch.full_like(measured.power, FIRST_SPREAD)
     weights = measured.concentration(spread)
     delays = torch.zeros(len(measured), dtype=torch.float64)

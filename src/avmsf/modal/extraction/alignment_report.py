@@ -1,16 +1,24 @@
-"""How a capture's recordings were aligned with one another, as sentences and as plain values."""
+"""How a capture's recordings were aligned, and what modes show of recorders and editors.
 
-from dataclasses import dataclass
+Faults are inverted polarity, other sample rates, fades, gates and automatic gain.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+
+import torch
+from jaxtyping import Float64
+from scipy.special import stdtr
+from torch import Tensor
 
 from avmsf._utils.text import listed
-from avmsf.capture import Impacts
+from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.extract import Extraction
-from avmsf.modal.extraction.recorder_faults import (
-    inverted_recordings,
-    noise_drop,
-    rate_factors,
-    uneven_decay,
-)
+from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import ModalBank, common_phase
+from avmsf.modal.synthesis import synthesize
 
 _SHOWN = 8
 """Recordings that a sentence names."""
@@ -103,3 +111,181 @@ class AlignmentReport:
     def _moved(self) -> list[float]:
         """The delays of the recordings that are aligned, samples."""
         return [delay for name, delay in self.delays.items() if name not in self.not_aligned]
+
+
+_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000, 88200, 96000, 176400, 192000)
+"""Sample rates of recorders and files."""
+_OTHERS_SHARE = 0.01
+"""Least part of the others' energy that a mode of theirs has, mean over them."""
+_SLICES = 12
+"""Of each sound, in which levels are compared."""
+_SURROGATES = 8
+"""Sounds of the same modes and other noise that each recording is compared with."""
+_MIN_RECORDINGS = 6
+"""Recordings below which the spread of the correlations of their gains is not known."""
+_FALSE_ALARM = 1e-3
+"""Probability that a capture without the fault is said to have it."""
+_LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""Length scales over the diagonal of the contacts' bounding box."""
+_NOISES = (0.01, 0.03, 0.1, 0.3, 1.0)
+"""Variances of what neighbors do not predict, over the kernel's."""
+_MIN_CORRELATION = 0.5
+"""Median correlation below which neighbors explain less than a quarter of the gains' energy, and nothing is judged."""
+_NORMAL = 1.4826
+"""Standard deviation of normal numbers over the median distance from their median."""
+
+
+def rate_factors(modes: Extraction, impacts: Impacts) -> dict[str, float]:
+    """Return by how much all modes of a recording are higher than the others', for each in which they are.
+
+    `modes` are those of all the aligned `impacts`. A recording is one of them where the modes of the others explain
+    less than half of its energy, and explain half of it or more with all frequencies and dampings times the ratio of
+    two usual sample rates, the best of these: its file gives another rate than it was recorded at.
+    """
+    power = torch.view_as_real(modes.gains).double().square().sum(-1) / modes.bank.damping
+    power = power / power.sum(1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    ratios = sorted({one / other for one, other in product(_RATES_HZ, _RATES_HZ)} - {1.0})
+    found = {}
+    for row, name in enumerate(impacts.names):
+        theirs = (power.sum(0) - power[row]) / max(1, len(power) - 1) >= _OTHERS_SHARE
+        bank = modes.bank.take(theirs)
+        explained = partial(_explained, impacts.sounds[row : row + 1].double(), bank, impacts.sample_rate)
+        if len(bank) == 0 or explained(1.0) >= 0.5:
+            continue
+        best = max(ratios, key=explained)
+        if explained(best) >= 0.5:
+            found[name] = best
+    # Where most are named, the modes found are none of the object's.
+    return found if 2 * len(found) < len(impacts) else {}
+
+
+def uneven_decay(modes: Extraction, impacts: Impacts) -> float | None:
+    """Return by how many dB a slice sounds fall more than decaying modes with noise do; None where they do not.
+
+    The energy of damped modes and stationary noise falls ever slower, apart from beats and the noise's chance. So for
+    each recording the largest growth of the fall between slices is compared with that of its own modes with noise of
+    its residual's spectrum in random phases (surrogate data: Theiler et al., Physica D 58, 1992): Student's test over
+    recordings. A fade-out or a noise gate makes sounds fall faster, which no object does. `modes` are those of all the
+    aligned `impacts`.
+    """
+    size = impacts.sounds.shape[1] // _SLICES
+    sounds = impacts.sounds[:, : _SLICES * size].double()
+    modal = _modal(sounds, modes.bank, impacts.sample_rate)
+    half = (sounds - modal)[:, -(_SLICES // 2) * size :]
+    spectrum, generator = torch.fft.rfft(half).abs(), torch.Generator().manual_seed(0)
+    usual = torch.zeros(len(sounds), dtype=torch.float64)
+    for _ in range(_SURROGATES):
+        phase = 2 * math.pi * torch.rand(spectrum.shape, generator=generator, dtype=torch.float64)
+        noise = torch.fft.irfft(torch.polar(spectrum, phase), half.shape[1]).repeat(1, 2)
+        usual += _fall_growth(modal + noise) / _SURROGATES
+    return _surely_positive(_fall_growth(sounds) - usual)
+
+
+def noise_drop(modes: Extraction, impacts: Impacts) -> float | None:
+    """Return by how many dB noise is louder before the impacts than what modes leave after them; None where it is not.
+
+    What modes leave is the noise, and more where they do not explain all. It is less where an automatic gain turns
+    itself down at the impact. Compared are the first half of what is kept before the onset and the second to sixth
+    twelfth of the sounds: Student's test over recordings. `impacts` are not yet aligned.
+    """
+    if impacts.before is None or not bool(torch.isfinite(impacts.before[:, : impacts.before.shape[1] // 2]).all()):
+        return None
+    before = impacts.before[:, : impacts.before.shape[1] // 2].double().square().mean(1)
+    sounds = modes.aligned(impacts).sounds.double()
+    left = (sounds - _modal(sounds, modes.bank, impacts.sample_rate)).square()
+    part = left.shape[1] // _SLICES
+    after = left[:, part : _SLICES // 2 * part].mean(1)
+    silent = torch.minimum(before, after) <= 1e-14 * sounds.square().amax(1)
+    return None if bool(silent.any()) else _surely_positive(10 * torch.log10(before / after))
+
+
+def _surely_positive(values: Float64[Tensor, " contacts"]) -> float | None:
+    """Return the mean over recordings where it is above zero by more than chance, else None."""
+    mean, error = float(values.mean()), float(values.std()) / math.sqrt(len(values))
+    return mean if stdtr(len(values) - 1, -mean / max(error, 1e-9)) < _FALSE_ALARM else None
+
+
+def _explained(
+    sounds: Float64[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float, factor: float
+) -> float:
+    """Return the part of the energy that modes explain with frequencies and dampings times a factor."""
+    kept = factor * bank.frequency < sample_rate / 2
+    scaled = ModalBank(factor * bank.frequency[kept], factor * bank.damping[kept])
+    return 1.0 - float((sounds - _modal(sounds, scaled, sample_rate)).square().sum() / sounds.square().sum())
+
+
+def _fall_growth(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, " contacts"]:
+    """Return by how many dB a slice each sound falls at most more than before."""
+    power = sounds.reshape(len(sounds), _SLICES, -1).square().mean(2)
+    # Digital silence is taken for a rounding error of single precision.
+    level = 10 * torch.log10(power.clamp_min(1e-14 * power.amax(1, keepdim=True)))
+    fall = -level.diff(dim=1)
+    return (fall - fall.cummin(1).values).amax(1)
+
+
+def _modal(
+    sounds: Float64[Tensor, "contacts samples"], bank: ModalBank, sample_rate: float
+) -> Float64[Tensor, "contacts samples"]:
+    """Return what modes explain of sounds, by least squares."""
+    gains = fit_gains(sounds, bank, sample_rate=sample_rate)
+    return synthesize(gains, bank.frequency, bank.damping, samples=sounds.shape[1], sample_rate=sample_rate)
+
+
+def inverted_recordings(modes: Extraction, impacts: Impacts) -> tuple[str, ...]:
+    """Return the names of recordings whose sign is the opposite of the others'; `modes` are those of `impacts`.
+
+    Phases are aligned modulo pi, so they do not show it. What does is the gains over the object: near contacts, struck
+    in the same direction, have gains of the same sign. Each mode's gains along its phase are predicted at every contact
+    from all others by a Gaussian process whose length scale and noise have the greatest likelihood over all modes. The
+    correlation of predicted and measured gains over modes is about c for most recordings, and about -c for an inverted
+    one.
+
+    Empty where contacts lie so far apart that neighbors do not determine a gain's sign. Recordings that could not be
+    aligned are not judged.
+    """
+    if modes.alignment is not None and len(left := torch.nonzero(modes.alignment.agreement < 0.5)):
+        rows = [row for row in range(len(impacts)) if row not in left]
+        impacts = impacts.take(rows)
+        modes = replace(modes.take(rows), alignment=None)
+    signs, found = torch.ones(len(impacts), 1, dtype=torch.float64), list[int]()
+    while len(impacts) >= _MIN_RECORDINGS and len(found) < len(impacts) // 3:
+        # One at a time: an inverted recording spoils what is predicted at its neighbors.
+        turned = replace(modes, gains=modes.gains * signs)
+        correlation = _predicted(turned, impacts)
+        usual, worst = float(correlation.median()), int(correlation.argmin())
+        deviation = max(_NORMAL * float((correlation - usual).abs().median()), 1 / math.sqrt(len(modes.bank)))
+        # The log odds of a correlation about -c to one about c, of so many recordings.
+        odds = -2 * usual * float(correlation[worst]) / deviation**2
+        if usual < _MIN_CORRELATION or odds < math.log(len(impacts) / _FALSE_ALARM) or worst in found:
+            break
+        found.append(worst)
+        signs[worst] = -1.0
+    return tuple(impacts.names[row] for row in sorted(found))
+
+
+def _predicted(modes: Extraction, impacts: Impacts) -> Float64[Tensor, " contacts"]:
+    """Return the correlation, over modes, of each recording's gains with those predicted from all others."""
+    phase = common_phase(modes.gains)
+    gains = modes.gains.to(torch.complex128)
+    along = gains.real * phase.cos() + gains.imag * phase.sin()
+    energy = (gains.real.square() + gains.imag.square()) / modes.bank.damping
+    # Every recording counts alike, however loud, and every mode by its energy.
+    along = along / modes.bank.damping.sqrt() / energy.sum(1, keepdim=True).sqrt().clamp_min(1e-300)
+    contacts = impacts.contacts.double()
+    distance = torch.cdist(contacts, contacts) / (contacts.amax(0) - contacts.amin(0)).norm().clamp_min(1e-300)
+    facing = torch.ones_like(distance)
+    if impacts.directions is not None:
+        facing = impacts.directions.double() @ impacts.directions.double().T
+    best, chosen, share = -math.inf, along, along.square().sum(0) / along.square().sum()
+    for length, noise in product(_LENGTHS, _NOISES):
+        kernel = facing * torch.exp(-0.5 * (distance / length).square())
+        whole = kernel + noise * torch.eye(len(kernel), dtype=torch.float64)
+        inverse = torch.linalg.inv(whole)
+        solved = inverse @ along
+        scale = (along * solved).sum(0).clamp_min(1e-300)
+        # Each mode's own variance is integrated out.
+        likelihood = -0.5 * len(along) * (scale.log() * share).sum() - 0.5 * torch.logdet(whole)
+        if float(likelihood) > best:
+            best, chosen = float(likelihood), along - solved / torch.diagonal(inverse)[:, None]
+    sizes = (along.norm(dim=1) * chosen.norm(dim=1)).clamp_min(1e-300)
+    return (along * chosen).sum(1) / sizes

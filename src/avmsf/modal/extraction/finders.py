@@ -97,10 +97,7 @@ class HighResolution(ModeFinder):
         return find_shifts(sounds, bank, sample_rate=sample_rate, significance=self.significance * chance)
 
     def _select(self, selection: Selection, found: ModalBank, lowest: float) -> ModalBank:
-        """Return those of `found` that the sounds need, refined.
-
-        The strong ones first, refined until little of them is left over: their remains would pass for weak modes.
-        """
+        """Return those of `found` that the sounds need, refined."""
         weighed, bank, rate = selection.candidates(found), _EMPTY, selection.sample_rate
         rounds = [*torch.arange(20.0, self.range_db, 20.0).tolist(), self.range_db, self.range_db]
         for turn, range_db in enumerate(rounds, 1):

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
-from avmsf.modal.extraction.extract import Extraction, extract_modes
-from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.extraction.recorder_faults import (
+from avmsf.modal.extraction.alignment_report import (
     inverted_recordings,
     noise_drop,
     rate_factors,
     uneven_decay,
 )
+from avmsf.modal.extraction.extract import Extraction, extract_modes
+from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.delayed_plate import cut
