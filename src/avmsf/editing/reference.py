@@ -186,10 +186,7 @@ class Reference:
 
 
 def _read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
-    """Return a recorded impact from its onset to the next, float32 at `sample_rate` Hz, of its strongest channel.
-
-    Warns and raises `EditError` as `Reference.read`.
-    """
+    """Return a recorded impact from its onset to the next, float32 at `sample_rate` Hz, of its strongest channel."""
     try:
         recording = read_recording(path)
         strongest = int(np.argmax(np.var(recording.channels, axis=1)))

@@ -107,10 +107,7 @@ def project(
 def _project(
     sounds: Float64[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], weighted: bool
 ) -> tuple[Complex128[Tensor, "contacts modes"], Complex128[Tensor, "contacts modes"]]:
-    """Return the sums over n of sound z^n and, if `weighted`, of n sound z^n (zero if not).
-
-    By blocks, as in `synthesize`: z^(mK + k) = z^(mK) z^k.
-    """
+    """Return the sums over n of sound z^n and, if `weighted`, of n sound z^n (zero if not)."""
     within = _powers(poles, _BLOCK)
     tables = [within.real, within.imag]
     if weighted:

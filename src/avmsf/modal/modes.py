@@ -111,9 +111,6 @@ class ForcePulse:
 
 
 def _impulse_until(time: Float64[np.ndarray, " times"], exponent: float) -> Float64[np.ndarray, " times"]:
-    """Return the integral of sin(pi t)^exponent from 0 to each time, over that from 0 to 1.
-
-    With s = sin^2 it is an incomplete beta function, rising to the middle and mirrored about it.
-    """
+    """Return the integral of sin(pi t)^exponent from 0 to each time, over that from 0 to 1."""
     rising = betainc((exponent + 1) / 2, 0.5, np.sin(np.pi * time) ** 2) / 2
     return np.where(time <= 0.5, rising, 1.0 - rising)

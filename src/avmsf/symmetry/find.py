@@ -193,11 +193,7 @@ def _fitted(test: SymmetryTest, group: PointGroup | None) -> PointGroup | None:
 
 
 def _evidence_of_orders(square: Callable[[Fraction], float], test: SymmetryTest) -> dict[int, float]:
-    """Return how much better each order's turns hold than those halfway between, in parts of what is significant.
-
-    The largest order is the first. `square` gives the squared error of a part of a whole turn. Orders whose turns are
-    far from holding are left out.
-    """
+    """Return how much better each order's turns hold than those halfway between, in parts of what is significant."""
     evidence = {}
     for order in range(MAX_ORDER, 1, -1):
         # Turns by more than a half are the reverse of others.

@@ -148,10 +148,7 @@ class ShortTime(ModeFinder):
     def _lines(
         self, sounds: Float[Tensor, "contacts samples"], sample_rate: float, bins: Int[Tensor, " bins"] | None = None
     ) -> Lines:
-        """Return the lines of all bins, or of some.
-
-        No mode can be in a bin whose envelope peaks late, or falls as slowly as hum, or as fast as the window.
-        """
+        """Return the lines of all bins, or of some."""
         fft_size = self._fft_size(sample_rate)
         hop = min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
         signals = (narrow_band(sound[None], fft_size=fft_size, hop=hop, bins=bins)[0] for sound in sounds)

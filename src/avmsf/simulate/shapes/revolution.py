@@ -333,10 +333,7 @@ def dish(random: np.random.Generator, wall: float | None) -> Draft:
 
 
 def _crown(turned: Turned, radius: float, top: float, *, swell: float, taper: float) -> None:
-    """Grow a massive grip of about this radius from the middle of a wall up to a height, meters.
-
-    It is wider by `swell` half-way up, and narrower by `taper` at its end.
-    """
+    """Grow a massive grip of about this radius from the middle of a wall up to a height, meters."""
     patch = turned.middle_patch(max(1, int(np.argmin(np.abs(turned.radii - radius)))), lower=False)
     start = patch.places
     part = np.linspace(0.0, 1.0, 11)[1:, None]
