@@ -68,21 +68,18 @@ class Proposal:
         return f"{self.key} = {json.dumps(self.value)}"
 
 
-def propose_settings(folder: str | Path, settings: CaptureSettings | None = None) -> tuple[Proposal, ...]:
+def propose_settings(folder: str | Path) -> tuple[Proposal, ...]:
     """Return the settings other than the present ones that would help to read a folder, with the reasons.
 
-    `settings`, where given, take the place of the folder's `capture.toml`. A key that the file holds, or that differs
-    from its default, was chosen and is left alone. Recordings that cannot be read are passed over; raises nothing for
-    bad input.
+    A key that the folder's `capture.toml` holds was chosen and is left alone. Recordings that cannot be read are passed
+    over; raises nothing for bad input.
     """
     folder, found = Path(folder), list[Proposal]()
     try:
-        chosen = set(read_toml(folder / SETTINGS)) if settings is None and (folder / SETTINGS).is_file() else set()
-        settings = settings or settings_of(folder)
-        rows = read_rows(folder)[0]
+        chosen = set(read_toml(folder / SETTINGS)) if (folder / SETTINGS).is_file() else set()
+        settings, rows = settings_of(folder), read_rows(folder)[0]
     except (CaptureError, OSError, ValueError):
         return ()
-    chosen |= {key for key, value in vars(settings).items() if value != vars(CaptureSettings())[key]}
     for keys, propose in (
         ({"unit", "surface_unit"}, _units),
         ({"force_channel", "response_channel"}, _channels),

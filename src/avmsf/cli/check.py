@@ -79,8 +79,7 @@ def run(options: Options) -> int:
     doing(f"reading {options.capture}")
     visual = inputs(options.capture)
     outside = [] if visual is None else misplaced(options.capture, visual)
-    factor = next((each.value for each in outside if each.name == "unit"), None)
-    proposals = propose_settings(options.capture, factor=factor)
+    proposals = propose_settings(options.capture)
     if proposals and options.write_settings:
         path = write_settings(options.capture, proposals)
         show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
