@@ -160,8 +160,8 @@ def test_facets_may_cut_across_a_wall_whose_thickness_is_known():
     mesh = weld(tube(radius, wall, 0.15, sides=96, rings=16))
     unknown, known = wall_of(mesh), wall_of(mesh, wall)
     with pytest.raises(SimulationError):
-        unknown.solid(unknown.length(9_000))
-    lowest = float(elastic_modes(known.solid(known.length(9_000)), STEEL, count=1).frequency[0])
+        unknown.solids(unknown.length(9_000))
+    lowest = float(elastic_modes(known.solids(known.length(9_000))(known.thickness), STEEL, count=1).frequency[0])
     speed = math.sqrt(STEEL.young / (12 * STEEL.density * (1 - STEEL.poisson**2)))
     assert lowest == pytest.approx(6 / math.sqrt(5) * wall / radius**2 * speed / (2 * math.pi), rel=0.04)
 
@@ -171,7 +171,7 @@ def test_prisms_fill_a_wall_of_uneven_thickness():
     mesh = weld(shape.surface)
     wall = wall_of(mesh)
     assert wall.thickness == pytest.approx(shape.thickness, rel=0.1)
-    solid = wall.solid(wall.length(12_000))
+    solid = wall.solids(wall.length(12_000))(wall.thickness)
     assert solid.volume == pytest.approx(mesh.volume, rel=0.02)
     assert count_dofs(solid) == pytest.approx(12_000, rel=0.35)
 
@@ -188,7 +188,7 @@ def test_lumps_and_walls_with_handles_are_not_filled_by_prisms(kind: str):
     wall = wall_of(weld(make_shape(kind, seed=1).surface))
     if wall is not None:
         with pytest.raises(SimulationError):
-            wall.solid(wall.length(12_000))
+            wall.solids(wall.length(12_000))
 
 
 def test_a_plate_of_twelve_triangles_has_leissas_frequencies():

@@ -96,7 +96,8 @@ def filled_solid(surface: CheckedSurface, dofs: int, *, wall: float | None = Non
         with contextlib.suppress(SimulationError):
             # Degrees of freedom may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
             size, most = sides.mesh.scale, TOLERANCES.max_prism_dofs_ratio
-            return _near(lambda detail: sides.solid(detail * size), dofs, first=sides.length(dofs) / size, most=most)
+            first = sides.length(dofs) / size
+            return _near(lambda detail: sides.solids(detail * size)(sides.thickness), dofs, first=first, most=most)
     first = _filling_detail(surface, dofs)
 
     def filled(detail: float) -> Solid:

@@ -47,8 +47,6 @@ COARSE_WALL_DOFS = 22_000
 varies by 15 nats from one mesh to the next, with 22,000 by about 3 (a mug)."""
 _COMPARED = 8
 """Lowest frequencies that two meshes are compared by."""
-_FORMAT = 3
-"""Number of the way in which bodies are made; cached files of another are not read."""
 _SHAPE_THICKNESSES = 5
 """Thicknesses that are computed at first of a shape whose wall is not known."""
 _MEANS = frozenset({"timeout", "pytetwild"})
@@ -308,7 +306,7 @@ class CandidateBodies:
         surface = self._closed if closed else self._surface
         assert surface is not None
         values = {
-            "wall": thickness, "dofs": dofs, "perturbed": perturbed, "count": self._count, "format": _FORMAT,
+            "wall": thickness, "dofs": dofs, "perturbed": perturbed, "count": self._count,
             "support": None if support is None else asdict(support), "material": asdict(self._material),
             "surface": surface.digest(), "version": version("avmsf"), "source": source_digest(__name__),
         }  # fmt: skip

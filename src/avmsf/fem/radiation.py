@@ -12,10 +12,6 @@ body, no reflection from it or from a room. Monopoles alone would be simpler, bu
 together, one outward and one inward, and would cancel. The time that the sound takes from the nearest patch is left
 out: `travel_time` gives it, and it only moves the start of a recording. Delays of the others turn phases and no more:
 what has decayed for longer was louder, but it starts later too, and a sum of modes has but one start.
-
-A pulsating sphere of the same area, which is often taken for the mean over all directions (Fahy and Gardonio, *Sound
-and Structural Vibration*, 2007, chapter 3), makes the lowest modes of vessels and pans 8 to 26 dB too loud: their parts
-move against each other, and cancel.
 """
 
 import math

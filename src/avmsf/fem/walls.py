@@ -3,10 +3,8 @@
 One layer of second-order elements bends as a shell does, so that the prisms may be many times as wide as the wall is
 thick, where tetrahedra of even shape would have to be as small as the wall.
 
-Tetrahedra that fill a closed mesh without regard to its sides lock. Their outer and inner facets do not lie opposite to
-each other, so the wall's thickness varies by the distance of the facets from the curved surface, and it cannot bend
-without stretching. A free steel tube of 50 mm radius and 1.5 mm wall has its lowest mode 26 % too high with 34,000
-degrees of freedom and 2 % with 85,000, but 2 % with 31,000 in prisms. Elements with curved sides lock more: 9 % there.
+Tetrahedra that fill a closed mesh without regard to its sides lock: their outer and inner facets do not lie opposite to
+each other, so that the wall cannot bend without stretching (docs/decisions/thin-walls.md).
 """
 
 import math
@@ -170,17 +168,11 @@ class Wall:
         """Return how many layers make prisms no higher than their sides are long."""
         return max(1, math.ceil(self.thickness / length)) if length else 1
 
-    def solid(self, length: float) -> Solid:
-        """Return prisms with sides of about `length` meters along the wall.
-
-        Raises SimulationError where they do not fill the mesh.
-        """
-        return self.solids(length)(self.thickness)
-
     def solids(self, length: float) -> Callable[[float], Solid]:
-        """Return what makes such prisms of another mean thickness, meters, behind the larger side.
+        """Return what makes prisms of a mean thickness, meters, with sides of about `length` meters along the wall.
 
-        Raises SimulationError where those of the mesh's do not fill it; what it returns does where prisms fold.
+        They lie behind the larger side. Raises SimulationError where those of the wall's own thickness do not fill the
+        mesh; what it returns does where prisms fold.
         """
         coarse = remeshed(self.sheet, length)
         thickness = np.full(len(coarse.vertices), self.thickness) if self.even else self._thickness_at(coarse)
@@ -229,7 +221,7 @@ class Wall:
 def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
     """Return a closed mesh as a wall, or as a block between two opposite sides; None where it is neither.
 
-    `Wall.solid` finds out whether prisms between the sides fill it. `thickness` states that of an even wall, meters.
+    `Wall.solids` finds out whether prisms between the sides fill it. `thickness` states that of an even wall, meters.
     """
     # Sides are found over edges of two triangles each.
     if not mesh.is_watertight or mesh.volume <= 0.0:
