@@ -16,7 +16,7 @@ from avmsf.cli.options import Unit
 from avmsf.cli.output import note
 from avmsf.cli.paths import OutputError
 from avmsf.errors import PositionError
-from avmsf.field.gains.model import expect_near, off_surface, off_surface_gains
+from avmsf.field.gains.model import expect_near, off_surface
 from avmsf.field.sound_field import SoundField
 
 _Vectors = Sequence[tuple[float, float, float]]
@@ -118,8 +118,7 @@ def check_given_contacts(contacts: Contacts, field: SoundField, *, advice: str =
         )
         raise OutputError(f"{error}{advice}", **{**error.attributes, **where}) from error
     for row, distance in off_surface(contacts.places, field.gain_field):
-        where_off = f"{1e3 * distance:.3g} mm off the object's surface"
-        note(f"{contacts.label(row)} is {where_off}; {off_surface_gains(field.gain_field)}")
+        note(f"{contacts.label(row)} is {1e3 * distance:.3g} mm off the object's surface")
 
 
 def _wav_name(row: Row, *, anywhere: bool) -> str:

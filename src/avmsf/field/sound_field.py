@@ -15,7 +15,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
-from avmsf.field.gains.model import GainModel, Gains, expect_near, off_surface, off_surface_gains
+from avmsf.field.gains.model import GainModel, Gains, expect_near, off_surface
 from avmsf.field.header import SUPPORTING
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
@@ -254,11 +254,9 @@ class SoundField:
         off = off_surface(contacts, self.gain_field)
         if off:
             row, distance = max(off, key=lambda each: each[1])
-            message = (
-                f"positions, row {row}: expected positions on the object, got {len(off)} off them, this one "
-                f"by {1e3 * distance:.3g} mm; {off_surface_gains(self.gain_field)}"
-            )
-            warnings.warn(PositionWarning(message, name="positions", row=row, value=distance), stacklevel=3)
+            wanted, got = "positions on the object", f"{len(off)} off it, this one by {1e3 * distance:.3g} mm"
+            found = PositionWarning.expected(wanted, distance, got=got, name="positions", row=row)
+            warnings.warn(found, stacklevel=3)
         ways = None if directions is None else as_directions(directions, "directions", count=len(contacts))
         return contacts, ways
 

@@ -19,7 +19,7 @@ from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.data import GainData, gain_data, orientation_signs
 from avmsf.field.gains.estimator import MixtureEstimator, RefinedGains
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.gains.model import off_surface, off_surface_gains, points_on_object
+from avmsf.field.gains.model import off_surface, points_on_object
 from avmsf.field.gains.scaled import BodyGains, ScaledGains
 from avmsf.field.store import load, save
 from avmsf.mesh.points import farthest_points
@@ -196,13 +196,6 @@ def test_a_place_on_a_false_floor_is_off_the_body_by_its_height() -> None:
     ((row, distance),) = off_surface(above, closed())
     assert row == 1
     assert abs(distance - HEIGHT) < 1e-6
-
-
-def test_only_a_body_has_the_gains_of_its_nearest_point() -> None:
-    assert off_surface_gains(closed()) != off_surface_gains(positional())
-    assert off_surface_gains(ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)) == off_surface_gains(
-        closed()
-    )
 
 
 def test_points_of_the_false_floor_are_no_contacts() -> None:

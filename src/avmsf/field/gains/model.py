@@ -190,16 +190,6 @@ def off_surface(positions: Float[Tensor, "contacts 3"], gains: GainModel) -> lis
     return [(row, float(distances[row])) for row in torch.nonzero(distances > limit).flatten().tolist()]
 
 
-def off_surface_gains(gains: GainModel) -> str:
-    """Return a message on which gains a position off the object has.
-
-    Mode shapes of a body are those of its nearest surface point; kernels of the position take the position itself.
-    """
-    if gains.body is None:
-        return "the gains there are extrapolated"
-    return "its gains are about those of the nearest surface point"
-
-
 def points_on_object(gains: GainModel) -> Float32[Tensor, "points 3"]:
     """Return the points of gains that are not `off_surface`: a reconstruction may close a deep cavity of the body.
 
