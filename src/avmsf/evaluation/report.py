@@ -47,8 +47,6 @@ FIGURES = "figures"
 """Folder of the spectrograms, one file for each object, or for each object and case, and of the heat maps."""
 MAX_PAGE_CHARACTERS = 13_000_000
 """Of the page's pictures and sounds; further contacts are omitted."""
-MAX_SPACES_BYTES = 1 << 24
-"""Of the embeddings of all objects: some ten thousand."""
 MAX_PAGE_OBJECTS = 4
 """Objects with sounds on the page, evenly spaced over all."""
 _LOWEST_HZ = 60.0
@@ -206,7 +204,7 @@ def _write_edits(records: Sequence[ObjectRecord], folder: Path) -> Iterator[Path
     before = {each.case: each.report["places"] for each in outcomes if each.method == "unedited"}
     edited = [each for each in outcomes if each.case in before and each.method != "unedited"]
     pairs = dict.fromkeys((each.report["source"], each.report["target"]) for each in edited)
-    spaces = read_json(folder / SPACES, max_bytes=MAX_SPACES_BYTES) if pairs else {}
+    spaces = read_json(folder / SPACES) if pairs else {}
     for (metric, space), (source, target) in product(spaces.items(), pairs):
         moves: dict[str, list[Move]] = {}
         for each in (each for each in edited if (each.report["source"], each.report["target"]) == (source, target)):
