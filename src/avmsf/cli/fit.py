@@ -12,7 +12,7 @@ import tyro
 
 from avmsf._utils.text import format_number, listed
 from avmsf.capture.filenames import expect_views
-from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import (
     Configured,
@@ -336,6 +336,8 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
     """Make Gaussians, features or a surface of the folder's views, and print what they are."""
     from avmsf._utils.files import copy_whole, write_whole
     from avmsf.capture.checks import check_one_unit, find_surface
+    from avmsf.capture.proposals import contacts_of
+    from avmsf.capture.table import in_folder, read_rows
     from avmsf.cli.info import describe_shape
     from avmsf.mesh.surface import read_surface, write_surface
     from avmsf.pipeline.scene import CLOUD, SceneStages
@@ -347,6 +349,10 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
         folder, stages, options.all_settings.scene, settings=settings, listener=display.listener, device=options.device
     )
     scene.expect_any()
+    contacts = None
+    if options.plots is not None and (folder / TABLE).is_file():
+        with in_folder(folder):
+            contacts = contacts_of(read_rows(folder)[0], settings)
     with stages.lock("avmsf fit"):
         match options.until:
             case "gaussians":
@@ -363,6 +369,6 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
             write_whole(path, partial(write_surface, read_surface(made.path), kind=kind), raising=OutputError)
         elif options.output is not None:
             copy_whole(made.path, options.output)
-        values = describe_shape(path, options.plots)
+        values = describe_shape(path, options.plots, contacts)
     print_result(f"wrote {path}", values)
     next_command("avmsf fit", folder, words)

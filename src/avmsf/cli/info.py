@@ -160,13 +160,17 @@ def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
     return impacts.take(rows), "not training recordings" if len(rows) < len(impacts) else "none a training recording"
 
 
-def describe_shape(path: Path, plots: Path | None) -> dict[str, Any]:
+def describe_shape(
+    path: Path, plots: Path | None, contacts: "Float[Tensor, 'contacts 3'] | None" = None
+) -> dict[str, Any]:
     """Print what Gaussians, features or a surface hold, draw them in the folder `plots`, and return plain values."""
     from avmsf.gaussians.ply import holds_gaussians
     from avmsf.plotting.pictures import save_picture
 
-    describe = _features if kind_of(path) == "features" else _gaussians if holds_gaussians(path) else _surface
-    text, values, draw = describe(path)
+    if kind_of(path) == "features":
+        text, values, draw = _features(path)
+    else:
+        text, values, draw = _gaussians(path) if holds_gaussians(path) else _surface(path, contacts)
     show(text)
     if plots is not None:
         picture = plots / ("cloud.png" if values["kind"] == "gaussians" else f"{values['kind']}.png")
@@ -209,7 +213,7 @@ def _features(path: Path) -> "_Described":
     return "\n".join([title, *(features_lines(report) if "encoder" in report else [])]), values, draw
 
 
-def _surface(path: Path) -> "_Described":
+def _surface(path: Path, contacts: "Float[Tensor, 'contacts 3'] | None") -> "_Described":
     import trimesh
 
     from avmsf.mesh.surface import read_surface
@@ -221,4 +225,5 @@ def _surface(path: Path) -> "_Described":
     closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
     text = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2, {closed}"
     values = {"kind": "surface", "triangles": len(surface.faces)}
-    return f"{path.name}: {text}", values, lambda: draw_surface(surface, title=f"{path.name}: surface")
+    title = f"{path.name}: surface"
+    return f"{path.name}: {text}", values, lambda: draw_surface(surface, title=title, contacts=contacts)
