@@ -35,7 +35,8 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     clipped = clipped_samples(response)
     if settings.force_channel is not None:
         clipped += clipped_samples(recording.channel(settings.force_channel))
-    second = _second_impact(recording, prepared, response, prepared.onset, settings=settings, seconds=seconds)
+    kept = response[prepared.onset : prepared.onset + round(seconds * rate)]
+    second = _second_impact(kept, prepared.onset, recording, prepared, settings.force_channel)
     others = (each for row, each in enumerate(recording.channels, 1) if row not in (channel, settings.force_channel))
     problems = []
     if settings.response_channel is None and any(not np.array_equal(each, response) for each in others):
@@ -75,20 +76,17 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
 
 
 def _second_impact(
-    recording: Recording,
-    prepared: Prepared,
-    sound: Float64[np.ndarray, " frames"],
-    begin: int,
-    *,
-    settings: CaptureSettings,
-    seconds: float,
+    sound: Float64[np.ndarray, " frames"], begin: int, recording: Recording, prepared: Prepared, channel: int | None
 ) -> int | None:
-    """Return the sample of `sound` or of the force's channel at which the object was struck again, or None."""
-    rate = recording.sample_rate
-    if prepared.pulse is not None and settings.force_channel is not None:
-        force = recording.channel(settings.force_channel)
-        return find_second_push(force, prepared.pulse, sample_rate=rate, seconds=seconds)
-    return find_second_impact(sound, begin, sample_rate=rate, seconds=seconds)
+    """Return the sample of a file at which the object was struck again: by the force's channel, or by its sound.
+
+    Within the length of `sound`, which is that of the file from sample `begin` on.
+    """
+    rate, seconds = recording.sample_rate, len(sound) / recording.sample_rate
+    if prepared.pulse is not None and channel is not None:
+        return find_second_push(recording.channel(channel), prepared.pulse, sample_rate=rate, seconds=seconds)
+    after = find_second_impact(sound, 0, sample_rate=rate, seconds=seconds)
+    return None if after is None else begin + after
 
 
 def prepare_single(recording: Recording, settings: CaptureSettings) -> tuple[Prepared, int | None]:
@@ -96,16 +94,16 @@ def prepare_single(recording: Recording, settings: CaptureSettings) -> tuple[Pre
 
     Raises `CaptureError` as `prepare`, and for a hum or noise (`check_impulsive`).
     """
-    rate, prepared = recording.sample_rate, prepare(recording, settings)
+    prepared = prepare(recording, settings)
     # Of one channel all is used, the silence before the impact too.
     samples = recording.response() if len(recording.channels) == 1 else prepared.sound
-    check_impulsive(samples, sample_rate=rate, name=recording.name)
-    begin, seconds = prepared.onset if settings.align else 0, len(prepared.sound) / rate
-    second = _second_impact(recording, prepared, prepared.sound, 0, settings=settings, seconds=seconds)
-    if second is None:
-        return prepared, None
-    second += begin if prepared.pulse is None else 0
-    return replace(prepared, sound=prepared.sound[: max(second - begin, shortest_allowed(rate))]), second
+    check_impulsive(samples, sample_rate=recording.sample_rate, name=recording.name)
+    begin = prepared.onset if settings.align else 0
+    second = _second_impact(prepared.sound, begin, recording, prepared, settings.force_channel)
+    if second is not None:
+        length = max(second - begin, shortest_allowed(recording.sample_rate))
+        prepared = replace(prepared, sound=prepared.sound[:length])
+    return prepared, second
 
 
 def noise_level(response: Float64[np.ndarray, " frames"], onset: int, rate: float) -> float:
