@@ -267,6 +267,12 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
     assert replace(found, fit=replace(found.fit, **silent)) == paper
 
 
+def test_a_configuration_is_told_from_another_by_any_of_its_settings() -> None:
+    # The record of an evaluation tells methods apart by it.
+    first, second = (LiftConfig(longest=9, weighting="plain", symmetry=False, angles=5, seed=seed) for seed in (0, 1))
+    assert repr(first) != repr(second)
+
+
 def test_settings_out_of_range_and_another_start_of_sounds_than_the_presets_are_refused() -> None:
     for config, name in ((ViewsConfig, "count"), (LiftConfig, "reach"), (LiftConfig, "feature_size")):
         with raises(SceneError, name=name, value=-1):

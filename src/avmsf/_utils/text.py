@@ -24,22 +24,12 @@ JSON of this length takes at most about 0.5 GB as Python objects."""
 MAX_TOML_BYTES = 16 << 10
 """Largest TOML file that is read: four times all settings of a capture with a comment each. Python's reader takes time
 and memory that grow with the square of a dotted key's length: 1 s and 0.3 GB for one of this length."""
-_MAX_CHANGES = 4
-"""Settings that a configuration names."""
 _HIDDEN = [*range(0x20), 0x7F, *range(0x80, 0xA0), *range(0x202A, 0x202F), *range(0x2066, 0x206A)]
 """Control characters of terminals (C0, DEL, C1), and those that reverse the direction of what follows."""
 _ESCAPES = {code: chr(code).encode("unicode_escape").decode() for code in _HIDDEN if chr(code) not in "\n\t"}
 _Record = TypeVar("_Record")
 OTHER: Any = object()
 """Stands for a value of another type."""
-
-
-def changes_repr(config: Any) -> str:
-    """Return a configuration's name and what differs from its defaults, in one line. For use as `__repr__`."""
-    usual = type(config)()
-    pairs = ((each.name, getattr(config, each.name)) for each in fields(config))
-    changed = [f"{name}={value!r}" for name, value in pairs if value != getattr(usual, name)]
-    return f"{type(config).__name__}({listed(changed, most=_MAX_CHANGES)})"
 
 
 def printable(text: str) -> str:

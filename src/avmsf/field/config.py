@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from avmsf._utils.text import changes_repr
 from avmsf.errors import FitError
 from avmsf.modal.config import scaled_fft_size
 
@@ -41,8 +40,6 @@ class AttentionShape:
 @dataclass(frozen=True)
 class FitConfig:
     """Settings of a fit. The defaults are the quick recipe; `PAPER` holds the paper's."""
-
-    __repr__ = changes_repr
 
     clusters: int = 16
     """Regions of the object that the network attends to (paper: 128, 256 or 512)."""

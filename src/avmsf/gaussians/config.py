@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
-from avmsf._utils.text import changes_repr
 from avmsf.errors import SceneError
 
 _MINIMA = {"steps": 1, "start_points": 100, "gaussians": 100, "densify_every": 1} | dict.fromkeys(
@@ -18,8 +17,6 @@ _FRACTIONS = ("coarse_until", "degree_every", "densify_from", "densify_until", "
 @dataclass(frozen=True)
 class SplatConfig:
     """Settings of the fit of Gaussians to views. The defaults suit a short run on a CPU."""
-
-    __repr__ = changes_repr
 
     steps: int = 2000
     """Optimizer steps, one view each; all schedules scale with them."""

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal, get_args
 
-from avmsf._utils.text import changes_repr
 from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.field.config import PAPER, FitConfig, GainModelName
 from avmsf.gaussians.config import SplatConfig
@@ -30,8 +29,6 @@ CACHED_FIELD, SURFACE = "field.safetensors", "surface.ply"
 class ViewsConfig:
     """How views are made of what a folder holds."""
 
-    __repr__ = changes_repr
-
     source: Literal["best", "mesh"] = "best"
     """Source of the views: the best in the folder, photographs with cameras before a mesh, or the mesh."""
     count: int = 0
@@ -51,14 +48,12 @@ class ViewsConfig:
 
     def __post_init__(self) -> None:
         if self.count < 0:
-            raise _scene_error("count", self.count, "0 for all views, or how many to use")
+            raise SceneError.expected("0 for all views, or how many to use", self.count, name="count")
 
 
 @dataclass(frozen=True)
 class LiftConfig:
     """Settings of the features."""
-
-    __repr__ = changes_repr
 
     encoder: str = AUTO
     """What describes the images: the name of a DINOv2 model (such as facebook/dinov2-base), a folder that holds one,
@@ -96,18 +91,16 @@ class LiftConfig:
     def __post_init__(self) -> None:
         for name, least in {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100}.items():
             if getattr(self, name) < least:
-                raise _scene_error(name, getattr(self, name), f"{least} or more")
+                raise SceneError.expected(f"{least} or more", getattr(self, name), name=name)
         if not 0 <= self.reach < math.inf:
-            raise _scene_error("reach", self.reach, "a number of point spacings, or 0 for any distance")
+            raise SceneError.expected("a number of point spacings, or 0 for any distance", self.reach, name="reach")
         if not 0 < self.feature_size < math.inf:
-            raise _scene_error("feature_size", self.feature_size, "more than 0")
+            raise SceneError.expected("more than 0", self.feature_size, name="feature_size")
 
 
 @dataclass(frozen=True)
 class BodyConfig:
     """How finite-element models are made of an object's shape."""
-
-    __repr__ = changes_repr
 
     wall: float | None = None
     """Wall thickness of the object, meters; 0 for a solid body. By default several are tried, and the recordings
@@ -125,14 +118,12 @@ class BodyConfig:
         if self.wall is not None and not 0 <= self.wall < float("inf"):
             raise SimulationError.expected("meters, or 0 for a solid body", self.wall, name="wall")
         if self.shapes < 1:
-            raise SimulationError(f"shapes: expected 1 or more, got {self.shapes}", name="shapes", value=self.shapes)
+            raise SimulationError.expected("1 or more", self.shapes, name="shapes")
 
 
 @dataclass(frozen=True)
 class SceneConfig:
     """Settings of all stages up to the features."""
-
-    __repr__ = changes_repr
 
     views: ViewsConfig = field(default_factory=ViewsConfig)
     """How views are made of what the folder holds."""
@@ -150,8 +141,6 @@ class SceneConfig:
 @dataclass(frozen=True)
 class PipelineConfig:
     """Settings of all stages."""
-
-    __repr__ = changes_repr
 
     gain_model: GainModelName = "auto"
     """How gains vary over the object."""
@@ -183,10 +172,6 @@ class PipelineConfig:
             raise FitError.expected(f"None or one of {', '.join(get_args(TimeZero))}", self.time_zero, name="time_zero")
         if not isinstance(self.modes, int) or self.modes < 1:
             raise FitError.expected("a whole number of 1 or more", self.modes, name="modes")
-
-
-def _scene_error(name: str, value: float | int, expected: str) -> SceneError:
-    return SceneError(f"{name}: expected {expected}, got {value}", name=name, value=value)
 
 
 PRESETS: Mapping[Preset, PipelineConfig] = {
