@@ -269,7 +269,7 @@ class SmallWeights:
         text, tensors = read_tensors(path, _KIND)
         try:
             content = json.loads(text)
-            network = SmallSonicGauss(record_of(SmallConfig(), content["config"], "config"))
+            network = SmallSonicGauss(record_of(SmallConfig, content["config"], "config"))
             report = dict(content["report"])
         except (ValueError, TypeError, KeyError, RuntimeError) as error:
             raise _KIND.damaged(path, error, name=_KIND.key) from error

@@ -11,10 +11,9 @@ import math
 import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from types import MappingProxyType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from avmsf.errors import AvmsfError
 
@@ -131,20 +130,21 @@ class RecordError(AvmsfError, ValueError):
     """A value of a file's record is missing, unknown or of another type or size: `name` is its key."""
 
 
-def record_of(example: _Record, values: Any, name: str, *, added: Mapping[str, Any] = MappingProxyType({})) -> _Record:
-    """Return a record of settings from a dict of exactly the example's fields, each of the type that it has there.
+def record_of(
+    kind: type[_Record], values: Any, name: str, *, added: Mapping[str, Any] = MappingProxyType({})
+) -> _Record:
+    """Return a dataclass's record from a dict of exactly its fields, each of its type.
 
-    `example` is a dataclass's instance; `name` is what errors call the record; `added` are the values of fields that
-    may be missing. Raises RecordError for other fields that are missing, for fields that are unknown or of another
-    type, and for what is not a dict.
+    `name` is what errors call the record; `added` are the values of fields that may be missing. Raises RecordError for
+    other fields that are missing, for fields that are unknown or of another type, and for what is not a dict.
     """
-    examples = {each.name: getattr(example, each.name) for each in fields(example)}  # type: ignore[arg-type]
-    values = {each: value for each, value in added.items() if each in examples} | like(values, {}, name)
-    if values.keys() != examples.keys():
-        differing = sorted(values.keys() ^ examples.keys())
+    hints = get_type_hints(kind)
+    values = {each: value for each, value in added.items() if each in hints} | like(values, {}, name)
+    if values.keys() != hints.keys():
+        differing = sorted(values.keys() ^ hints.keys())
         got = f"{', '.join(differing)}, missing or unknown"
         raise RecordError.expected("its own keys", values.get(differing[0]), got=got, name=f"{name}.{differing[0]}")
-    return type(example)(**{each: like(value, examples[each], f"{name}.{each}") for each, value in values.items()})
+    return kind(**{each: typed(value, hints[each], f"{name}.{each}") for each, value in values.items()})
 
 
 def without_defaults(values: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
@@ -170,15 +170,17 @@ def as_type(value: Any, hint: Any) -> Any:
     return value if isinstance(hint, type) and type(value) is hint else OTHER
 
 
+def typed(value: Any, hint: Any, name: str) -> Any:
+    """Return a JSON value as a type. Raises RecordError where it is of another."""
+    found = as_type(value, hint)
+    if found is OTHER:
+        raise RecordError.expected(getattr(hint, "__name__", str(hint)), value, got=repr(value), name=name)
+    return found
+
+
 def like(value: Any, example: Any, name: str) -> Any:
     """Return a JSON value as the type of `example`. Raises RecordError where it is of another."""
-    if isinstance(example, tuple) and isinstance(value, list):
-        return tuple(like(each, example[0], name) for each in value)
-    if isinstance(example, float) and type(value) is int and abs(value) <= sys.float_info.max:
-        return float(value)
-    if type(value) is not type(example):
-        raise RecordError.expected(type(example).__name__, value, got=repr(value), name=name)
-    return value
+    return typed(value, type(example), name)
 
 
 def count_of(value: Any, name: str, *, least: int = 1) -> int:

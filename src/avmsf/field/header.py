@@ -6,7 +6,7 @@ from typing import Any
 from avmsf._utils.headers import FileKind
 from avmsf._utils.text import RecordError, like, record_of
 from avmsf.errors import FieldFileError
-from avmsf.fem.material import NOMINAL
+from avmsf.fem.material import Material
 
 FORMAT = 8
 """Number of this format; it grows with every change that older versions could not read. Later versions read it."""
@@ -35,7 +35,7 @@ def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
     written = like(known.get("edit"), "", f"{name}.edit")
     kind = _RENAMED_EDITS.get(written, written)
     if kind == "change_material":
-        record_of(NOMINAL, known.get("to"), f"{name}.to")
+        record_of(Material, known.get("to"), f"{name}.to")
     if kind == "adjust_modes":
         for key in ("pitch", "decay"):
             factors = known.get(key)

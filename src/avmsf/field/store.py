@@ -118,7 +118,7 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         capture=like(origin["capture"], "", "origin.capture"),
         trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
         per_newton=like(origin["per_newton"], True, "origin.per_newton"),
-        config=record_of(FitConfig(), config, "config", added=ADDED_SETTINGS),
+        config=record_of(FitConfig, config, "config", added=ADDED_SETTINGS),
         report=checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
         settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
     )

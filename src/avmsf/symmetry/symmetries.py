@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from avmsf._utils.text import count_of, like
+from avmsf._utils.text import count_of, like, typed
 from avmsf.errors import SceneError
 
 
@@ -144,10 +144,10 @@ def _read(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _vector(entry: Mapping[str, Any], name: str) -> Float[Tensor, " 3"]:
-    value = like(entry[name], (1.0,), name)
+    value = typed(entry[name], tuple[float, float, float], name)
     length = math.hypot(*value)
-    if len(value) != 3 or not math.isfinite(length) or (name != "point" and abs(length - 1.0) > 1e-6):
-        raise ValueError(f"{name}: expected {'three numbers' if name == 'point' else 'a unit vector'}, got {value}")
+    if not math.isfinite(length) or (name != "point" and abs(length - 1.0) > 1e-6):
+        raise ValueError(f"{name}: expected {'finite numbers' if name == 'point' else 'a unit vector'}, got {value}")
     return torch.tensor(value, dtype=torch.float64)
 
 

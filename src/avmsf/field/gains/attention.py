@@ -27,7 +27,6 @@ _MIN_PLACES = 6
 _MAX_LAYERS = 64
 """Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time
 to build before it can be compared with the file's tensors."""
-_EXAMPLE = AttentionShape(clusters=1, bands=0, width=1, hidden=1, layers=0, feature_scale=1.0)
 
 
 class AttentionGains(TrainableGains, GainModel):
@@ -145,7 +144,7 @@ class AttentionGains(TrainableGains, GainModel):
     def _empty(cls, record: Mapping[str, Any]) -> "AttentionGains":
         points, dim, modes = (count_of(record[name], name) for name in ("points", "dim", "modes"))
         encoder = like(record["encoder"], "", "encoder")
-        shape = record_of(_EXAMPLE, record["shape"], "shape", added=ADDED_SETTINGS)
+        shape = record_of(AttentionShape, record["shape"], "shape", added=ADDED_SETTINGS)
         if (most := max(shape.layers, shape.bands)) > _MAX_LAYERS:
             raise RecordError.expected(f"at most {_MAX_LAYERS}", most, name="layers")
         with torch.device("meta"):
