@@ -86,7 +86,9 @@ def suggest(
     count = as_count(count, "count", raising=FitError)
     given = None if candidates is None else as_vectors(candidates, "candidates").double()
     gains = _mixture_of(field, unseen)
-    _expect_directions(directions, given)
+    count_given = 0 if given is None else len(given)
+    if directions is not None and len(directions) != count_given:
+        raise FitError.expected(f"one for each of {count_given} candidates", len(directions), name="directions")
     with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
@@ -188,12 +190,6 @@ def _reachable(
         advice = "check the object's shape, or give candidates"
         raise FitError.expected(wanted, 0, got=f"none of {len(points)}", name="candidates", advice=advice)
     return torch.from_numpy(places[reached]), None if axes is None else -torch.from_numpy(axes[reached])
-
-
-def _expect_directions(directions: Float[Tensor, "_given 3"] | None, candidates: Tensor | None) -> None:
-    count = 0 if candidates is None else len(candidates)
-    if directions is not None and len(directions) != count:
-        raise FitError.expected(f"one for each of {count} candidates", len(directions), name="directions")
 
 
 def _expect_on_surface(candidates: Float64[Tensor, "candidates 3"], gains: MixtureGains) -> None:

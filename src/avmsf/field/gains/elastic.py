@@ -115,7 +115,8 @@ class Elastic(KernelFamily):
         """Return the kernels between two sets of impacts, without a basis, which would be far larger."""
         one, other = self._along(sites), self.shares[:, :-1][:, None] * self._along(others)
         mixed = (one @ other.flatten(0, 1).T).reshape(len(one), *other.shape[:2]).transpose(0, 1)
-        return mixed + self._residual_kernel(sites, others) * self.shares[:, -1, None, None]
+        rest = squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)
+        return mixed + rest * self.shares[:, -1, None, None]
 
     def categories(self) -> Int[Tensor, " kernels"]:
         """Return one category for each profile and remainder: the shape that is its center has a prior of its own."""
@@ -216,9 +217,6 @@ class Elastic(KernelFamily):
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:
         return self.frequency_weights.reshape(-1, len(FACTORS), len(FREQUENCY_ERRORS)).sum(2)
-
-    def _residual_kernel(self, sites: Sites, others: Sites) -> Float64[Tensor, "sites others"]:
-        return squared_exponential(sites.points, others.points, self._reach)[0] * sites.cosine(others)
 
 
 def frequency_log_prior(units: int = 1) -> Float64[Tensor, " pairs"]:

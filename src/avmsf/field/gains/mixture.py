@@ -125,11 +125,6 @@ class KernelMixture:
         """Return the posterior of some series, in the given order."""
         return replace(self, values=self.values[:, series], floor=self.floor[series], weights=self.weights[..., series])
 
-    def at_contacts(self, contacts: Int[Tensor, " contacts"]) -> "KernelMixture":
-        """Return the same hypotheses with the same weights, for the values of some of the contacts alone."""
-        kernels = self.kernels[:, contacts[:, None], contacts]
-        return replace(self, kernels=kernels, values=self.values[contacts])
-
     @cached_property
     def noise_variance(self) -> Float64[Tensor, "noises series"]:
         """The variance v of the noise over s^2."""
@@ -294,17 +289,10 @@ def log_evidence(
             quadratic = (power / variance).sum(1).clamp_min(_TINY)
             found[rows, row] = -0.5 * (len(values) * quadratic.log() + variance.log().sum(1))
             if expected is not None:
-                found[rows, row] += _scale_evidence(quadratic, expected[rows], len(values))
+                known = 2.0 * SCALE_SHAPE * expected[rows].clamp_min(_TINY)
+                total = (quadratic + known).log()
+                found[rows, row] += SCALE_SHAPE * (known.log() - total) - 0.5 * len(values) * (total - quadratic.log())
     return found
-
-
-def _scale_evidence(
-    quadratic: Float64[Tensor, "kernels series"], expected: Float64[Tensor, "kernels series"], count: int
-) -> Float64[Tensor, "kernels series"]:
-    """Return what an inverse-gamma prior of s^2 adds to the log evidence of the prior 1/s, up to a constant."""
-    known = 2.0 * SCALE_SHAPE * expected.clamp_min(_TINY)
-    total = (quadratic + known).log()
-    return SCALE_SHAPE * (known.log() - total) - 0.5 * count * (total - quadratic.log())
 
 
 def log_joint(

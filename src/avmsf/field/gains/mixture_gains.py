@@ -197,8 +197,9 @@ class MixtureGains(GainModel):
         """Return the model without some contacts, its hypotheses weighed as before."""
         kept = torch.nonzero(~contacts).flatten()
         measured = None if self.measured is None else self.measured[kept]
-        training, mixture = self.training.take(kept), self.mixture.at_contacts(kept)
-        return replace(self, training=training, mixture=mixture, measured=measured)
+        kernels, values = self.mixture.kernels[:, kept[:, None], kept], self.mixture.values[kept]
+        mixture = replace(self.mixture, kernels=kernels, values=values)
+        return replace(self, training=self.training.take(kept), mixture=mixture, measured=measured)
 
     def shares(self) -> Float64[Tensor, "families modes"]:
         """Return the posterior probability of each family: mean over both parts of each mode, by their energy."""
