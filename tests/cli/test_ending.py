@@ -23,6 +23,7 @@ import torch
 from avmsf._utils import progress
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import check, main
+from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.output import display, print_json, say, show, table
 from avmsf.cli.paths import InputError, OutputError
 from avmsf.errors import CaptureError
@@ -267,6 +268,18 @@ def test_ctrl_c_keeps_what_is_done(done, fields, tmp_path, capsys, monkeypatch):
         assert {name: row["state"] for name, row in table_of(pages).items()} == {"a": "done", "b": "not reached"}
     assert any(pages.glob("*.csv")) == bool(done)
     assert states(capsys, *words) == {"a": "as before" if done else "done", "b": "done"}
+
+
+def test_of_many_a_file_that_the_command_did_not_make_is_not_replaced(captures, tmp_path):
+    words = [*map(str, captures[:2]), "--until", "surface", "-o", str(tmp_path / "many")]
+    made = tmp_path / "many" / f"{captures[0].name}.ply"
+    made.parent.mkdir()
+    made.write_bytes(b"a scan")
+    record = made.with_name(f"{made.name}.stage.json")
+    for _ in range(2):
+        tasks = FitOptions.parse(words).tasks()
+        assert [tasks[each.name].overwrite for each in captures[:2]] == [record.exists(), True]
+        record.touch()
 
 
 def test_what_cannot_be_of_many_is_refused(captures: tuple[Path, ...], tmp_path: Path) -> None:

@@ -117,7 +117,10 @@ class Options(Configured, Many):
         """Return the options for one of many captures."""
         cache, plots = (None if each is None else each / output.name for each in (self.cache, self.plots))
         path = output.with_name(f"{output.name}{_SUFFIXES[self.until][0]}")
-        return replace(self, inputs=(given,), output=path, cache=cache, plots=plots)
+        # What is not there yet, or has a record, is this command's own: it may be made again.
+        own = not path.exists() or path.with_name(f"{path.name}.stage.json").exists()
+        overwrite = self.overwrite or own
+        return replace(self, inputs=(given,), output=path, cache=cache, plots=plots, overwrite=overwrite)
 
     def cells(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Return what the table of many shows of a field."""
