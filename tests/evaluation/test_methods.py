@@ -161,8 +161,6 @@ def test_one_or_two_shots_are_enough(name):
         sounds = renderer.render(impacts.contacts)
         assert sounds.shape == (COUNT, SAMPLES)
         assert bool(torch.isfinite(sounds).all())
-        if name.startswith("knn"):
-            assert report_of(renderer) == {"neighbors": count}
 
 
 @pytest.mark.parametrize("name", ["knn-gains", "spline-gains"])
