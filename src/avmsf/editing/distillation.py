@@ -94,7 +94,7 @@ class DecoderDistillation:
                     made.append(self._cleaned(clips[rows], level[rows], seeds[rows]))
             except torch.OutOfMemoryError as error:
                 wanted = f"memory on {self.model.device} for {size} sounds of {self.model.name} at once"
-                advice = "lower distillation.batch, use fewer seconds, or choose the device cpu"
+                advice = "lower prompt.distillation.batch, use fewer seconds, or choose the device cpu"
                 raise EditError.expected(wanted, size, got="too little", name="batch", advice=advice) from error
             back = resampled(torch.cat(made), sample_rate=self.model.sample_rate, wanted=self.sample_rate)
             return levelled(with_length(back.to(sounds), sounds.shape[1]), sounds, sample_rate=self.sample_rate)
