@@ -14,6 +14,7 @@ from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
 from avmsf.cli.edit_report import contact_of_sounds
 from avmsf.cli.paths import OutputError
+from avmsf.cli.report import field_lines
 from avmsf.editing.material import RATIO_ONLY, change_material, rayleigh_damping
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.editing.reference import Reference
@@ -111,6 +112,13 @@ def test_supporting_poles_are_no_modes_in_the_table(field: Path, capsys: Streams
     assert "850.00" not in shown
 
 
+def test_noise_that_has_become_loud_beside_the_modes_is_noted(field: Path, capsys: Streams) -> None:
+    for level in (-12, -3):
+        changes = [word for hertz in FREQUENCY.tolist() for word in ("--mode-db", hertz, level)]
+        _, shown = results_of(capsys, "edit", field, "-o", field.with_name("new.safetensors"), *changes)
+        assert ("note: the modes are 12 dB softer and the noise" in shown) == (level == -12)
+
+
 def test_constants_stand_in_place_of_the_tables(field: Path) -> None:
     new = edited(field, "--from", "ceramic", *sets("material.young=1e10 material.beta=2e-7 material.law=ratio-only"))
     custom = replace(CERAMIC, young=1e10, beta=2e-7)
@@ -135,6 +143,10 @@ def test_sliders_follow_the_material_and_call_modes_by_their_old_frequencies(fie
     new = edited(field, "--to", "wood", "--from", "ceramic", *sliders, "--mode-db", "2300", "6")
     changes = {"pitch": 1.2, "decay": 0.5, "brightness_db": 3.0, "gains_db": [0.0, -math.inf, 0.0, 0.0, 6.0]}
     expect_same(new, adjust_modes(change_material(ceramic(), CERAMIC, WOOD), **changes))
+    assert field_lines(new, field)[-2:] == [
+        "  edited     change_material, from ceramic to wood, law displacement",
+        "  edited     adjust_modes, pitch 1.2, decay 0.5, brightness_db 3, gains_db 0 to 6 by mode, 1 muted",
+    ]
     words = ["--pitch", "1.2", "--mode-pitch", "850", "0.5", "--mode-pitch", "2300", "1.5", "--mode-decay", "1300", "4"]
     factors = {"pitch": [1.2, 0.6, 1.2, 1.2, 1.2 * 1.5], "decay": [1.0, 1.0, 4.0, 1.0, 1.0]}
     expect_same(edited(field, *words, name="single"), adjust_modes(ceramic(), **factors))
@@ -150,7 +162,9 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(field, capsys, monk
     words = ["--like", str(field.with_name("like.wav"))]
     words += sets("guide.steps=4 guide.contacts_per_step=2 guide.preview_every=2")
     whole, part = edited(field, *words, name="whole"), field.with_name("part.safetensors")
-    assert whole.origin.report[EDITS][0]["reference"] == "like.wav"
+    told = whole.origin.report[EDITS][0]
+    factors = f"pitch {told['pitch']:.4g}, decay {told['decay']:.4g}"
+    assert field_lines(whole, field)[-1] == f"  edited     guided, towards 'like.wav', {factors}, steps 4"
     assert float((whole.bank.frequency / FREQUENCY).median()) == pytest.approx(1.3, rel=0.1)
     steps = interrupt_at(monkeypatch, 2)
     assert main(["edit", str(field), "--output", str(part), *words]) == 130
@@ -248,7 +262,7 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 WRONG: dict[str, tuple[str | None, object]] = {
     "": ("options", None),
-    "--from wood": ("options", None),
+    "--from wood": ("--from", None),
     "--prompt bell --like like.wav": ("--prompt", ("--prompt", "--like")),
     "--like-material wood --like like.wav": ("--like", ("--like", "--like-material")),
     "--like-material cheese": ("--like-material", "cheese"),
@@ -259,6 +273,17 @@ WRONG: dict[str, tuple[str | None, object]] = {
     "--pitch 0": ("pitch", 0.0),
     "--like nowhere.wav": (None, None),
     "--like like.wav --set guide.steps=0": ("steps", 0),
+    # What nothing would use.
+    "--pitch .9 --from steel": ("--from", None),
+    "--like like.wav --from wood": ("--from", None),
+    "--pitch 2 --set guide.steps=9": ("guide", None),
+    "--pitch 2 --set parameters=published": ("parameters", None),
+    "--like like.wav --model nowhere": ("--model", None),
+    "--pitch 2 --set prompt.distillation.denoising=3": ("prompt", None),
+    "--like like.wav --set prompt.clap=x": ("prompt", None),
+    "--pitch 2 --set material.law=ratio-only": ("material.law", None),
+    "--like-material wood --set material.law=velocity": ("material.law", None),
+    "--pitch 2 --position 0 0 0": ("--position", None),
     "--prompt bell --set prompt.clap=x --set guide.preview_every=0": ("prompt.clap", 0),
     # What a model cannot do.
     "--prompt bell --set prompt.distillation.guidance=-5": ("guidance", -5.0),

@@ -96,15 +96,29 @@ class Options(Configured):
     def check_inputs(self) -> None:
         """Raise the package's errors for an edit that cannot be done or written, before anything is loaded."""
         super().check_inputs()
-        settings, guides = self.all_settings, self.guides
+        settings, usual, guides = self.all_settings, self.usual, self.guides
         if len(guides) > 1:
             wanted, advice = "one of --prompt, --like and --like-material", "use one after the other"
             raise EditError.expected(wanted, tuple(guides), name=guides[0], advice=advice)
         for option, name in (("--to", self.to), ("--from", self.old), ("--like-material", self.like_material)):
             if name is not None:
                 material_named(name, option=option)
-        if not (self.changes_material or self.changes_modes or guides):
-            raise EditError.expected("an edit, such as --to", name="options")
+        law = settings.material.law != usual.material.law
+        material = "--to, --scale or a constant of a material with it"
+        guide = "--prompt, --like or --like-material as well"
+        unused = {
+            "parameters": (not guides and settings.parameters != usual.parameters, guide),
+            "guide": (not guides and settings.guide != usual.guide, guide),
+            "--model": (self.prompt is None and self.model != STABLE_AUDIO, "--prompt as well"),
+            "prompt": (self.prompt is None and settings.prompt != usual.prompt, "--prompt as well"),
+            "material.law": (law and not self.changes_material, material),
+            "--from": (self.old is not None and not (self.changes_material or self.like_material), material),
+            "--position": (self.position is not None and self.plots is None, "--plots with it"),
+            "options": (not (self.changes_material or self.changes_modes or guides), "an edit, such as --to"),
+        }
+        for name, (wrong, wanted) in unused.items():
+            if wrong:
+                raise EditError.expected(wanted, name=name)
         if self.prompt is not None:
             settings.check_prompt(self.prompt)
             if settings.prompt.generated is not None:

@@ -23,6 +23,8 @@ from avmsf.plotting.spectrograms import draw_spectrograms
 
 _CANDIDATES = 64
 """Points of the surface among which the loudest is looked for."""
+_LOUD_NOISE_DB = 6.0
+"""Decrease of the modes' level, dB, from which on the noise, whose level stays, may be too loud: half the amplitude."""
 _FieldAt = tuple[SoundField, Float64[Tensor, " 3"]]
 """A field and a contact on it, meters."""
 
@@ -76,6 +78,9 @@ def notes_on(
         )
     if scale != 1.0:
         notes.append(f"positions on the edited object are {scale:g} times as large")
+    softer = 20.0 * float((before.size.norm() / after.size.norm()).log10())
+    if _LOUD_NOISE_DB < softer < math.inf and bool(new.residual.magnitude.any()):
+        notes.append(f"the modes are {softer:.0f} dB softer and the noise is as loud as before; render with --no-noise")
     return notes
 
 

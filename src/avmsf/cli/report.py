@@ -118,10 +118,25 @@ def _gains_words(gains: dict[str, Any]) -> str:
 
 
 def _edit_words(edit: Mapping[str, Any]) -> str:
-    """Return what an edit is, and those of its settings that are one value; --json has all."""
-    materials = [f"from {edit['from']['name']} to {edit['to']['name']}"] if "from" in edit else []
-    single = [f"{name} {value}" for name, value in edit.items() if isinstance(value, str | int | float) and value]
-    return ", ".join([*single, *materials])
+    """Return what an edit is, without settings that change nothing; --json has all."""
+    parts = [str(edit.get("edit"))]
+    if "from" in edit:
+        parts.append(f"from {edit['from']['name']} to {edit['to']['name']}")
+    parts += [f"towards {edit[name]!r}" for name in ("prompt", "reference") if name in edit]
+    usual = {"size": 1.0, "pitch": 1.0, "decay": 1.0, "brightness_db": 0.0, "gains_db": 0.0}
+    for name in [name for name, same in usual.items() if edit.get(name, same) != same]:
+        # One value, or one for each mode; None is one that is muted.
+        values = edit[name] if isinstance(edit[name], list) else [edit[name]]
+        known = [each for each in values if each is not None] or [-math.inf]
+        ends = dict.fromkeys(f"{each:.4g}" for each in (min(known), max(known)))
+        mute = f", {values.count(None)} muted" if None in values else ""
+        parts.append(f"{name} {' to '.join(ends)}{' by mode' * (len(values) > 1)}{mute}")
+    parts += [f"{name} {edit[name]}" for name in ("law", "negative", "model", "guidance", "steps") if edit.get(name)]
+    beyond = {"silent_hertz": "beyond half the sample rate", "overdamped_hertz": "overdamped"}
+    parts += [f"modes {what}: {len(edit[name])}" for name, what in beyond.items() if edit.get(name)]
+    if scores := edit.get("clap", {}).get("scores"):
+        parts.append(f"CLAP score {scores[0]:.3f} to {scores[-1]:.3f}")
+    return ", ".join(parts)
 
 
 def quality_words(field: SoundField, path: Path) -> list[str]:
