@@ -164,7 +164,9 @@ def test_fit_replaces_nothing_but_a_field_of_the_same_capture(capture: Path, fie
             FitOptions.parse([str(capture), *other_kind, *words]).check_inputs()
     edited = replace(own, origin=replace(own.origin, report={**own.origin.report, "edits": [{"edit": "x"}]}))
     other = replace(own, origin=replace(own.origin, capture="bowl"))
-    for content in (edited, other, b"sound"):
+    # Keys of one length, as the header says how long it is.
+    damaged = [output.read_bytes().replace(key, key[::-1]) for key in (b"origin", b"report")]
+    for content in (edited, other, b"sound", *damaged):
         output.write_bytes(content) if isinstance(content, bytes) else save(content, output)
         with raises(OutputError, file=output, name="--overwrite"):
             FitOptions.parse([str(capture), *words]).check_inputs()

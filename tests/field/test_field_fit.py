@@ -252,6 +252,11 @@ def test_recordings_that_cannot_be_fitted_are_refused():
         plate_fit(SHORT, train=replace(impacts, sounds=torch.zeros_like(impacts.sounds)))
     with raises(FitError, name="modes", value=pytest.approx(2302.0, abs=1.0)):
         plate_fit(SHORT, train=replace(impacts, sample_rate=4000.0))
+    for name, known in (("sounds", impacts.sounds), ("contacts", impacts.contacts), ("directions", torch.ones(12, 3))):
+        lost = known.clone()
+        lost[2, 0] = math.nan
+        with raises(FitError, name="plate/003", row=2):
+            plate_fit(SHORT, train=replace(impacts, **{name: lost}), modes=modes)
     with raises(FitError, name="plate/003", value=0.0, row=2):
         plate_fit(SHORT, train=replace(impacts, forces=torch.tensor([1.0, 2.0, 0.0]).repeat(4)))
     none = torch.zeros(0, dtype=torch.float64)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from avmsf._utils.text import format_number, listed
+from avmsf._utils.text import RecordError, format_number, like, listed
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.cli.many import Many, run_many
@@ -117,8 +117,9 @@ class Options(Configured, Many):
         """Return the options for one of many captures."""
         cache, plots = (None if each is None else each / output.name for each in (self.cache, self.plots))
         path = output.with_name(f"{output.name}{_SUFFIXES[self.until][0]}")
-        # What is not there yet, or has a record, is this command's own: it may be made again.
-        own = not path.exists() or path.with_name(f"{path.name}.stage.json").exists()
+        # What has a record is this command's own, and may be made again; a field says itself whose it is.
+        recorded = self.until is not None and path.with_name(f"{path.name}.stage.json").exists()
+        own = not path.exists() or recorded
         overwrite = self.overwrite or own
         return replace(self, inputs=(given,), output=path, cache=cache, plots=plots, overwrite=overwrite)
 
@@ -179,13 +180,13 @@ class Options(Configured, Many):
         source, found = self.capture, "another file"
         own = settings_of(source).name or (source.resolve().name if source.is_dir() else source.resolve().stem)
         # What is no field of this version is a file like any other.
-        with suppress(FieldFileError):
-            origin = FIELD.parse(FIELD.read_text(path), path)["origin"]
-            edited = bool(origin["report"].get("edits"))
-            same_kind = self.until is None and (self.material is None or "guess" in origin["report"])
-            if origin["capture"] == own and same_kind and not edited:
+        with suppress(FieldFileError, RecordError):
+            origin = like(FIELD.parse(FIELD.read_text(path), path).get("origin"), {}, "origin")
+            report = like(origin.get("report"), {}, "origin.report")
+            same_kind = self.until is None and (self.material is None or "guess" in report)
+            if origin.get("capture") == own and same_kind and not report.get("edits"):
                 return
-            found = f"{'an edited' if edited else 'a'} field of {origin['capture']!r}"
+            found = f"{'an edited' if report.get('edits') else 'a'} field of {origin.get('capture')!r}"
         advice = "choose another, or add --overwrite to replace it"
         raise OutputError.expected("a free name", found, got=found, file=path, name="--overwrite", advice=advice)
 

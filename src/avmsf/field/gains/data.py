@@ -132,6 +132,13 @@ def gain_variance(data: GainData) -> Float64[Tensor, " modes"]:
 def _expect_fitting(train: Impacts, modes: Extraction) -> None:
     if len(train) == 0:
         raise FitError.expected("1 recording or more", 0, got="none", name="train", advice="record impacts")
+    finite = torch.isfinite(train.sounds).all(1) & torch.isfinite(train.contacts).all(1)
+    if train.directions is not None:
+        finite &= torch.isfinite(train.directions).all(1)
+    if not bool(finite.all()):
+        row = int(finite.int().argmin())
+        wanted, advice = "finite samples, coordinates and directions", "remove the recording; directions may be zeros"
+        raise FitError.expected(wanted, got="NaN or infinity", row=row, name=train.names[row], advice=advice)
     if train.forces is not None and not bool((train.forces > 0.0).all()):
         row = int((train.forces > 0.0).int().argmin())
         force, name = float(train.forces[row]), train.names[row]
