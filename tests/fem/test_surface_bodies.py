@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from avmsf.errors import SimulationError
-from avmsf.fem import candidate_bodies
+from avmsf.fem import body_meshes, candidate_bodies
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import DISCREPANCY, MATERIALS, NOMINAL, factor_range
@@ -135,6 +135,16 @@ def test_surfaces_of_no_body_are_refused_with_all_reasons(make, thicknesses, ref
 def test_points_alone_have_no_body():
     with raises(SimulationError, name="faces", value=0):
         computed(Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64)))
+
+
+def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(body_meshes, "free_memory", lambda: 2 * 377e6)
+    with raises(SimulationError, name="memory") as caught:
+        computed(sheet(), thicknesses=[0.004], dofs=80_000)
+    [reason] = caught.value.value
+    assert all(number in reason for number in ("80000", "1.6 GB", "40000"))
+    monkeypatch.setattr(body_meshes, "free_memory", lambda: None)
+    assert computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies
 
 
 def test_too_few_degrees_of_freedom_are_named():

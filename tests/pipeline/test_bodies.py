@@ -218,6 +218,16 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
     estimator_for("smooth", make)
 
 
+def test_without_enough_memory_a_fit_has_no_elastic_family_and_no_stated_wall_is_blamed(monkeypatch):
+    monkeypatch.setattr("avmsf.fem.body_meshes.free_memory", lambda: 1000.0)
+    told: list[str] = []
+    estimator_for("auto", lambda: candidate_bodies(dome(), BodyConfig(wall=0.004)), log=told.append)
+    assert told[0].startswith("no elastic mode shapes: ")
+    assert "free for" in told[0]
+    with raises(SimulationError, name="memory"):
+        estimator_for("elastic", lambda: candidate_bodies(dome(), BodyConfig(wall=0.004)))
+
+
 def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:
     told: list[str] = []
     surface = Surface(1000.0 * dome().vertices, dome().faces)

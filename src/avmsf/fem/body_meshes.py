@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import itemgetter
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -30,7 +31,7 @@ _TRIANGLES_PER_DOF = 0.1
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How the detail is searched."""
+    """How the detail is searched, and what modes take of the memory."""
 
     min_dofs_ratio: float = 0.65  # degrees of freedom over those wanted, from which on the search ends
     max_dofs_ratio: float = 1.2  # and up to which
@@ -44,6 +45,10 @@ class Tolerances:
     max_detail: float = 0.4
     max_knotted_ratio: float = 4.0  # triangles over those that `fill` should get, for no edge to be shared among three
     wall_dofs_per_vertex: float = 36.0  # degrees of freedom of a wall over the vertices of the mesh that it follows
+    peak_bytes: float = 377e6  # that the modes of `peak_dofs` take (benchmarks/proof.py)
+    peak_dofs: int = 40_000
+    peak_power: float = 1.1  # by which it grows with the degrees of freedom
+    memory_safety: float = 2.0  # factor on that, for lumps take more than the walls it was measured on
 
 
 TOLERANCES = Tolerances()
@@ -190,3 +195,23 @@ def _filling_detail(surface: CheckedSurface, dofs: int) -> float:
     relative = np.maximum(held / lengths, 1e-3)
     needed = area / lengths**2 * 16.4 * relative**-0.68 + volume / lengths**3 * 38.0 * np.minimum(1.0, relative / 3.0)
     return float(lengths[np.argmax(needed <= dofs)] / size) if (needed <= dofs).any() else TOLERANCES.max_detail
+
+
+def expect_memory(dofs: int) -> None:
+    """Raise SimulationError where the modes of a mesh with so many degrees of freedom do not fit into memory."""
+    free, peak = free_memory(), TOLERANCES.memory_safety * TOLERANCES.peak_bytes
+    needed = peak * (dofs / TOLERANCES.peak_dofs) ** TOLERANCES.peak_power
+    if free is not None and needed > free:
+        fitting = int(TOLERANCES.peak_dofs * (free / peak) ** (1.0 / TOLERANCES.peak_power)) // 1000 * 1000
+        wanted = f"about {needed / 1e9:.2g} GB of it free for {dofs} degrees of freedom"
+        advice = f"use {max(fitting, MIN_DOFS)} (--set body.dofs=N), or close other programs"
+        raise SimulationError.expected(wanted, free, got=f"{free / 1e9:.2g} GB", name="memory", advice=advice)
+
+
+def free_memory() -> float | None:
+    """Return the bytes of memory that programs can still have, or None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(1024.0 * float(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return None

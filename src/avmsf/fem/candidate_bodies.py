@@ -24,7 +24,15 @@ from threadpoolctl import threadpool_limits
 from avmsf._utils.caching import content_digest, key_of, once, source_digest
 from avmsf._utils.compiled import lane_count
 from avmsf.errors import SimulationError
-from avmsf.fem.body_meshes import MIN_DOFS, HollowShape, count_dofs, filled_solid, shape_solid, wall_solids
+from avmsf.fem.body_meshes import (
+    MIN_DOFS,
+    HollowShape,
+    count_dofs,
+    expect_memory,
+    filled_solid,
+    shape_solid,
+    wall_solids,
+)  # fmt: skip
 from avmsf.fem.elastic_modes import ElasticModes, HeldModes, elastic_modes
 from avmsf.fem.elastic_store import modes_once
 from avmsf.fem.material import MAX_FREQUENCY_ERROR, NOMINAL, Material
@@ -49,7 +57,7 @@ _COMPARED = 8
 """Lowest frequencies that two meshes are compared by."""
 _SHAPE_THICKNESSES = 5
 """Thicknesses that are computed at first of a shape whose wall is not known."""
-_MEANS = frozenset({"timeout", "pytetwild"})
+_MEANS = frozenset({"memory", "timeout", "pytetwild"})
 """Names of errors that are no fault of a surface or its wall."""
 
 
@@ -99,8 +107,8 @@ class CandidateBodies:
     first.
 
     Raises SimulationError for too few degrees of freedom. `bodies` raises it for a surface of points, and where no body
-    can be had, with the reason for each: by the name "surface", or by that of the reason where only time or the mesher
-    stood against it.
+    can be had, with the reason for each: by the name "surface", or by that of the reason where only memory, time or the
+    mesher stood against it.
     """
 
     def __init__(
@@ -314,6 +322,7 @@ class CandidateBodies:
 
     def _make_solid(self, thickness: float | None, dofs: int, *, closed: bool = False) -> Solid:
         """Return about so many degrees of freedom of a wall of a thickness, meters, or of all that is enclosed."""
+        expect_memory(dofs)
         self._log(f"dividing the {body_name(thickness, closed=closed)} into tetrahedra")
         if thickness is None:
             return filled_solid(self.checked, dofs)
