@@ -1,5 +1,6 @@
 """Where to strike next, and where a hammer reaches."""
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -128,6 +129,7 @@ ONE = torch.tensor([[0.4, 0.1, 0.0]])
         (1, torch.tensor([[0.4, 0.1, 0.2]]), None, {"name": "candidates", "row": 0, "value": [0.4, 0.1, 0.2]}),
         (1, ONE.expand(2, 3), DOWN.expand(1, 3), {"name": "directions", "value": 1}),
         (1, None, DOWN.expand(1, 3), {"name": "directions", "value": 1}),
+        (1, ONE, torch.tensor([[0, 0, -math.inf]]), {"name": "directions", "row": 0, "value": [0, 0, -math.inf]}),
         (1, bar_contacts(1), None, {"name": "candidates", "value": 0}),
     ],
 )

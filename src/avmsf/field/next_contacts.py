@@ -89,6 +89,9 @@ def suggest(
     count_given = 0 if given is None else len(given)
     if directions is not None and len(directions) != count_given:
         raise FitError.expected(f"one for each of {count_given} candidates", len(directions), name="directions")
+    if directions is not None and len(faulty := torch.nonzero(~directions.isfinite().all(dim=1)).flatten()):
+        found = directions[faulty[0]].tolist()
+        raise FitError.expected("finite numbers", found, row=int(faulty[0]), name="directions")
     with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
