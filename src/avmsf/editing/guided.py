@@ -138,6 +138,8 @@ class PreviewScore:
     """Returns that of a sound at the field's rate."""
     network: str
     """Its name in the report."""
+    digest: str
+    """Of its weights: scores by others are not mixed."""
 
 
 def edit_towards(
@@ -198,7 +200,7 @@ class _Optimization:
         # The interval of previews does not change the result.
         del settings["preview_every"]
         identity = checkpoint_identity(field, probes, guide.describe(), settings)
-        identity |= {} if score is None else {"network": key_of({"name": score.network})}
+        identity |= {} if score is None else {"network": score.digest}
         self.checkpoint = Checkpoint(checkpoint, identity, what="the edit", raising=EditError)
         state = self.checkpoint.read()
         self.scores: dict[int, float] = {} if state is None else state["scores"]

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from avmsf._utils.caching import content_digest
 from avmsf._utils.files import model_folder
 from avmsf.editing.guided import PreviewScore
 from avmsf.errors import EvaluationError, download_failure, from_extra
@@ -88,7 +89,8 @@ class Clap:
         def score(sound: Float[Tensor, " samples"]) -> float:
             return float(self.score(sound[None], prompt, sample_rate=sample_rate))
 
-        return PreviewScore(score, self.name)
+        settings, weights = self.processor.feature_extractor.to_dict(), self.model.state_dict()
+        return PreviewScore(score, self.name, content_digest(settings, *weights, *weights.values()))
 
     def embed(self, sounds: Float[Tensor, "..."], *, sample_rate: float) -> Float64[Tensor, "contacts dim"]:
         """Return the sounds' embeddings, of length one."""
