@@ -308,6 +308,7 @@ def test_like_is_near_unlike_far_and_a_seed_gives_the_same_space():
     assert space.distance(wood, "wood") < 0.5 * space.distance(wood, "glass")
     assert space.distance(glass, "glass") < 0.5 * space.distance(glass, "wood")
     assert np.array_equal(again.embedding, space.embedding)
+    assert {"umap-learn", "numba", "scikit-learn"} <= space.record()["versions"].keys()
     assert np.array_equal(again.place(random_bank(25, seed=99)), wood)
     assert not np.array_equal(space_of(*labelled(), seed=4).embedding, space.embedding)
 
@@ -316,6 +317,8 @@ def test_like_is_near_unlike_far_and_a_seed_gives_the_same_space():
     ("make", "attributes"),
     [
         (lambda: pitches(bank([])), {"name": "bank", "value": 0}),
+        (lambda: pitches(bank([100.0, 0.0])), {"row": 1, "name": "frequency", "value": 0.0}),
+        (lambda: pitches_and_dampings(bank([100.0], -1.0)), {"row": 0, "name": "damping", "value": -1.0}),
         (lambda: check_materials(["wood"] * 4), {"name": "materials", "value": (4, 1)}),
         (lambda: space_of(*labelled()).embedding, {"name": "umap-learn"}),
     ],

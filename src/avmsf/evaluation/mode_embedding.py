@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -26,13 +27,15 @@ _MIN_OBJECTS = 6
 """Objects that UMAP has anything to arrange of."""
 _NEIGHBORS, _MIN_DISTANCE = 8, 0.1
 """Objects that each one's place is decided by, and how close points may come; all else is umap-learn's default."""
+_PACKAGES = ("umap-learn", "numba", "numpy", "scipy", "scikit-learn", "avmsf")
+"""Those that an embedding depends on, down to its last digits."""
 
 
 def pitches(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
     """Return the frequencies alone, as in the paper: 32 evenly spaced quantiles of log2 f, by Hazen's rule.
 
     Over the square root of their number, so that the distance of two sets is the root mean square of their quantiles'
-    differences in octaves. Raises EvaluationError for an empty set.
+    differences in octaves. Raises EvaluationError for a set that is empty or not of numbers above 0.
     """
     levels = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
     return np.quantile(_logarithms(bank)[0], levels, method="hazen") / math.sqrt(_QUANTILES)
@@ -65,6 +68,10 @@ def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64
     """Return log2 of frequencies and dampings."""
     if not len(bank):
         raise EvaluationError.expected("one mode or more", 0, got="none", name="bank")
+    for name in ("frequency", "damping"):
+        for row, value in enumerate(getattr(bank, name).tolist()):
+            if not 0.0 < value < math.inf:
+                raise EvaluationError.expected(f"a {name} above 0", value, row=row, name=name)
     return bank.frequency.log2().numpy(), bank.damping.log2().numpy()
 
 
@@ -124,7 +131,7 @@ class MaterialSpace:
         return float(np.linalg.norm(place - self.center(material)))
 
     def record(self) -> dict[str, Any]:
-        """Return all that the scores rest on, as JSON holds it: settings, vectors and the embedding."""
+        """Return all that the scores rest on, as JSON holds it: settings, versions, vectors and the embedding."""
         return {
             "features": self.features,
             "umap": {"neighbors": _NEIGHBORS, "min_distance": _MIN_DISTANCE, "seed": self.seed},
@@ -132,6 +139,7 @@ class MaterialSpace:
             "names": list(self.names),
             "vectors": self.vectors.tolist(),
             "embedding": self.embedding.tolist(),
+            "versions": {name: version(name) for name in _PACKAGES},
         }
 
     @cached_property
