@@ -21,7 +21,7 @@ from torch import Tensor
 from avmsf._utils.device import usable_device
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
-from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published
+from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published, folder_digest
 from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.capture.filenames import files_in
@@ -89,7 +89,7 @@ def method_named(name: str) -> Method:
     if entry.path:
         given = name.partition(":")[2]
         path = Path(given).expanduser()
-        if not given or not path.exists():
+        if not given or not (path.is_dir() if entry.is_folder else path.is_file()):
             wanted = f"{entry.path} after `{kind_of(name)}:`"
             raise EvaluationError.expected(wanted, name, file=path if given else None, name="method")
         # However it is written: results of one path are those of one method.
@@ -98,7 +98,7 @@ def method_named(name: str) -> Method:
         made: Method = resolve(entry.make)(name, **entry.settings, **settings)
         return made
     if entry.path:
-        weights = digest_of(path)[:16]
+        weights = folder_digest(path) if entry.is_folder else digest_of(path)[:16]
     return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings, **settings), weights, entry.visual_input)
 
 
