@@ -260,12 +260,7 @@ def of_scale(scale: float) -> BodyFamily:
 
 
 REFUSED: dict[str, tuple[type[AvmsfError], Callable[[], object]]] = {
-    "an unknown material": (
-        SimulationError,
-        lambda: fit_material(
-            clip_spectra(struck(torch.ones(1, 12))), curve(), family(), DiffSoundConfig("unobtainium")
-        ),
-    ),
+    "an unknown material": (SimulationError, lambda: DiffSoundConfig("unobtainium")),
     "points without triangles": (
         SimulationError,
         lambda: body_family(Surface(sheet().vertices, torch.zeros(0, 3, dtype=torch.int64)), count=3),

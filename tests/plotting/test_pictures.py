@@ -156,6 +156,12 @@ def test_no_direction_is_out_of_sight_from_all_sides():
         assert np.linalg.det(view) == pytest.approx(1.0)
 
 
+def test_no_direction_is_up():
+    for up in ((0.0, 0.0, 0.0), (math.nan, 0.0, 1.0)):
+        with raises(EvaluationError, name="up"):
+            view_from(ALL_SIDES[0], up)
+
+
 def test_what_points_up_is_up_and_nearer_points_come_last():
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.0]])
     colors = torch.eye(3)

@@ -31,10 +31,12 @@ _ARROW = 28.0
 def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
     """Return rows right, up and towards the eye of a side; azimuth 0 looks from the axis after the one that is up.
 
-    That is from x where z is up, from z where y is.
+    That is from x where z is up, from z where y is. Raises EvaluationError where `up` has no length.
     """
     azimuth, elevation = side
     sky = np.asarray(up, dtype=float)
+    if not np.linalg.norm(sky) > 0.0:
+        raise EvaluationError.expected("a direction of three numbers", list(up), name="up")
     sky = sky / np.linalg.norm(sky)
     first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
     first = first - (first @ sky) * sky

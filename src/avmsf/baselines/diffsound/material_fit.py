@@ -80,6 +80,10 @@ class DiffSoundConfig:
     """Generations of the following global search for a smaller difference, and half as many near a thickness that was
     found; none in the published program."""
 
+    def __post_init__(self) -> None:
+        if self.material is not None:
+            material_named(self.material)
+
 
 @dataclass(frozen=True)
 class MaterialFit:
@@ -172,8 +176,8 @@ def fit_material(
 ) -> MaterialFit:
     """Return the material and thickness whose modes sound most like the clips.
 
-    Raises SimulationError for an unknown material, and EvaluationError for a body that has no mode in the band with any
-    of the materials, as one whose mesh is in another unit.
+    Raises EvaluationError for a body that has no mode in the band with any of the materials, as one whose mesh is in
+    another unit.
     """
     config = DiffSoundConfig() if config is None else config
     starts = [material_named(config.material)] if config.material is not None else list(MATERIALS.values())
