@@ -1,6 +1,7 @@
 """`avmsf fit`: a capture folder in, a field file out, or what a stage before it makes; of many, a folder of these."""
 
 import shlex
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
@@ -263,7 +264,9 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     scores: dict[str, Scores] = {}
     if test is not None:
         doing("comparing the field with the recordings that it was not fitted to")
+        begun = time.monotonic()
         scores = compare(fitted, train, test, made.modes)
+        display.listener.ready("scores", time.monotonic() - begun)
         lines.append(score_table(f"{parts_words(train, test)}; lower is better", scores))
         lines += [f"not trained on: {listed(test.names, most=8)}"] if display.verbose else []
     lines += field_lines(fitted, path, settings=display.verbose)
