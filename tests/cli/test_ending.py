@@ -79,11 +79,13 @@ def test_missing_memory_ends_a_verb_with_a_sentence(run, act, capsys):
 
 
 def test_an_error_of_this_package_shows_where_it_arose(run: Callable[..., int]) -> None:
-    def fail() -> None:
-        raise ImportError("a bug")
+    for bug in (ImportError("a bug"), FileNotFoundError(2, "No such file or directory", "page.html")):
 
-    with pytest.raises(ImportError):
-        run(fail)
+        def fail(error: Exception = bug) -> None:
+            raise error
+
+        with pytest.raises(type(bug)):
+            run(fail)
 
 
 def test_a_name_that_the_system_refuses_ends_a_verb_with_a_sentence(capsys: Streams) -> None:
@@ -91,6 +93,7 @@ def test_a_name_that_the_system_refuses_ends_a_verb_with_a_sentence(capsys: Stre
         assert main(words) == 2
         [line] = capsys.readouterr().err.splitlines()
         assert line.startswith(f"avmsf {words[0]}: xxx")
+        assert "x: expected a readable or writable path, got 'File name too long'; " in line
 
 
 def test_sigterm_ends_a_verb_as_ctrl_c_does(run: Callable[..., int], guarded: None, capsys: Streams) -> None:

@@ -24,7 +24,6 @@ from types import FrameType
 from typing import Any
 
 import avmsf
-from avmsf._utils.files import unwritable
 from avmsf._utils.text import printable
 from avmsf.cli.output import display, print_json, say, show_plainly
 from avmsf.errors import NO_MEMORY, AvmsfError, lacks_memory
@@ -105,9 +104,13 @@ def _run(words: list[str]) -> int:
         except Exception as error:
             if lacks_memory(error):
                 return _fail(AvmsfError(NO_MEMORY), name)
+            if isinstance(error, FileNotFoundError):
+                # Inputs that are missing are refused before: this is a fault of the package.
+                raise
             if isinstance(error, OSError) and isinstance(error.filename, str | Path):
                 # What the system refuses at a path: its name is too long, or a folder may not be searched.
-                return _fail(unwritable(Path(error.filename), error, raising=AvmsfError), name)
+                wanted, advice = "a readable or writable path", "check its name and its permissions"
+                return _fail(AvmsfError.expected(wanted, error.strerror, file=error.filename, advice=advice), name)
             if isinstance(error, AvmsfError):
                 return _fail(error, name)
             raise
