@@ -1,6 +1,7 @@
 """The bodies that a surface may hide, and the thickness of their wall by the evidence of gains."""
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -100,10 +101,14 @@ def test_both_sides_of_a_wall_are_filled_and_given_no_wall():
 
 def test_boxes_that_overlap_are_one_body():
     one, other = trimesh.creation.box((0.3, 0.05, 0.02)), trimesh.creation.box((0.05, 0.2, 0.015))
-    found = computed(surface_of(trimesh.util.concatenate([one, other])), thicknesses=[None, 0.001], count=6, dofs=6000)
+    messages: list[str] = []
+    both = surface_of(trimesh.util.concatenate([one, other]))
+    found = computed(both, thicknesses=[None, 0.001, 0.5], count=6, dofs=6000, log=messages.append)
     assert [body.name for body in found.bodies] == ["solid body"]
     volume = 0.3 * 0.05 * 0.02 + (0.2 - 0.05) * 0.05 * 0.015
     assert found.bodies[0].elastic.mass == pytest.approx(NOMINAL.density * volume, rel=0.05)
+    (thick,) = (each for each in messages if each.startswith("not a candidate body: wall of 500 mm"))
+    assert re.fullmatch(".*: wall of 500 mm: expected a thickness below the object's width of .* mm, got 500 mm", thick)
 
 
 @pytest.mark.slow

@@ -170,7 +170,7 @@ class CandidateBodies:
             advice = f"repair the mesh, or give {other}"
             raise SimulationError.expected(wanted_body, reasons, got=got, name=name, advice=advice)
         for reason in reasons:
-            self._log(f"not a candidate body: {reason}")
+            self._log_refused(reason)
         return (self.refined(bodies[0]),) if len(bodies) == 1 else tuple(bodies)
 
     @property
@@ -233,8 +233,15 @@ class CandidateBodies:
 
         `log` is called with the reason.
         """
-        name = body_name(thickness, closed=body.closed)
-        return self._attempt(f"not a candidate body: {name}", partial(self._body, thickness, body.closed, fine=False))
+        try:
+            return self._body(thickness, body.closed, fine=False)
+        except (SimulationError, MemoryError) as error:
+            self._log_refused(f"{body_name(thickness, closed=body.closed)}: {error}")
+            return None
+
+    def _log_refused(self, reason: str) -> None:
+        """Log why a body cannot be had, where there are others; without an error's name and advice."""
+        self._log(f"not a candidate body: {reason.partition('; ')[0].replace(': wall: expected', ': expected')}")
 
     def _attempt(self, failure: str, make: Callable[[], Made]) -> Made | None:
         """Return what is made; None where that cannot be, which is logged after `failure`."""
