@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,7 +10,7 @@ from avmsf.errors import LocationError
 from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import Origin
 from avmsf.localization.likelihood import Force, Likelihood, PredictedGains
-from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate
+from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate, locate_impacts
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import distinct_contacts
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
@@ -206,10 +207,17 @@ def test_fields_that_were_edited_and_know_no_contacts_are_located_on_too():
     assert missed(found, found.most_probable, impacts.contacts[0]) < 0.05
 
 
-@pytest.mark.parametrize("given", [2.0, 2], ids=repr)
+@pytest.mark.parametrize("given", [2.0, 2, np.float32(2)], ids=repr)
 def test_a_force_may_be_a_number(given):
     found, expected = (locator_of().locate(SOUND, force=force) for force in (given, Force(2.0)))
     assert torch.equal(found.probability, expected.probability)
+
+
+@pytest.mark.parametrize("given", ["strong", [1.0, 2.0], np.ones(1), np.ones(2), torch.ones(2), True], ids=str)
+def test_what_is_not_one_force_is_refused(given):
+    for find in (locate, locate_impacts):
+        with raises(LocationError, name="force.expected"):
+            find(locator_of().field, SOUND, force=given, locator=locator_of())
 
 
 SOUND = struck(1, seed=3).sounds[0]
@@ -221,6 +229,7 @@ NOISE = torch.randn(7200, generator=torch.Generator().manual_seed(0))
     [
         (lambda: Force(0.0), {"name": "force.expected", "value": 0.0}),
         (lambda: Force(math.inf), {"name": "force.expected", "value": math.inf}),
+        (lambda: Force(math.nan), {"name": "force.expected"}),
         (lambda: Force(1.0, spread_db=-1.0), {"name": "force.spread_db", "value": -1.0}),
         (lambda: locator_of().locate(torch.zeros(5000)), {"name": "sound", "value": "silence"}),
         (lambda: locator_of().locate(NOISE[:300]), {"name": "samples", "value": 300}),

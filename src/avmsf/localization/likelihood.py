@@ -18,6 +18,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
@@ -74,7 +75,7 @@ class PredictedGains:
 
 @dataclass(frozen=True, eq=False)
 class Force:
-    """The prior of an impact's force, of either polarity. Raises LocationError for values that are not above 0."""
+    """The prior of an impact's force, of either polarity. Raises LocationError for what is no finite number above 0."""
 
     expected: float
     """Relative to the force at which the field's rendered sounds are as loud as the recording."""
@@ -83,9 +84,9 @@ class Force:
 
     def __post_init__(self) -> None:
         for name, value in (("expected", self.expected), ("spread_db", self.spread_db)):
-            if not (math.isfinite(value) and value > 0.0):
-                advice = "leave the force out if it is not known"
-                raise LocationError.expected("a number above 0", value, name=f"force.{name}", advice=advice)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 < value < math.inf:
+                wanted, advice = "one positive finite number", "leave the force out if it is not known"
+                raise LocationError.expected(wanted, value, name=f"force.{name}", advice=advice)
 
 
 class Likelihood:

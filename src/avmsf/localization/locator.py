@@ -107,7 +107,7 @@ class Locator:
         Raises LocationError for sounds that are too short, silent or not finite, and where the modes explain no more
         than they would of noise.
         """
-        known = force if force is None or isinstance(force, Force) else Force(float(force))
+        known = force if force is None or isinstance(force, Force) else Force(force)
         used = sound.detach().cpu()[: self.field.samples]
         check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)
@@ -117,7 +117,7 @@ class Locator:
         amplitudes = replace(amplitudes, energy=max(amplitudes.energy, amplitudes.fitted, *detuned))
         values, noise = length.separate(amplitudes)
         _check_above_noise(values, noise)
-        scaled = None if known is None else replace(known, expected=known.expected * length.unit)
+        scaled = None if known is None else replace(known, expected=float(known.expected) * length.unit)
         found = Likelihood(length.predicted, values, noise, force=scaled)
         # The force does not say whether the impact was on this object.
         free = found if scaled is None else Likelihood(length.predicted, values, noise)
