@@ -34,6 +34,7 @@ class _Tolerances:
     """By when `find_onset` must see every recording that starts with the impact. Where modes cancel at first it takes
     up to .3 ms (a plate of 43 modes at 96 kHz) and 5 samples (the aircraft at 400 Hz)."""
     usual_range_db: float = 80.0  # from the median: near nodes of most modes it is 40, of a soft impact 30
+    usual_gap_db: float = 12.0  # of the loudest to the next, of six or more: at most 7 in 24 captures
     range_db: float = 140.0  # of the loudest to the faintest: float32, in which they are fitted, rounds at 144
     equal_peaks: int = 4  # recordings that were scaled to one peak, since struck ones differ by decibels
     same_peak_db: float = 0.05
@@ -196,8 +197,12 @@ def check_levels(sounds: dict[str, tuple[bytes, float]]) -> list[CaptureWarning]
             "each scaled to one peak, which loses how strong the modes are at each contact; export them unscaled"
         )
         return [CaptureWarning(message, file=names[0], name="peak", value=peaks[0])]
-    if abs(away[row]) <= _TOLERANCES.usual_range_db:
-        return []
     wanted, advice = f"at most {_TOLERANCES.usual_range_db:g} dB", "check its gain, its scale and its force"
+    next_loudest, loudest = np.argsort(levels, kind="stable")[-2:] if len(levels) >= 6 else (row, row)
+    if (gap := levels[loudest] - levels[next_loudest]) > _TOLERANCES.usual_gap_db:
+        row, wanted = int(loudest), f"at most {_TOLERANCES.usual_gap_db:g} dB"
+        found = f"{gap:.0f} dB above that of the next loudest recording"
+    elif abs(away[row]) <= _TOLERANCES.usual_range_db:
+        return []
     message = f"{names[row]}: its peak, {peaks[row]:.3g}, is {found}; expected {wanted}; {advice}"
     return [CaptureWarning(message, file=names[row], name="peak", value=peaks[row])]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.alignment_report import (
+    gain_changes,
     inverted_recordings,
     noise_drop,
     rate_factors,
@@ -51,6 +52,7 @@ def test_right_recordings_have_no_fault() -> None:
     assert rate_factors(modes, aligned) == {}
     assert uneven_decay(modes, aligned) is None
     assert noise_drop(modes, impacts) is None
+    assert gain_changes(impacts) == {}
 
 
 @pytest.mark.parametrize("factor", [48 / 44.1, 0.5])
@@ -59,6 +61,20 @@ def test_a_recording_of_another_rate_is_named_with_the_ratio(factor: float) -> N
     factors[3] = factor
     modes, impacts = recorded(files(factors))
     assert rate_factors(modes, modes.aligned(impacts)) == {"03.wav": pytest.approx(factor)}
+
+
+def test_another_gain_changes_noise_and_sound_alike() -> None:
+    sounds = files(ONES)
+    gain = torch.ones(COUNT, 1, 1, dtype=torch.float64)
+    gain[3] = 0.1
+    assert gain_changes(recorded(sounds * gain)[1]) == {"03.wav": pytest.approx(-20.0, abs=1.5)}
+    # A louder room alone is another thing, and so is a softer impact.
+    loud = sounds.clone()
+    loud[3, :LEAD] *= 10.0
+    assert gain_changes(recorded(loud)[1]) == {}
+    soft = sounds.clone()
+    soft[3, LEAD:] *= 0.1
+    assert gain_changes(recorded(soft)[1]) == {}
 
 
 def test_a_fade_out_and_a_noise_gate_are_no_decays() -> None:

@@ -41,6 +41,8 @@ class AlignmentReport:
     """By how much a slice sounds fall more than vibrations do; None where they do not."""
     noise_drop_db: float | None
     """By how much noise is louder before the impacts than after; None where it is not."""
+    gain_changes_db: dict[str, float]
+    """Recordings of another gain, and by how much it is higher."""
 
     @classmethod
     def of(cls, modes: Extraction, impacts: Impacts) -> "AlignmentReport | None":
@@ -51,13 +53,14 @@ class AlignmentReport:
         left = [name for name, likely in zip(found.names, found.agreement.tolist(), strict=True) if likely < 0.5]
         delays = dict(zip(found.names, found.delays.tolist(), strict=True))
         aligned, inverted = modes.aligned(impacts), list(inverted_recordings(modes, impacts))
-        faults = rate_factors(modes, aligned), uneven_decay(modes, aligned), noise_drop(modes, impacts)
-        return cls(found.coherence_before, found.coherence_after, delays, left, inverted, *faults)
+        faults = rate_factors(modes, aligned), uneven_decay(modes, aligned)
+        levels = noise_drop(modes, impacts), gain_changes(impacts)
+        return cls(found.coherence_before, found.coherence_after, delays, left, inverted, *faults, *levels)
 
     @property
     def doubtful(self) -> set[str]:
         """The recordings that something is wrong with."""
-        return {*self.not_aligned, *self.inverted, *self.rate_factors}
+        return {*self.not_aligned, *self.inverted, *self.rate_factors, *self.gain_changes_db}
 
     def sentences(self) -> list[str]:
         """Return the faults of recordings, and how coherent the modes' phases are."""
@@ -77,6 +80,11 @@ class AlignmentReport:
             f"{name}: all its modes are {factor:.4g} times the others': it was recorded at {1 / factor:.4g} times the "
             "sample rate that its file gives; convert it from that rate, or remove its row"
             for name, factor in self.rate_factors.items()
+        ]
+        found += [
+            f"{name}: its noise and its sound are both about {abs(change):.0f} dB {'above' if change > 0 else 'below'} "
+            "the others: another gain or scale; export it as the others, record it again, or remove its row"
+            for name, change in self.gain_changes_db.items()
         ]
         if self.uneven_decay_db is not None:
             found.append(
@@ -122,7 +130,9 @@ _SLICES = 12
 _SURROGATES = 8
 """Sounds of the same modes and other noise that each recording is compared with."""
 _MIN_RECORDINGS = 6
-"""Recordings below which the spread of the correlations of their gains is not known."""
+"""Recordings below which the spread of their noise, or of the correlations of their gains, is not known."""
+_NAMED = 0.0228
+"""Probability that a recording of the same gain is named: that of two standard errors of a normal distribution."""
 _FALSE_ALARM = 1e-3
 """Probability that a capture without the fault is said to have it."""
 _LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -197,6 +207,36 @@ def noise_drop(modes: Extraction, impacts: Impacts) -> float | None:
     after = left[:, part : _SLICES // 2 * part].mean(1)
     silent = torch.minimum(before, after) <= 1e-14 * sounds.square().amax(1)
     return None if bool(silent.any()) else _surely_positive(10 * torch.log10(before / after))
+
+
+def gain_changes(impacts: Impacts) -> dict[str, float]:
+    """Return by how many dB the gain of a recording is higher than the others', where its noise and its sound are.
+
+    An impact may be soft, and a room quiet; a gain changes both. The noise before the onset has to differ from that of
+    the other recordings by more than chance (Student's predictive distribution, Bonferroni's correction) and by more
+    than two standard deviations of their levels, less being what impacts do; and the sound has to be nearer to theirs
+    without that difference. `impacts` are not yet aligned.
+    """
+    count = len(impacts)
+    if count < _MIN_RECORDINGS or impacts.before is None:
+        return {}
+    before = impacts.before[:, : impacts.before.shape[1] * 3 // 4].double().square().mean(1)
+    sound = impacts.sounds.double().square().mean(1)
+    if not bool((before > 1e-14 * sound.max()).all()):
+        return {}
+    (noise, noise_std), (level, level_std) = (_from_others(10 * torch.log10(each)) for each in (before, sound))
+    chance = 2 * count * torch.from_numpy(stdtr(count - 2, -(noise.abs() / noise_std).numpy()))
+    named = (chance < _NAMED) & (noise.abs() > 2 * level_std) & ((level - noise).abs() < level.abs())
+    return {impacts.names[row]: float(noise[row]) for row in torch.nonzero(named).flatten().tolist()}
+
+
+def _from_others(
+    values: Float64[Tensor, " contacts"],
+) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"]]:
+    """Return each value's difference from the mean of the others, and the standard deviation that it should have."""
+    count = len(values)
+    rest = values.expand(count, count)[~torch.eye(count, dtype=torch.bool)].reshape(count, count - 1)
+    return values - rest.mean(1), (rest.std(1) * math.sqrt(1 + 1 / (count - 1))).clamp_min(1e-9)
 
 
 def _surely_positive(values: Float64[Tensor, " contacts"]) -> float | None:
