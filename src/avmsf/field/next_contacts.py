@@ -86,12 +86,7 @@ def suggest(
     count = as_count(count, "count", raising=FitError)
     given = None if candidates is None else as_vectors(candidates, "candidates").double()
     gains = _mixture_of(field, unseen)
-    count_given = 0 if given is None else len(given)
-    if directions is not None and len(directions) != count_given:
-        raise FitError.expected(f"one for each of {count_given} candidates", len(directions), name="directions")
-    if directions is not None and len(faulty := torch.nonzero(~directions.isfinite().all(dim=1)).flatten()):
-        found = directions[faulty[0]].tolist()
-        raise FitError.expected("finite numbers", found, row=int(faulty[0]), name="directions")
+    _expect_directions(directions, 0 if given is None else len(given))
     with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
@@ -121,6 +116,17 @@ def suggest(
         points,
         len(points) - len(pool) if given is None else 0,
     )
+
+
+def _expect_directions(directions: Float[Tensor, "_given 3"] | None, count: int) -> None:
+    """Raise FitError unless there are none, or so many directions, all of finite numbers."""
+    if directions is None:
+        return
+    if len(directions) != count:
+        raise FitError.expected(f"one for each of {count} candidates", len(directions), name="directions")
+    if len(faulty := torch.nonzero(~directions.isfinite().all(dim=1)).flatten()):
+        row = int(faulty[0])
+        raise FitError.expected("finite numbers", directions[row].tolist(), row=row, name="directions")
 
 
 def _mixture_of(field: SoundField, unseen: bool) -> MixtureGains:

@@ -23,7 +23,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import POSITIONAL, Unstructured, Visual
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains, complex_of
-from avmsf.field.gains.outliers import others, predicts_better
+from avmsf.field.gains.outliers import Credibility, others, predicts_better
 from avmsf.field.gains.regression import Regression, Solution, sites_of
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.training import FittedGains, GainEstimator, TrainableGains, Trainer
@@ -166,11 +166,7 @@ class MixtureEstimator(GainEstimator):
             bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), known.with_thickness)
         found = self._refined(fit, bodies)
         (outliers, credibility), evidence = fit.assess(found), dict[str, float]()
-        # Supports are tried where they are asked for or stated, or where the free body predicts little.
-        little = credibility is not None and credibility.gained < _PREDICTS
-        tried = known is not None and (
-            known.supports == "try" or bool(known.held_at) or (known.supports == "auto" and little)
-        )
+        tried = known is not None and _may_be_held(known, credibility)
         if tried and known is not None and found.best is not None and (modes := known.held(found.best)) is not None:
             rows = others(fit.sites, {each.row for each in outliers})
             held = fit.held(rows, found.best, modes, stated=bool(known.held_at))
@@ -269,6 +265,12 @@ def estimator_for(
         if log is not None:
             log(f"no elastic mode shapes: {error}")
         return MixtureEstimator(kinds, missing=str(error), symmetries=symmetries())
+
+
+def _may_be_held(bodies: CandidateBodies, credibility: Credibility | None) -> bool:
+    """Return whether supports are tried: where they are asked for or stated, or the free body predicts little."""
+    little = credibility is not None and credibility.gained < _PREDICTS
+    return bodies.supports == "try" or bool(bodies.held_at) or (bodies.supports == "auto" and little)
 
 
 def _leveled(fit: Regression, found: Solution) -> tuple[Regression, Solution, list[float]]:
