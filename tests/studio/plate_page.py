@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ import trimesh
 from avmsf.capture.impacts import Impacts
 from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
+from avmsf.export.writing import write_folder
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.studio.routes import PAGE
@@ -93,7 +93,7 @@ def plate_object(kind: str, folder: Path) -> Path | None:
 def lay_out(folder: Path, table: SampledField, *, live: bool, **bundle: Any) -> Path:
     """Write the page with a field, and if `live` with what a server would tell of itself."""
     made = make_bundle(table, **bundle)
-    replace(made, manifest={**made.manifest, "live": LIVE if live else None}).write(folder)
+    write_folder(folder, made.files, {**made.manifest, "live": LIVE if live else None})
     shutil.copy(PAGE / "index.html", folder)
     shutil.copytree(PAGE, folder / "page")
     return folder
