@@ -109,7 +109,7 @@ def test_no_impacts_files_are_anothers(place: Place, tmp_path: Path, capsys: Str
     printed, _ = located(place, capsys, *words, "--output", str(tmp_path))
     stems = ["twin", "twin-2", "twin-2-2"]
     assert [Path(impact["picture"]).stem for impact in printed["impacts"]] == stems
-    assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{end}" for stem in stems for end in ("png", "ply")}
+    assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.png" for stem in stems}
 
 
 def test_recordings_without_an_impact_on_the_object_have_no_place(place, tmp_path, capsys):
