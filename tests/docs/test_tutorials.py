@@ -20,7 +20,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS = REPOSITORY / "docs"
 PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", DOCS / "getting-started.md")
 """Tutorials first: what they have run in the same folder is not repeated for README and getting started."""
-PHOTOGRAPHS, PYTHON = "**With photographs**", "## Python"
+PHOTOGRAPHS, PYTHON = "**With photographs**", "## [Python]"
 """Where README turns from a capture with a mesh to one with photographs, and to Python."""
 FEW_STEPS = sets("splat.steps=60 splat.start_points=800")
 FEW_VIEWS = sets("views.rendered=48 views.count=18")
@@ -64,6 +64,8 @@ def parts(page: Path) -> dict[str, str]:
     text = page.read_text()
     if page.stem != "README":
         return {"photographed" if page.stem == "photographs" else "workshop": text}
+    assert PHOTOGRAPHS in text
+    assert PYTHON in text
     mesh, _, rest = text.partition(PHOTOGRAPHS)
     # Its Python, which another test runs, would fit bodies of many thicknesses, for minutes.
     return {"workshop": mesh, "photographed": rest.partition(PYTHON)[0]}
