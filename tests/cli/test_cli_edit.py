@@ -112,6 +112,22 @@ def test_supporting_poles_are_no_modes_in_the_table(field: Path, capsys: Streams
     assert "850.00" not in shown
 
 
+def test_a_modes_level_is_one_number_in_info_and_edit_whatever_its_phase(field: Path, capsys: Streams) -> None:
+    corners = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float64)
+    values = torch.tensor([1.0, 1.0j, -1.0, 0.6 + 0.8j, 0.1j], dtype=torch.complex128).expand(3, 5)
+    alike = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(3, 3)
+    gains = replace(mixture(Sites(corners, alike), values, directional=False), points=corners.float())
+    save(replace(ceramic(), gain_field=gains), field)
+    new, found = field.with_name("new.safetensors"), []
+    changes = results_of(capsys, "edit", field, "-o", new, "--mode-db", "850", "-6")[0]["modes"]
+    assert [row["level_change_db"] for row in changes] == pytest.approx([0, -6, 0, 0, 0], abs=1e-4)
+    for path in (field, new):
+        found.append([row["level_db"] for row in results_of(capsys, "info", path)[0]["modes"]])
+    # The gains of a weaker mode are shrunk a little more by the noise.
+    assert found[0] == pytest.approx([0, 0, 0, 0, -20], abs=0.1)
+    assert np.subtract(*found[::-1]) == pytest.approx([0, -6, 0, 0, 0], abs=1e-4)
+
+
 def test_noise_that_has_become_loud_beside_the_modes_is_noted(field: Path, capsys: Streams) -> None:
     for level in (-12, -3):
         changes = [word for hertz in FREQUENCY.tolist() for word in ("--mode-db", hertz, level)]

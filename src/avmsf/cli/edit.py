@@ -133,7 +133,6 @@ def run(options: Options) -> int:
     from avmsf.cli.edit_report import changes_table, contact_of_sounds, draw, mode_changes, notes_on
     from avmsf.editing.modal_edit import EDITS, silenced
     from avmsf.field.store import load, save
-    from avmsf.plotting.edits import ModeLevels
 
     old = load(options.field)
     contact = contact_of_sounds(old, options.position)
@@ -142,10 +141,9 @@ def run(options: Options) -> int:
     for ending in ("checkpoint", "preview.wav") if options.guides else ():
         options.part(ending).unlink(missing_ok=True)
     edits = new.origin.report[EDITS][len(old.origin.report.get(EDITS, [])) :]
-    before, after = ModeLevels.of(old), ModeLevels.of(new)
-    modes, supporting = mode_changes(before, after, new.is_mode)
-    notes = [f"note: {each}" for each in notes_on(edits, new, before, after, scale=options.scale)]
-    show("\n".join([changes_table(modes, before, after, new.is_mode), *notes]))
+    modes, supporting = mode_changes(old, new)
+    notes = [f"note: {each}" for each in notes_on(edits, old, new, scale=options.scale)]
+    show("\n".join([changes_table(modes, old, new), *notes]))
     if options.plots is not None:
         draw(options.plots, (old, contact), (new, options.scale * contact), edits[-1])
     show(f"wrote {options.output}")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
@@ -17,7 +17,7 @@ from avmsf.cli.report import MAX_LISTED_MODES
 from avmsf.editing.guided import CLAP
 from avmsf.editing.modal_edit import remarks
 from avmsf.field.sound_field import SoundField
-from avmsf.plotting.edits import ModeLevels, draw_clap_curves, draw_edit
+from avmsf.plotting.edits import draw_clap_curves, draw_edit
 from avmsf.plotting.pictures import save_picture
 from avmsf.plotting.spectrograms import draw_spectrograms
 
@@ -29,28 +29,25 @@ _FieldAt = tuple[SoundField, Float64[Tensor, " 3"]]
 """A field and a contact on it, meters."""
 
 
-def mode_changes(
-    before: ModeLevels, after: ModeLevels, is_mode: Bool[Tensor, " modes"]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def mode_changes(old: SoundField, new: SoundField) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return what became of each mode, and of each supporting pole, in the field's order."""
     columns = {
-        "frequency_before": before.frequency,
-        "frequency_after": after.frequency,
-        "t60_before": before.t60,
-        "t60_after": after.t60,
-        "level_change_db": 20.0 * (after.size / before.size).log10(),
-        "silent": after.size == 0.0,
+        "frequency_before": old.bank.frequency,
+        "frequency_after": new.bank.frequency,
+        "t60_before": old.bank.t60,
+        "t60_after": new.bank.t60,
+        "level_change_db": 20.0 * (new.amplitudes / old.amplitudes).log10(),
+        "silent": new.amplitudes == 0.0,
     }
     cells = zip(*(column.tolist() for column in columns.values()), strict=True)
     rows = [dict(zip(columns, row, strict=True)) for row in cells]
-    return list(compress(rows, is_mode.tolist())), list(compress(rows, (~is_mode).tolist()))
+    return list(compress(rows, new.is_mode.tolist())), list(compress(rows, (~new.is_mode).tolist()))
 
 
-def changes_table(
-    rows: list[dict[str, Any]], before: ModeLevels, after: ModeLevels, is_mode: Bool[Tensor, " modes"]
-) -> str:
+def changes_table(rows: list[dict[str, Any]], old: SoundField, new: SoundField) -> str:
     """Return the rows of the modes of most energy, before or after, as a table."""
-    energy = (before.size.square() * before.t60).maximum(after.size.square() * after.t60)[is_mode]
+    before, after = (field.amplitudes.square() * field.bank.t60 for field in (old, new))
+    energy = before.maximum(after)[new.is_mode]
     listed = energy.argsort(descending=True)[:MAX_LISTED_MODES].sort().values.tolist()
     cells = []
     for row in (rows[place] for place in listed):
@@ -65,20 +62,19 @@ def changes_table(
     return table(f"{title}, before and after", columns, cells, words=0)
 
 
-def notes_on(
-    edits: list[dict[str, Any]], new: SoundField, before: ModeLevels, after: ModeLevels, *, scale: float
-) -> list[str]:
+def notes_on(edits: list[dict[str, Any]], old: SoundField, new: SoundField, *, scale: float) -> list[str]:
     """Return what a user of an edited field should know."""
     notes = [*remarks(edits, new)]
-    seconds, ringing = new.samples / new.sample_rate, after.longest_t60
-    if ringing > max(seconds, before.longest_t60):
+    seconds = new.samples / new.sample_rate
+    before, ringing = (max([0.0, *field.bank.t60[field.amplitudes > 0].tolist()]) for field in (old, new))
+    if ringing > max(seconds, before):
         notes.append(
             f"the longest T60 is {format_number(ringing)} s and rendered sounds last {format_number(seconds)} s; "
             f"render and export with --seconds {math.ceil(10 * ringing) / 10:g}"
         )
     if scale != 1.0:
         notes.append(f"positions on the edited object are {scale:g} times as large")
-    softer = 20.0 * float((before.size.norm() / after.size.norm()).log10())
+    softer = 20.0 * float((old.amplitudes.norm() / new.amplitudes.norm()).log10())
     if _LOUD_NOISE_DB < softer < math.inf and bool(new.residual.magnitude.any()):
         notes.append(f"the modes are {softer:.0f} dB softer and the noise is as loud as before; render with --no-noise")
     return notes
@@ -101,9 +97,8 @@ def draw(folder: Path, before: _FieldAt, after: _FieldAt, last: dict[str, Any]) 
     old, new = before[0], after[0]
     name, rate = old.origin.capture or "field", old.sample_rate
     sounds = torch.cat([field.render(place[None]) for field, place in (before, after)])
-    levels = ModeLevels.of(old), ModeLevels.of(new)
     pictures = {
-        "modes.png": draw_edit(*levels, sample_rate=rate, title=f"modes of {name}, edited"),
+        "modes.png": draw_edit(old, new, title=f"modes of {name}, edited"),
         "spectrograms.png": draw_spectrograms(
             {"": {"before": sounds[0], "after": sounds[1]}},
             ("before", "after"),

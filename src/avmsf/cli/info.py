@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     _Described = tuple[str, dict[str, Any], Callable[[], Figure]]
     """Text and values on a file, and what draws it."""
 
-_DRAWN_POINTS, _LISTED_POINTS = 4000, 500
-"""Of the surface: for pictures, and for the mean levels in a table."""
+_DRAWN_POINTS = 4000
 _DRAWN_CONTACTS = 4
 _BATCH = 1024
 """Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
@@ -71,12 +70,12 @@ def run(options: Options) -> int:
 
 def _describe_field(options: Options) -> None:
     from avmsf.capture import read_capture
-    from avmsf.cli.report import describe, field_lines, mode_rows, mode_table, score_table
+    from avmsf.cli.report import describe, field_lines, levels, mode_rows, mode_table, score_table
     from avmsf.evaluation.scores import evaluate
     from avmsf.field.store import load
 
     field = load(options.file)
-    rows, supporting = mode_rows(field.bank, mode_levels(field), field.is_mode)
+    rows, supporting = mode_rows(field.bank, levels(field.amplitudes), field.is_mode)
     values = {**describe(field), "modes": rows, "supporting_poles": supporting}
     of = ", levels on average over the object"
     lines = [*field_lines(field, options.file), mode_table(of, rows, len(supporting), every=options.all)]
@@ -104,16 +103,9 @@ def gains_at(field: "SoundField", points: "Float[Tensor, 'points 3']") -> "Float
     return torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])
 
 
-def mode_levels(field: "SoundField") -> "Float[Tensor, ' modes']":
-    """Return each mode's root mean square gain over the object against the strongest pole's, dB."""
-    from avmsf.cli.report import levels
-
-    points = field.gain_field.points
-    return levels(gains_at(field, points[:: max(1, len(points) // _LISTED_POINTS)]))
-
-
 def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:
     """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
+    from avmsf.cli.report import levels
     from avmsf.field.posterior import has_posterior, relative_gain_std
     from avmsf.mesh.points import farthest_points
     from avmsf.pipeline.fit import modes_words
@@ -128,7 +120,7 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
     points = points[:: max(1, len(points) // _DRAWN_POINTS)]
     gains, title = gains_at(field, points)[:, kept], f"gains of the modes of most energy of {name}"
     pictures = {
-        "modes": draw_modes(field.bank, mode_levels(field), is_mode=kept, title=f"{modes} of {name}"),
+        "modes": draw_modes(field.bank, levels(field.amplitudes), is_mode=kept, title=f"{modes} of {name}"),
         "gains": draw_gains(points, gains, field.bank.take(kept), title=title),
     }
     if recorded is not None:

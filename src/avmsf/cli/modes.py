@@ -66,7 +66,7 @@ def run(options: Options) -> int:
     count = counted(len(impacts), "recording")
     doing(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
     extraction = extract_modes(impacts, FINDERS[config.extraction](modes=config.modes))
-    level = levels(extraction.gains.abs())
+    level = levels(extraction.gains.abs().square().mean(0).sqrt())
     quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
     modes, supporting = mode_rows(extraction.bank, level, quality.is_mode, quality)
     aligned = AlignmentReport.of(extraction, impacts)

@@ -227,11 +227,10 @@ def features_lines(report: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def levels(amplitudes: Float[Tensor, "contacts modes"]) -> Float[Tensor, " modes"]:
-    """Return each mode's root mean square amplitude against the strongest pole's, dB."""
-    size = amplitudes.square().mean(0).sqrt()
-    smallest = torch.finfo(size.dtype).tiny
-    return 20 * torch.log10((size / size.max().clamp_min(smallest)).clamp_min(1e-10))
+def levels(amplitudes: Float[Tensor, " modes"]) -> Float[Tensor, " modes"]:
+    """Return each mode's amplitude against the strongest pole's, dB; at least -200."""
+    loudest = amplitudes.max().clamp_min(torch.finfo(amplitudes.dtype).tiny)
+    return 20 * torch.log10((amplitudes / loudest).clamp_min(1e-10))
 
 
 def mode_rows(
@@ -244,7 +243,7 @@ def mode_rows(
     columns = {
         "frequency_hertz": bank.frequency,
         "damping_per_second": bank.damping,
-        "t60_seconds": math.log(1000) / bank.damping,
+        "t60_seconds": bank.t60,
         "level_db": level_db,
     }
     if quality is not None:

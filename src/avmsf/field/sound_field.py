@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from avmsf.modal.synthesis import synthesize
 
 _BATCH = 32
 """Contacts rendered at once, which bounds the memory."""
+_LEVEL_POINTS = 256
+"""Points of the object that a mode's level is taken over, at most."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,13 @@ class SoundField:
         mask = torch.ones(len(self.bank), dtype=torch.bool)
         mask[self.origin.report.get(SUPPORTING, [])] = False
         return mask
+
+    @cached_property
+    def amplitudes(self) -> Float64[Tensor, " modes"]:
+        """Root mean square amplitude of each mode over the object; zero for those that do not sound."""
+        points = self.gain_field.points
+        known = self.known(points[:: max(1, -(-len(points) // _LEVEL_POINTS))])
+        return torch.where(self.audible, known.power.mean(0).sqrt(), 0.0)
 
     def save(self, path: str | Path) -> None:
         """Write the field to one safetensors file. Raises FieldFileError where it cannot be written."""

@@ -31,6 +31,11 @@ class ModalBank:
     def __len__(self) -> int:
         return self.frequency.shape[0]
 
+    @property
+    def t60(self) -> Float64[Tensor, " modes"]:
+        """Time in which each mode falls by 60 dB, s."""
+        return math.log(1000) / self.damping
+
     def take(self, rows: Tensor) -> "ModalBank":
         """Return the modes of these rows or of this mask."""
         return ModalBank(self.frequency[rows], self.damping[rows])

@@ -1,99 +1,66 @@
 """Figures of edits: modes before and after, and CLAP scores over the steps."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import mean
 from typing import TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import StrMethodFormatter
-from torch import Tensor
 
 from avmsf.field.sound_field import SoundField
 from avmsf.plotting.style import FIRST, SECOND, series_color, styled, titled_figure
 
 _RANGE_DB = 80.0
 """What is shown below the loudest."""
-_POINTS = 256
-"""Points of the object that a mode's level is taken over, at most."""
 _BANDS = 3
 """Bands an octave in which modes are counted."""
 
 
-@dataclass(frozen=True, eq=False)
-class ModeLevels:
-    """An object's modes by their mean level over its surface."""
-
-    frequency: Float64[Tensor, " modes"]
-    """Hz."""
-    t60: Float64[Tensor, " modes"]
-    """Time in which each falls by 60 dB, s."""
-    size: Float64[Tensor, " modes"]
-    """Root mean square amplitude over the surface; zero for modes that are silent."""
-
-    @classmethod
-    def of(cls, field: SoundField) -> "ModeLevels":
-        """Return those of a field."""
-        points = field.gain_field.points
-        known = field.known(points[:: max(1, -(-len(points) // _POINTS))])
-        size = torch.where(field.audible, known.power.mean(0).sqrt(), 0.0)
-        return cls(field.bank.frequency, np.log(1000.0) / field.bank.damping, size)
-
-    @property
-    def longest_t60(self) -> float:
-        """The longest T60 of the modes that sound, s; zero without one."""
-        return max([0.0, *self.t60[self.size > 0].tolist()])
-
-    def level_db(self, reference: float) -> Float64[Tensor, " modes"]:
-        """Return levels over an amplitude, dB; -inf for silent modes."""
-        return 20.0 * torch.log10(self.size / max(reference, torch.finfo(torch.float64).tiny))
-
-
 @styled
-def draw_edit(before: ModeLevels, after: ModeLevels, *, sample_rate: float, title: str) -> Figure:
+def draw_edit(before: SoundField, after: SoundField, *, title: str) -> Figure:
     """Draw levels, ring times and the number of modes over frequency (logarithmic), before and after an edit.
 
-    Modes that are silent have no level; the band above half the sample rate (Hz), where all are, is shaded.
+    Modes that are silent have no level; the band above half the sample rate, where all are, is shaded.
     """
     figure = titled_figure(title, 9, 8.4)
     levels, rings, counts = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
-    loudest = float(before.size.max())
+    loudest = before.amplitudes.max().clamp_min(torch.finfo(torch.float64).tiny)
     drawn = [("before", before, FIRST), ("after", after, SECOND)]
-    tops = [each.level_db(loudest).max().item() for _, each, _ in drawn if bool((each.size > 0).any())]
-    top = max([0.0, *tops])
-    for name, modes, color in drawn:
-        audible = (modes.size > 0).numpy()
-        frequency, t60 = modes.frequency.numpy(), modes.t60.numpy()
-        level = np.maximum(modes.level_db(loudest).numpy()[audible], top - _RANGE_DB)
+    top = max(0.0, 20.0 * float((after.amplitudes.max() / loudest).log10()))
+    for name, field, color in drawn:
+        audible = (field.amplitudes > 0).numpy()
+        frequency, t60 = field.bank.frequency.numpy(), field.bank.t60.numpy()
+        level = np.maximum(20.0 * (field.amplitudes / loudest).log10().numpy()[audible], top - _RANGE_DB)
         levels.vlines(frequency[audible], top - _RANGE_DB, level, colors=color, linewidths=1.2, alpha=0.7)
         levels.plot(frequency[audible], level, "o", color=color, markersize=4, label=name)
         rings.plot(frequency[audible], t60[audible], "o", color=color, markersize=4, alpha=0.8)
         rings.plot(frequency[~audible], t60[~audible], "o", color=color, markersize=4, mfc="none")
-    moves = (torch.stack([getattr(each, name) for each in (before, after)]).numpy() for name in ("frequency", "t60"))
+    banks = before.bank, after.bank
+    moves = [torch.stack([getattr(bank, name) for bank in banks]).numpy() for name in ("frequency", "t60")]
     rings.plot(*moves, color="gray", linewidth=0.5, alpha=0.5, zorder=0)
     _count(counts, drawn)
     levels.set(ylim=(top - _RANGE_DB, top + 6.0), ylabel="level (dB re strongest mode before)")
     levels.legend()
     rings.set(yscale="log", ylabel="decay time T60 (s)")
     counts.set(xlabel="frequency (Hz); hollow: silent", ylabel="modes per third-octave band")
-    highest = max(float(each.frequency.max()) for _, each, _ in drawn)
+    highest, nyquist = max(float(bank.frequency.max()) for bank in banks), 0.5 * before.sample_rate
     for axes in (levels, rings, counts):
         axes.set_xscale("log")
         axes.grid(which="both")
-        if highest >= 0.5 * sample_rate:
-            axes.axvspan(0.5 * sample_rate, 1.1 * highest, color="gray", alpha=0.2, linewidth=0)
+        if highest >= nyquist:
+            axes.axvspan(nyquist, 1.1 * highest, color="gray", alpha=0.2, linewidth=0)
     for axis in (counts.xaxis, rings.yaxis):
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     return figure
 
 
-def _count(axes: Axes, drawn: list[tuple[str, ModeLevels, str]]) -> None:
+def _count(axes: Axes, drawn: list[tuple[str, SoundField, str]]) -> None:
     """Draw how many modes there are in each band, silent ones left out."""
-    octaves = [modes.frequency[modes.size > 0].log2().numpy() * _BANDS for _, modes, _ in drawn]
+    octaves = [field.bank.frequency[field.amplitudes > 0].log2().numpy() * _BANDS for _, field, _ in drawn]
     both = np.concatenate(octaves)
     if not len(both):
         return

@@ -47,7 +47,7 @@ def draw_modes(
     frequency, level = bank.frequency.numpy(), level_db.numpy()
     bottom = 10.0 * math.floor(float(level.min()) / 10) - 5.0
     kept = np.ones(len(level), dtype=bool) if is_mode is None else is_mode.numpy()
-    t60 = math.log(1000) / bank.damping.numpy()
+    t60 = bank.t60.numpy()
     for axes, heights, foot, own in ((upper, level, bottom, FIRST), (lower, t60, 0.0, SECOND)):
         for rows, color in ((~kept, "lightgray"), (kept, own)):
             if rows.any():
