@@ -131,7 +131,7 @@ def test_a_modes_level_is_one_number_in_info_and_edit_whatever_its_phase(field: 
 def test_noise_that_has_become_loud_beside_the_modes_is_noted(field: Path, capsys: Streams) -> None:
     for level in (-12, -3):
         changes = [word for hertz in FREQUENCY.tolist() for word in ("--mode-db", hertz, level)]
-        _, shown = results_of(capsys, "edit", field, "-o", field.with_name("new.safetensors"), *changes)
+        _, shown = results_of(capsys, "edit", field, "-o", field.with_name("new.safetensors"), "--overwrite", *changes)
         assert ("note: the modes are 12 dB softer and the noise" in shown) == (level == -12)
 
 
@@ -193,7 +193,7 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(field, capsys, monk
     edited(field, "--pitch", "2", name="part")
     assert state.read_bytes() == kept
     del steps[:-1]
-    expect_same(edited(field, *words, name="part"), whole)
+    expect_same(edited(field, *words, "--overwrite", name="part"), whole)
     assert steps == [2, 3, 4]
     assert not list(field.parent.glob("*.preview.wav")) + list(field.parent.glob("*.checkpoint"))
 
@@ -319,9 +319,17 @@ def test_what_cannot_be_done_is_refused_before_a_model_is_loaded(words, field, m
     assert not field.with_name("new.safetensors").exists()
 
 
-def test_an_edit_overwrites_no_field_and_draws_no_contact_off_the_object(field: Path, capsys: Streams) -> None:
-    assert main(["edit", str(field), "--output", str(field), "--pitch", "2"]) == 2
-    assert capsys.readouterr().err.startswith(f"avmsf edit: {field}")
+def test_an_edit_overwrites_no_file_and_draws_no_contact_off_the_object(field: Path) -> None:
+    before = field.read_bytes()
+    with raises(OutputError, file=field, name="--output"):
+        run_verb("edit", str(field), "--output", str(field), "--pitch", "2", "--overwrite")
+    for name, content in (("edited", edited(field, "--pitch", "2", name="other")), ("sound", b"RIFF")):
+        there = field.with_name(f"{name}.safetensors")
+        there.write_bytes(content) if isinstance(content, bytes) else save(content, there)
+        with raises(OutputError, file=there, name="--overwrite"):
+            edited(field, "--pitch", "2", name=name)
+        edited(field, "--pitch", "2", "--overwrite", name=name)
+    assert field.read_bytes() == before
     with pytest.raises(OutputError):
         edited(field, "--pitch", "2", "--plots", str(field.with_name("look")), "--position", "100", "0", "0")
 

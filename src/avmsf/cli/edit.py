@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from avmsf.cli.options import Configured
+from avmsf.cli.options import Configured, Flag
 from avmsf.cli.output import doing, next_command, print_json, say, show
-from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg
+from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.cli.settings import with_settings
 from avmsf.editing.config import STABLE_AUDIO, EditSettings
 from avmsf.errors import EditError
@@ -33,6 +33,8 @@ class Options(Configured):
     field: FieldFile
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.safetensors"), New((".safetensors",))]
     """File to write the edited field to."""
+    overwrite: Flag = False
+    """Replace a file that is there."""
     to: _MaterialName = None
     """New material: ceramic, glass, wood, plastic, iron, polycarbonate or steel."""
     old: Annotated[str | None, arg("MATERIAL", name="from")] = None
@@ -126,6 +128,7 @@ class Options(Configured):
         if self.output.exists() and self.field.exists() and self.output.samefile(self.field):
             wanted, advice = "another file than the field to edit", "choose another --output"
             raise OutputError.expected(wanted, got="the same", file=self.output, name="--output", advice=advice)
+        expect_free(self.output, overwrite=self.overwrite)
 
 
 def run(options: Options) -> int:

@@ -3,7 +3,6 @@
 import shlex
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from avmsf._utils.text import RecordError, format_number, like, listed
+from avmsf._utils.text import format_number, listed
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.cli.many import Many, run_many
@@ -26,12 +25,11 @@ from avmsf.cli.options import (
     option_of,
 )
 from avmsf.cli.output import display, doing, next_command, next_step, print_json, print_result, show
-from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, arg
+from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.cli.settings import with_settings
-from avmsf.errors import FieldFileError, FitError
+from avmsf.errors import FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import GainModelName
-from avmsf.field.header import FIELD
 from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset
 
 if TYPE_CHECKING:
@@ -159,7 +157,14 @@ class Options(Configured, Many):
         config = self.all_settings
         if one and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
-            self._check_free(self.output)
+            source = self.capture
+            own = settings_of(source).name or (source.resolve().name if source.is_dir() else source.resolve().stem)
+            expect_free(
+                self.output,
+                overwrite=self.overwrite,
+                capture=own if self.until is None else None,
+                guess=self.material is not None,
+            )
         if self.material is not None:
             material_named(self.material, option="--material")
         self._check_unused(config)
@@ -173,23 +178,6 @@ class Options(Configured, Many):
                 wanted, advice = "a capture folder", "--material NAME computes a field of a mesh without recordings"
                 raise FitError.expected(wanted, got="a file", file=self.capture, name="--material", advice=advice)
             expect_capture(self.capture)
-
-    def _check_free(self, path: Path) -> None:
-        """Raise `OutputError` for a file that only --overwrite replaces: all but an unedited field of the capture."""
-        if self.overwrite or not path.exists():
-            return
-        source, found = self.capture, "another file"
-        own = settings_of(source).name or (source.resolve().name if source.is_dir() else source.resolve().stem)
-        # What is no field of this version is a file like any other.
-        with suppress(FieldFileError, RecordError):
-            origin = like(FIELD.parse(FIELD.read_text(path), path).get("origin"), {}, "origin")
-            report = like(origin.get("report"), {}, "origin.report")
-            same_kind = self.until is None and (self.material is None or "guess" in report)
-            if origin.get("capture") == own and same_kind and not report.get("edits"):
-                return
-            found = f"{'an edited' if report.get('edits') else 'a'} field of {origin.get('capture')!r}"
-        advice = "choose another, or add --overwrite to replace it"
-        raise OutputError.expected("a free name", found, got=found, file=path, name="--overwrite", advice=advice)
 
     def _check_unused(self, config: PipelineConfig) -> None:
         """Raise FitError for options that nothing would read."""

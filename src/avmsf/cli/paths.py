@@ -3,6 +3,7 @@
 An input exists and is no file of another kind; an output can be written, and its ending is that of its format.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -10,9 +11,10 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from avmsf._utils.headers import FEATURES_KEY, read_metadata
+from avmsf._utils.text import RecordError, like
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.capture.table import REQUIRED, read_table
-from avmsf.errors import AvmsfError
+from avmsf.errors import AvmsfError, FieldFileError
 from avmsf.field.header import FIELD
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
 
@@ -134,6 +136,26 @@ def expect_writable(path: Path) -> None:
     if not existing.is_dir():
         advice = f"choose another folder for {path.name}"
         raise OutputError.expected("a folder", "file", got="a file", file=existing, advice=advice)
+
+
+def expect_free(path: Path, *, overwrite: bool, capture: str | None = None, guess: bool = False) -> None:
+    """Raise `OutputError` for a file that only --overwrite replaces: all but an unedited field of the named capture.
+
+    With `guess`, all but one that was computed without recordings.
+    """
+    if overwrite or not path.exists():
+        return
+    found = "another file"
+    # What is no field of this version is a file like any other.
+    with suppress(FieldFileError, RecordError):
+        origin = like(FIELD.parse(FIELD.read_text(path), path).get("origin"), {}, "origin")
+        report = like(origin.get("report"), {}, "origin.report")
+        own = capture is not None and origin.get("capture") == capture and not report.get("edits")
+        if own and (not guess or "guess" in report):
+            return
+        found = f"{'an edited' if report.get('edits') else 'a'} field of {origin.get('capture')!r}"
+    advice = "choose another, or add --overwrite to replace it"
+    raise OutputError.expected("a free name", found, got=found, file=path, name="--overwrite", advice=advice)
 
 
 def path_mark(hint: Any) -> Existing | New | None:
