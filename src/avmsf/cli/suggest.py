@@ -20,10 +20,6 @@ TABLE, PICTURE = "suggested.csv", "suggested.png"
 _DRAWN_POINTS = 4000
 _UPWARD = 0.5
 """Part of a direction that goes up, from which on an impact is from below: 30 degrees above the horizontal."""
-_EXPLANATION = (
-    "uncertainty: by the field's posterior, relative to the energy of the gains; 0 = certain, 1 = silence. The error "
-    "of sounds is measured by leave-one-out, and that value is the one to rely on (avmsf info)"
-)
 
 
 @dataclass(frozen=True)
@@ -85,7 +81,11 @@ def run(options: Options) -> int:
     headings = {"order": "", "x": "x (m)", "y": "y (m)", "z": "z (m)", "error_after": "after"}
     title = f"where to record next: uncertainty of the gains now {format_number(found.before)}"
     lines = [table(title, [headings.get(each, each) for each in columns], cells, words=1 + (names is not None))]
-    lines.append(_EXPLANATION)
+    error = "" if field.quality is None else f", {format_number(field.quality.error)}"
+    lines.append(
+        "uncertainty: by the field's posterior, relative to the energy of the gains (0 certain, 1 silence); it only "
+        f"ranks contacts. What counts is the error of sounds by leave-one-out{error} (avmsf info)"
+    )
     if len(rows) < options.count:
         lines.append(f"{options.count} asked for: no other candidate is without a recording")
     if found.unreachable:
