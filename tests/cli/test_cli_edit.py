@@ -52,7 +52,7 @@ def field(tmp_path: Path) -> Path:
 
 def edited(field: Path, *words: str, name: str = "new") -> SoundField:
     output = field.with_name(f"{name}.safetensors")
-    assert run_verb("edit", str(field), "--output", str(output), *words) == 0
+    assert run_verb("edit", str(field), "--output", str(output), "--overwrite", *words) == 0
     return load(output)
 
 
@@ -193,7 +193,7 @@ def test_towards_a_recording_and_an_interrupted_edit_goes_on(field, capsys, monk
     edited(field, "--pitch", "2", name="part")
     assert state.read_bytes() == kept
     del steps[:-1]
-    expect_same(edited(field, *words, "--overwrite", name="part"), whole)
+    expect_same(edited(field, *words, name="part"), whole)
     assert steps == [2, 3, 4]
     assert not list(field.parent.glob("*.preview.wav")) + list(field.parent.glob("*.checkpoint"))
 
@@ -323,12 +323,13 @@ def test_an_edit_overwrites_no_file_and_draws_no_contact_off_the_object(field: P
     before = field.read_bytes()
     with raises(OutputError, file=field, name="--output"):
         run_verb("edit", str(field), "--output", str(field), "--pitch", "2", "--overwrite")
-    for name, content in (("edited", edited(field, "--pitch", "2", name="other")), ("sound", b"RIFF")):
-        there = field.with_name(f"{name}.safetensors")
-        there.write_bytes(content) if isinstance(content, bytes) else save(content, there)
+    sound = field.with_name("sound.safetensors")
+    sound.write_bytes(b"RIFF")
+    edited(field, "--pitch", "2")
+    for there in (field.with_name("new.safetensors"), sound):
         with raises(OutputError, file=there, name="--overwrite"):
-            edited(field, "--pitch", "2", name=name)
-        edited(field, "--pitch", "2", "--overwrite", name=name)
+            run_verb("edit", str(field), "--output", str(there), "--pitch", "2")
+    edited(field, "--pitch", "2", name="sound")
     assert field.read_bytes() == before
     with pytest.raises(OutputError):
         edited(field, "--pitch", "2", "--plots", str(field.with_name("look")), "--position", "100", "0", "0")

@@ -200,7 +200,7 @@ def score_table(title: str, scores: Mapping[str, Scores]) -> str:
         first, *others = HEADINGS
         with_error = f"{format_number(mean[first])} ± {format_number(error[first], 1)}"
         rows.append([method, with_error, *(format_number(mean[metric]) for metric in others)])
-    about = "own gains: measured in the held-out recordings themselves; about the least error that predictions can reach"
+    about = "own gains: measured in the held-out recordings themselves; about the least error that predictions reach"
     return "\n".join([table(title, ["", *HEADINGS.values()], rows), *([about] if _OWN_GAINS in scores else [])])
 
 
