@@ -24,7 +24,6 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import along_phase
 from avmsf.field.gains.estimator import MixtureEstimator
-from avmsf.field.posterior import fitted_mixture
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
@@ -266,7 +265,7 @@ class SplitCase:
 
         Intervals are normal, of a measured gain; each mode's phase, which all contacts share, is free.
         """
-        model = fitted_mixture(field)
+        model = field.fitted_mixture
         known = model.posterior(self.test.contacts, self.test.directions)
         assert known.std is not None
         gains = fit_gains(self.test.sounds.double(), field.bank, sample_rate=field.sample_rate)

@@ -11,7 +11,6 @@ import torch
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import FieldFileError, FitError
 from avmsf.field.next_contacts import suggest
-from avmsf.field.posterior import fitted_mixture, has_posterior, relative_gain_std
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.localization.locator import Locator
@@ -87,10 +86,10 @@ def test_doubt_grows_away_from_contacts_and_has_no_unit(made: type) -> None:
     contacts = contacts[contacts[:, 0] < 0.4 * LENGTH]
     values = drawn_gains(contacts, seed=6)
     points = bar_points()
-    doubt = relative_gain_std(sound_field(made(contacts, values)), points)
+    doubt = sound_field(made(contacts, values)).relative_gain_std(points)
     near, far = doubt[points[:, 0] < 0.3 * LENGTH].mean(), doubt[points[:, 0] > 0.8 * LENGTH].mean()
     assert float(far) > 2.0 * float(near)
-    louder = relative_gain_std(sound_field(made(contacts, 7.0 * values)), points)
+    louder = sound_field(made(contacts, 7.0 * values)).relative_gain_std(points)
     assert torch.allclose(louder, doubt, rtol=1e-4, atol=1e-6)
 
 
@@ -99,9 +98,9 @@ def test_an_edited_field_is_as_sure_of_itself_as_before(made: type) -> None:
     contacts, others = bar_contacts(30)[:12], bar_contacts(30)[12:]
     field = sound_field(made(contacts, drawn_gains(bar_contacts(30), seed=16)[:12]))
     points, same = bar_points()[::5], adjust_modes(field)
-    assert has_posterior(same)
-    assert fitted_mixture(same) is field.gain_field
-    assert torch.equal(relative_gain_std(same, points), relative_gain_std(field, points))
+    assert same.has_posterior
+    assert same.fitted_mixture is field.gain_field
+    assert torch.equal(same.relative_gain_std(points), field.relative_gain_std(points))
     maps = [Locator.of(each, points=points).locate(field.render(others[:1])[0]) for each in (field, same)]
     assert torch.equal(maps[0].probability, maps[1].probability)
 
@@ -113,7 +112,7 @@ def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
     above = adjust_modes(field, pitch=[1.0, 1.0, 4.0, 4.0])
     mute = adjust_modes(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
     points = bar_points()[::5]
-    assert torch.equal(relative_gain_std(above, points), relative_gain_std(mute, points))
+    assert torch.equal(above.relative_gain_std(points), mute.relative_gain_std(points))
 
 
 def test_what_cannot_be_said_is_refused() -> None:

@@ -13,7 +13,6 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from avmsf.errors import EvaluationError
-from avmsf.field.posterior import relative_gain_std
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank
@@ -317,7 +316,7 @@ def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
     contacts = bar_contacts(8)
     field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=9)))
     points = bar_points()
-    std = relative_gain_std(field, points)
+    std = field.relative_gain_std(points)
     sheet = draw_uncertainty(points, std, title="bar", contacts=contacts, suggested=contacts[:2])
     assert len(sheet.axes) == 2  # the sheet and its colors
     bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()

@@ -106,7 +106,6 @@ def gains_at(field: "SoundField", points: "Float[Tensor, 'points 3']") -> "Float
 def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:
     """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
     from avmsf.cli.report import levels
-    from avmsf.field.posterior import has_posterior, relative_gain_std
     from avmsf.mesh.points import farthest_points
     from avmsf.pipeline.fit import modes_words
     from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
@@ -134,8 +133,8 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
             normalize=False,
             title=f"{name}: recorded and rendered",
         )
-    if has_posterior(field):
-        std, title = relative_gain_std(field, points), f"uncertainty of the gains of {name}"
+    if field.has_posterior:
+        std, title = field.relative_gain_std(points), f"uncertainty of the gains of {name}"
         pictures["uncertainty"] = draw_uncertainty(points, std, title=title, contacts=field.gain_field.contacts)
     if field.gain_field.surface is not None:
         pictures["surface"] = draw_surface(field.gain_field.surface, title=f"the body of {name}")

@@ -108,7 +108,6 @@ def run(options: Options) -> int:
 def _write(folder: Path, field: "SoundField", found: "Suggestions", rows: Sequence[Sequence[Any]]) -> None:
     """Write the list of contacts, and draw them on the object with the uncertainty of its gains."""
     from avmsf._utils.files import write_whole
-    from avmsf.field.posterior import relative_gain_std
     from avmsf.plotting.pictures import save_picture
     from avmsf.plotting.uncertainty import draw_uncertainty
 
@@ -117,7 +116,7 @@ def _write(folder: Path, field: "SoundField", found: "Suggestions", rows: Sequen
     points = field.gain_field.points[:: max(1, len(field.gain_field.points) // _DRAWN_POINTS)]
     picture = draw_uncertainty(
         points,
-        relative_gain_std(field, points),
+        field.relative_gain_std(points),
         title=f"{field.origin.capture or 'field'}: uncertainty, and where to record next",
         contacts=field.gain_field.contacts,
         suggested=found.contacts,

@@ -13,7 +13,6 @@ from avmsf._utils.text import counted
 from avmsf.errors import EditError
 from avmsf.field.gains.model import Gains
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.posterior import scale_of
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.clips import Sounds
 from avmsf.modal.modes import ModalBank
@@ -52,7 +51,7 @@ def edited(
 
 def muted(field: SoundField) -> Bool[Tensor, " modes"]:
     """Return which modes edits have given gains of zero; no edit restores them."""
-    return scale_of(field) == 0
+    return field.scale == 0
 
 
 def silenced(field: SoundField) -> Bool[Tensor, " modes"]:

@@ -16,8 +16,8 @@ a kernel K with a noise share q, the scale s^2 integrated out:
   bodies computed by finite elements. Each is multiplied by the cosine between the impacts' directions.
 - **Weights of hypotheses** (`gains.mixture`, `fitting`): the posterior w ~ pi_h p(y | K_h, q), with the prior pi of
   kernel categories learned from all modes by expectation maximization (MacKay, 1992). None is selected.
-- **Posterior** (`posterior`, `MixtureGains.posterior`): at a new contact with covariances k, the mixture over h of
-  means k' C^-1 y and variances Q/n (k0 - k' C^-1 k), Q = y' C^-1 y (R&W 2.25, 2.26, with s^2 by its posterior);
+- **Posterior** (`SoundField.posterior`): at a new contact with covariances k, the mixture over h of means k' C^-1 y and
+  variances Q/n (k0 - k' C^-1 k), Q = y' C^-1 y (R&W 2.25, 2.26, with s^2 by its posterior);
   leave-one-place-out errors follow in closed form (R&W 5.4.2) and give `quality`, outliers and `next_contacts`.
 
 Types: `SoundField` (`sound_field`); `GainModel` with `AttentionGains` (the paper's network), `MixtureGains`,

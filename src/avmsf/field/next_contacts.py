@@ -16,7 +16,6 @@ from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import off_surface
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.hammer_access import HAMMER_DIAMETER, reached_on_mesh, reached_on_points
-from avmsf.field.posterior import energy_of, fitted_mixture
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.points import farthest_points
 
@@ -134,7 +133,7 @@ def _mixture_of(field: SoundField, unseen: bool) -> MixtureGains:
     if isinstance(field.gain_field, ScaledGains):
         wanted, advice = "a field as fitted", "give the unedited field"
         raise FitError.expected(wanted, "edited", got="an edited one", name="field", advice=advice)
-    gains = fitted_mixture(field)
+    gains = field.fitted_mixture
     if unseen and gains.body is None:
         wanted, advice = "a field with the object's surface", "leave unseen out, or give candidates"
         raise FitError.expected(wanted, True, got="one without", name="unseen", advice=advice)
@@ -162,7 +161,7 @@ def _choose(
     for mode, covariance, noise in gains.covariances(places, directions):
         variance += weights[mode] * torch.diagonal(covariance)[:size].clamp_min(0.0)
         modes.append((weights[mode] * covariance[:, size:], weights[mode] * noise))
-    energy = float(energy_of(field, gains.predict(points.float()).parts).mean() + variance.mean())
+    energy = float(field.energy(gains.predict(points.float()).parts).mean() + variance.mean())
 
     def measured(shared: Float64[Tensor, "places candidates"], noise: float) -> Float64[Tensor, " candidates"]:
         """Return the variance of a measured gain at each candidate."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors, short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import PositionWarning
+from avmsf.errors import FitError, PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
 from avmsf.field.gains.model import GainModel, Gains, expect_near, off_surface
@@ -29,6 +29,8 @@ _BATCH = 32
 """Contacts rendered at once, which bounds the memory."""
 _LEVEL_POINTS = 256
 """Points of the object that a mode's level is taken over, at most."""
+_MAX_MAPPED_POINTS = 1000
+"""Points that the mean over the surface is taken over, at most."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,33 @@ class SoundField:
         known = self.known(points[:: max(1, -(-len(points) // _LEVEL_POINTS))])
         return torch.where(self.audible, known.power.mean(0).sqrt(), 0.0)
 
+    @property
+    def scale(self) -> Float64[Tensor, " modes"]:
+        """The gains over the fitted ones: 1, or what an edit has made of each mode."""
+        return torch.ones(len(self.bank), dtype=torch.float64) * self.gain_field.scale
+
+    @property
+    def has_posterior(self) -> bool:
+        """Whether the uncertainty of the gains is known."""
+        gains = self.gain_field.fitted
+        return isinstance(gains, MixtureGains) and gains.place_count >= 2
+
+    @property
+    def fitted_mixture(self) -> MixtureGains:
+        """The gain model that the field was fitted with, beneath its edits.
+
+        Raises FitError where its uncertainty is not known: for the attention network, a guess without recordings, and
+        contacts in a single place.
+        """
+        gains = self.gain_field.fitted
+        if not isinstance(gains, MixtureGains):
+            wanted, advice = f"gains of the kind {MixtureGains.kind!r}", "fit recordings with --gain-model auto"
+            raise FitError.expected(wanted, gains.kind, name="field", advice=advice)
+        if gains.place_count < 2:
+            wanted, advice = "recordings at 2 positions or more", "record impacts at another position"
+            raise FitError.expected(wanted, gains.place_count, name="field", advice=advice)
+        return gains
+
     def save(self, path: str | Path) -> None:
         """Write the field to one safetensors file. Raises FieldFileError where it cannot be written."""
         from avmsf.field.store import save
@@ -160,12 +189,27 @@ class SoundField:
             FitError: For a field without a posterior: of the attention network, of recordings in one place, or guessed
                 without recordings.
         """
-        from avmsf.field.posterior import fitted_mixture
-
-        fitted_mixture(self)
+        _ = self.fitted_mixture
         known = self.gain_field.posterior(*self._impacts(positions, directions))
         assert known.std is not None
         return GainPosterior(self._amplitudes(known), known.std.double().square().sum(2).sqrt())
+
+    def relative_gain_std(self, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
+        """Return the standard deviation of the gains at points (meters) over their root mean square on the object.
+
+        Both as energy over all modes: 0 is certainty; places that may be louder than the mean can have more than 1.
+        Raises as `fitted_mixture`.
+        """
+        _, surface = self.fitted_mixture, self.gain_field.points
+        step = max(1, len(surface) // _MAX_MAPPED_POINTS)
+        energy = self.energy(self.gain_field.predict(surface[::step]).parts).mean()
+        std = self.gain_field.posterior(points).std
+        assert std is not None
+        return (self.energy(std) / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
+
+    def energy(self, parts: Float[Tensor, "contacts modes 2"]) -> Float64[Tensor, " contacts"]:
+        """Return the energy of gains in two parts: the sum over audible modes of squares over four dampings."""
+        return (parts.double().square().sum(2) * self.audible / (4.0 * self.bank.damping.double())).sum(1)
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings of the object with the starts that the field's sounds have."""

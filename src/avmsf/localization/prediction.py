@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.posterior import fitted_mixture, has_posterior, scale_of
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.likelihood import Likelihood, PredictedGains
 from avmsf.mesh.points import farthest_points
@@ -31,7 +30,7 @@ _MIN_CONTACTS = 3
 
 def can_self_calibrate(field: SoundField) -> bool:
     """Return whether a field's own contacts suffice to estimate its errors elsewhere."""
-    return has_posterior(field) and len(fitted_mixture(field).contacts) >= _MIN_CONTACTS
+    return field.has_posterior and len(field.fitted_mixture.contacts) >= _MIN_CONTACTS
 
 
 def calibration_factor(field: SoundField) -> float:
@@ -42,7 +41,7 @@ def calibration_factor(field: SoundField) -> float:
     """
     if not can_self_calibrate(field):
         return 1.0
-    errors = fitted_mixture(field).standardized_errors().abs()
+    errors = field.fitted_mixture.standardized_errors().abs()
     return float(torch.nanquantile(errors.flatten(), _LEVEL)) / NormalDist().inv_cdf(0.5 + _LEVEL / 2.0)
 
 
@@ -164,7 +163,7 @@ def calibrate_tempering(field: SoundField) -> float:
     """
     if not can_self_calibrate(field):
         return 1.0
-    gains = fitted_mixture(field)
+    gains = field.fitted_mixture
     fitted = replace(field, gain_field=gains)
     contacts = farthest_points(gains.contacts, min(_MAX_HOLDOUT, len(gains.contacts)))
     points = gains.points.double()
@@ -178,7 +177,7 @@ def calibrate_tempering(field: SoundField) -> float:
     prior = point_areas(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
     smoothing = smoothing_matrix(places, contacts=distinct_contacts(fitted))
     # A locator leaves the others out, too.
-    kept = torch.nonzero(field.audible & (scale_of(field) != 0.0)).flatten()
+    kept = torch.nonzero(field.audible & (field.scale != 0.0)).flatten()
     rotated = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
     score = -0.5 * (_FACTORS.log() / _LOG_PRIOR_STD).square()
     for contact, truth in zip(contacts.tolist(), truths.tolist(), strict=True):

@@ -21,7 +21,7 @@ def draw_uncertainty(
     suggested: Float[Tensor, "suggested 3"] | None = None,
     directions: Float[Tensor, "suggested 3"] | None = None,
 ) -> Figure:
-    """Draw the relative standard deviation of gains (`relative_gain_std`) on an object's points (object frame, meters).
+    """Draw `SoundField.relative_gain_std` on an object's points (object frame, meters).
 
     From six sides. Recorded `contacts` are marked by crosses, `suggested` ones by their numbers, each where it
     is visible: no point is in front of it, and the impact, whose `directions` may be given, points away from the

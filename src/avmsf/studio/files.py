@@ -21,7 +21,6 @@ from avmsf.export.sampled_field import SampledField, outward_normals, supporting
 from avmsf.export.writing import MAX_POINTS
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.gains.model import points_on_object
-from avmsf.field.posterior import scale_of
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.ply import holds_gaussians, read_splats
 from avmsf.mesh.surface import Surface, read_surface
@@ -194,7 +193,7 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
     """
     if before.gain_field.fitted is not after.gain_field.fitted or not torch.equal(before.phase, after.phase):
         return None
-    old, new = scale_of(before), scale_of(after)
+    old, new = before.scale, after.scale
     if bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):
         return None
     audible = torch.nonzero(after.audible).flatten()

@@ -83,6 +83,8 @@ class GainModel(ABC):
     """Points of the object's surface, object frame, meters: where pictures and searches look."""
     length: float = 1.0
     """Lengths on this object over those on the object that the gains were fitted to."""
+    scale: Float64[Tensor, " modes"] | float = 1.0
+    """Gains over the fitted ones."""
 
     @property
     def fitted(self) -> "GainModel":
