@@ -111,6 +111,9 @@ class _SpectralL1(torch.autograd.Function):
         padded = _padded(sounds, widest)
         slope = torch.zeros_like(padded)
         loss = sounds.new_zeros(())
+        compare, overlap_add = _compare_torch, _overlap_add_torch
+        if sounds.device.type == "cpu":
+            compare, overlap_add = _compare_numpy, _overlap_add_numpy
         for known in target.resolutions:
             size = len(known.window)
             # Short sounds may have fewer frames than are skipped.
@@ -123,12 +126,11 @@ class _SpectralL1(torch.autograd.Function):
             for rows, part in _chunks(frames):
                 spectra = torch.fft.rfft(frames[rows, part] * known.window)
                 place = start + step * part.start
-                loss.add_(_compare(spectra, known.magnitudes[rows], known.floor, place, step), alpha=factor)
+                loss.add_(compare(spectra, known.magnitudes[rows], known.floor, place, step), alpha=factor)
                 if ctx.needs_input_grad[0]:
                     # From here on the spectra are the slope's.
                     slopes = torch.fft.irfft(spectra, size, norm="forward")
-                    into = slope[rows, before + part.start * stride :]
-                    _overlap_add(into, slopes, known.window, stride, 0.5 * factor)
+                    overlap_add(slope[rows, before + part.start * stride :], slopes, known.window, stride, 0.5 * factor)
         ctx.save_for_backward(slope[:, widest // 2 : widest // 2 + sounds.shape[1]])
         return loss
 
@@ -141,22 +143,8 @@ class _SpectralL1(torch.autograd.Function):
         return outer * slope, None, None, None
 
 
-def _overlap_add(
-    into: Float[Tensor, "contacts samples"],
-    frames: Float[Tensor, "contacts frames size"],
-    window: Float[Tensor, " size"],
-    hop: int,
-    factor: float,
-) -> None:
-    """Add windowed frames times a factor, which begin at 0, hop, 2 hop, ..., to signals, in place."""
-    if frames.device.type != "cpu":
-        _overlap_add_torch(into, frames, window, hop, factor)
-        return
-    values = window.numpy()
-    _overlap_add_compiled(into.numpy(), frames.numpy(), values * values.dtype.type(factor), hop)
-
-
 def _overlap_add_torch(into: Tensor, frames: Tensor, window: Tensor, hop: int, factor: float) -> None:
+    """Add windowed frames times a factor, which begin at 0, hop, 2 hop, ..., to signals, in place."""
     count, size = frames.shape[1:]
     into = into[:, : (count - 1) * hop + size]
     # The transpose of cutting a signal into frames: one call, whatever the hop.
@@ -164,6 +152,11 @@ def _overlap_add_torch(into: Tensor, frames: Tensor, window: Tensor, hop: int, f
         signal = into.detach().requires_grad_()
         cut = signal.unfold(1, size, hop)
     into.add_(torch.autograd.grad(cut, signal, frames.mul_(window))[0], alpha=factor)
+
+
+def _overlap_add_numpy(into: Tensor, frames: Tensor, window: Tensor, hop: int, factor: float) -> None:
+    values = window.numpy()
+    _overlap_add_compiled(into.numpy(), frames.numpy(), values * values.dtype.type(factor), hop)
 
 
 @compiled()
@@ -198,31 +191,22 @@ def _magnitude(spectra: Complex[Tensor, "contacts frames bins"], floor: float) -
     return spectra.abs().clamp_min_(math.sqrt(floor))
 
 
-def _compare(
-    spectra: Complex[Tensor, "contacts frames bins"],
-    target: Float[Tensor, "contacts _frames bins"],
-    floor: float,
-    first: int,
-    every: int,
-) -> Float[Tensor, ""]:
+def _compare_torch(spectra: Tensor, target: Tensor, floor: float, first: int, every: int) -> Float[Tensor, ""]:
     """Return the L1 distance of magnitudes to the target's frames `first` + i `every`; turn `spectra` into its slope.
 
     The slope is doubled in the first and the last bin, which a one-sided inverse transform counts once, others twice.
     """
-    if spectra.device.type != "cpu":
-        return _compare_torch(spectra, target, floor, first, every)
-    known = target.numpy()
-    return target.new_tensor(_compare_compiled(spectra.numpy(), known, known.dtype.type(floor), first, every))
-
-
-def _compare_torch(spectra: Tensor, target: Tensor, floor: float, first: int, every: int) -> Float[Tensor, ""]:
     found = _magnitude(spectra, floor)
     difference = found - target[:, first : first + every * spectra.shape[1] : every]
     distance = torch.linalg.vector_norm(difference, 1)
     spectra *= difference.sign_().div_(found)
-    # The first and the last bin.
     spectra[..., :: spectra.shape[2] - 1].mul_(2.0)
     return distance
+
+
+def _compare_numpy(spectra: Tensor, target: Tensor, floor: float, first: int, every: int) -> Float[Tensor, ""]:
+    known = target.numpy()
+    return target.new_tensor(_compare_compiled(spectra.numpy(), known, known.dtype.type(floor), first, every))
 
 
 # Not all of fastmath: a fit that diverges is known by what is not a number.
