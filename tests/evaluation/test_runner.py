@@ -27,7 +27,7 @@ from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.plan import Evaluation
 from avmsf.evaluation.registry import PROTOCOLS, MetricSettings
 from avmsf.evaluation.report import write_summary
-from avmsf.evaluation.results import ResultsFolder, natural
+from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import CaseRun, ObjectData, Progress, run_objects
 from avmsf.evaluation.simple_methods import NearestRecording
 from avmsf.evaluation.splits import Case, split
@@ -202,10 +202,6 @@ def test_a_folder_of_other_things_and_damaged_results_are_refused(plates: Path, 
         (results.path / "objects" / "a.json").write_text(content)
         with raises(EvaluationError, file="objects/a.json"):
             results.records()
-
-
-def test_names_are_in_natural_order() -> None:
-    assert sorted(["10", "9", "a10", "a9", "1_x"], key=natural) == ["1_x", "9", "10", "a9", "a10"]
 
 
 def test_methods_with_modes_are_compared_with_the_truth(tmp_path: Path) -> None:

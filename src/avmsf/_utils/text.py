@@ -8,6 +8,7 @@ import csv
 import io
 import json
 import math
+import re
 import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -74,6 +75,16 @@ def listed(names: Sequence[str], *, most: int = 5, separator: str = ", ") -> str
     """Return the first names or sentences and how many more there are."""
     more = len(names) - most
     return separator.join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Return names in natural order: numbers within them by value, 2 before 10, and before letters."""
+
+    def key(name: str) -> list[tuple[bool, int, str]]:
+        parts = re.findall(r"\d+|\D+", name)
+        return [(not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
+
+    return tuple(sorted(names, key=key))
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import soundfile
 
+from avmsf._utils.text import in_order
 from avmsf.capture.filenames import find_surface_file, shows_object
 from avmsf.capture.folder import Capture, read_capture
 from avmsf.capture.issues import Issues
@@ -13,7 +14,7 @@ from avmsf.capture.settings import TABLE, settings_of
 from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.datasets.dataset import Dataset, DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.detect import detect_dataset
-from avmsf.datasets.numbering import in_order, refuse_unknown
+from avmsf.datasets.numbering import refuse_unknown
 from avmsf.datasets.objectfolder import ObjectFolderRaw
 from avmsf.datasets.realimpact import RealImpact
 from avmsf.errors import CaptureError, DatasetError

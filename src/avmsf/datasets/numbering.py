@@ -1,10 +1,11 @@
 """Numbers, names and subsets of the objects of ObjectFolder Real and RealImpact."""
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from difflib import get_close_matches
 from typing import NoReturn
 
+from avmsf._utils.text import in_order
 from avmsf.errors import DatasetError
 
 REALIMPACT_NAMES = (
@@ -34,12 +35,6 @@ def number_of(identifier: str) -> int | None:
     """Return the number that a folder's name begins with, 100 of `100_Frisbee` and of `100`; None if there is none."""
     found = re.match(r"(0|[1-9]\d*)(?:_|$)", identifier)
     return int(found[1]) if found else None
-
-
-def in_order(names: Iterable[str]) -> tuple[str, ...]:
-    """Return names by their numbers, 2 before 10; those without a number come last."""
-    numbered = ((number_of(name), name) for name in names)
-    return tuple(name for _, _, name in sorted((number is None, number or 0, name) for number, name in numbered))
 
 
 def shared_objects() -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from avmsf._utils.text import parse_json, read_text
+from avmsf._utils.text import in_order, parse_json, read_text
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.checks import find_surface
 from avmsf.capture.folder import Capture
@@ -19,7 +19,6 @@ from avmsf.capture.table import Impact
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
-    in_order,
     in_words,
     material_in,
     number_of,

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
+from avmsf._utils.text import in_order
 from avmsf.capture.audio import Recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
@@ -16,7 +17,6 @@ from avmsf.capture.table import Impact
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import (
     REALIMPACT_NAMES,
-    in_order,
     in_words,
     material_in,
     number_of,

@@ -21,7 +21,7 @@ from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text import json_text, read_json_object
+from avmsf._utils.text import in_order, json_text, read_json_object
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.errors import AvmsfError, CaptureError, EvaluationError
 from avmsf.evaluation.splits import Case
@@ -165,8 +165,8 @@ class ResultsFolder:
 
     def records(self) -> tuple[ObjectRecord, ...]:
         """Return all objects' records, in natural order."""
-        paths = sorted((self.path / OBJECTS).glob("[!.]*.json"), key=lambda path: natural(path.stem))
-        return tuple(map(self._record, paths))
+        names = in_order(path.stem for path in (self.path / OBJECTS).glob("[!.]*.json"))
+        return tuple(self._record(self._path_of(name)) for name in names)
 
     def _path_of(self, identifier: str) -> Path:
         return self.path / OBJECTS / f"{identifier}.json"
@@ -238,12 +238,6 @@ def failure_of(error: Exception) -> str:
 def file_word(name: str) -> str:
     """Return a name for files: methods that read a folder have its path in their name."""
     return re.sub(r"[^\w-]", "-", name)
-
-
-def natural(name: str) -> list[tuple[bool, int, str]]:
-    """Return a key that sorts numbers within names by value."""
-    parts = re.findall(r"\d+|\D+", name)
-    return [(not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
 
 
 def _flat(values: Any, name: str = "") -> dict[str, Any]:
