@@ -29,14 +29,7 @@ from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.evaluation.metrics import envelope_distance
 from avmsf.evaluation.registry import kind_of, method_entry, resolve
-from avmsf.evaluation.simple_methods import (
-    MeanGains,
-    MeanWaveform,
-    NearestRecording,
-    RandomImpact,
-    SplineGains,
-    WhiteNoise,
-)
+from avmsf.evaluation.simple_methods import MeanGains
 from avmsf.evaluation.task import Contacts, Method, Renderer, Sounds, Task, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.material import MATERIALS
@@ -102,31 +95,6 @@ def method_named(name: str) -> Method:
     return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings, **settings), weights, entry.visual_input)
 
 
-def white_noise(task: Task) -> WhiteNoise:
-    """Return noise as loud as the training recordings (the paper's White Noise)."""
-    return WhiteNoise(task.train, seed=task.seed)
-
-
-def random_impact(task: Task) -> RandomImpact:
-    """Return a recording of another object (the paper's Random Impact)."""
-    return RandomImpact(task.other_recording(), task.train.sample_rate)
-
-
-def nearest_recording(task: Task) -> NearestRecording:
-    """Return the nearest training recording."""
-    return NearestRecording(task.train)
-
-
-def mean_waveform(task: Task, *, by_direction: bool = False) -> MeanWaveform:
-    """Return the mean of the nearest training recordings (the paper's KNN)."""
-    return MeanWaveform(task.train, by_direction=by_direction)
-
-
-def mean_gains(task: Task) -> MeanGains:
-    """Return the shared modes with the mean of the nearest recordings' gains."""
-    return MeanGains(task.train, task.modes(), noise=True, seed=task.seed)
-
-
 def mean_trained_gains(task: Task) -> MeanGains:
     """Return the trained field of `paper` with the mean of its own gains at the nearest training contacts."""
     field = task.field("paper")
@@ -134,11 +102,6 @@ def mean_trained_gains(task: Task) -> MeanGains:
     trained = Extraction(field.bank, gains.to(torch.complex64), field.residual)
     # The network knows no directions: its gains are of one sign wherever a hammer came from.
     return MeanGains(replace(task.train, directions=None), trained, noise=True, seed=task.seed)
-
-
-def spline_gains(task: Task) -> SplineGains:
-    """Return the shared modes with gains by splines over the contacts."""
-    return SplineGains(task.train, task.modes(), noise=True, seed=task.seed)
 
 
 def diffsound(

@@ -97,17 +97,21 @@ def _guided(title: str, parameters: str) -> MethodEntry:
 
 
 METHODS: dict[str, MethodEntry] = {
-    "white-noise": MethodEntry("Gaussian noise at the level of the training recordings", "methods:white_noise"),
-    "random-impact": MethodEntry("a recording of another object", "methods:random_impact"),
-    "nearest": MethodEntry("the nearest training recording", "methods:nearest_recording"),
-    "knn3": MethodEntry("mean waveform of the three nearest recordings (the paper's KNN)", "methods:mean_waveform"),
+    "white-noise": MethodEntry(
+        "Gaussian noise at the level of the training recordings", "simple_methods:WhiteNoise.of"
+    ),
+    "random-impact": MethodEntry("a recording of another object", "simple_methods:RandomImpact.of"),
+    "nearest": MethodEntry("the nearest training recording", "simple_methods:NearestRecording.of"),
+    "knn3": MethodEntry(
+        "mean waveform of the three nearest recordings (the paper's KNN)", "simple_methods:MeanWaveform.of"
+    ),
     "knn3-directions": MethodEntry(
         "mean waveform of the three nearest recordings, by position and impact direction",
-        "methods:mean_waveform",
+        "simple_methods:MeanWaveform.of",
         settings={"by_direction": True},
     ),
-    "knn-gains": MethodEntry("modal gains averaged over the three nearest recordings", "methods:mean_gains"),
-    "spline-gains": MethodEntry("modal gains by thin-plate splines", "methods:spline_gains"),
+    "knn-gains": MethodEntry("modal gains averaged over the three nearest recordings", "simple_methods:MeanGains.of"),
+    "spline-gains": MethodEntry("modal gains by thin-plate splines", "simple_methods:SplineGains.of"),
     "diffsound": MethodEntry("reimplementation of DiffSound with a measured residual", "methods:diffsound"),
     "paper-diffsound": MethodEntry(
         "reimplementation of DiffSound with the residual that `paper` learns, as in the paper",

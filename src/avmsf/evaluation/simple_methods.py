@@ -7,6 +7,7 @@ import zlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from torch.nn.functional import normalize
 
 from avmsf.capture.impacts import Impacts, places_of
 from avmsf.errors import EvaluationError
-from avmsf.evaluation.task import Amplitudes, Contacts, Sounds
+from avmsf.evaluation.task import Amplitudes, Contacts, Sounds, Task
 from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites
 from avmsf.mesh.points import nearest_points
@@ -27,6 +28,8 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import shape_noise
 from avmsf.modal.synthesis import synthesize
 
+_Baseline = TypeVar("_Baseline", bound="_Trained")
+
 
 @dataclass(frozen=True, eq=False)
 class _Trained:
@@ -34,24 +37,21 @@ class _Trained:
 
     train: Impacts
 
+    @classmethod
+    def of(cls: type[_Baseline], task: Task, **settings: Any) -> _Baseline:
+        """Return the baseline of a task's training recordings."""
+        return cls(task.train, **settings)
+
     @property
     def sample_rate(self) -> float:
         """Samples per second, Hz."""
         return self.train.sample_rate
 
-
-class _Neighbors:
-    """What is averaged over the nearest training impacts."""
-
-    train: Impacts
-    count: int
-
-    @property
-    def neighbors(self) -> int:
-        """How many are averaged: all where there are fewer than `count`. Raises EvaluationError for none."""
-        if self.count < 1:
-            raise EvaluationError.expected("1 or more training impacts", self.count, name="count")
-        return min(self.count, len(self.train))
+    def neighbors(self, count: int) -> int:
+        """Return how many training impacts are averaged: at most all. Raises EvaluationError for none."""
+        if count < 1:
+            raise EvaluationError.expected("1 or more training impacts", count, name="count")
+        return min(count, len(self.train))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +70,11 @@ class ModalBaseline(_Trained, ABC):
         if count != len(self.train):
             advice = "extract the modes from these impacts"
             raise EvaluationError.expected(wanted, count, name="extraction", advice=advice)
+
+    @classmethod
+    def of(cls: type[_Baseline], task: Task, **settings: Any) -> _Baseline:
+        """Return the baseline of a task's modes, with their noise."""
+        return cls(task.train, task.modes(), noise=True, seed=task.seed, **settings)  # type: ignore[call-arg]
 
     @property
     def bank(self) -> ModalBank:
@@ -114,6 +119,11 @@ class WhiteNoise(_Trained):
 
     seed: int = 0
 
+    @classmethod
+    def of(cls, task: Task, **settings: Any) -> "WhiteNoise":
+        """Return the noise of a task's seed."""
+        return cls(task.train, task.seed, **settings)
+
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return noise that depends only on the seed and the contact."""
         loudness = self.train.sounds.square().mean(dim=1).sqrt().mean()
@@ -139,7 +149,7 @@ class NearestRecording(_Trained):
 
 
 @dataclass(frozen=True, eq=False)
-class MeanWaveform(_Neighbors, _Trained):
+class MeanWaveform(_Trained):
     """The mean of the nearest training sounds, sample by sample: the paper's KNN. Phases cancel in it.
 
     With `by_direction`, where the directions of both sides are known, an impact's direction is part of where it is
@@ -153,17 +163,18 @@ class MeanWaveform(_Neighbors, _Trained):
 
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the mean of the nearest training contacts' sounds."""
+        count = self.neighbors(self.count)
         if not self.by_direction or directions is None or self.train.directions is None:
-            return self.train.sounds[nearest_points(self.train.contacts, contacts, count=self.neighbors)].mean(dim=1)
+            return self.train.sounds[nearest_points(self.train.contacts, contacts, count=count)].mean(dim=1)
         known = Sites(self.train.contacts.double(), normalize(self.train.directions.double()))
         asked = Sites(contacts.double(), normalize(directions.double()))
         size = float((known.points.amax(0) - known.points.amin(0)).norm())
-        rows, signs = asked.nearest(known, size=size, count=self.neighbors)
+        rows, signs = asked.nearest(known, size=size, count=count)
         return (signs[:, :, None].to(self.train.sounds) * self.train.sounds[rows]).mean(dim=1)
 
 
 @dataclass(frozen=True, eq=False)
-class MeanGains(_Neighbors, ModalBaseline):
+class MeanGains(ModalBaseline):
     """The modes with the mean of the nearest contacts' amplitudes."""
 
     count: int = 3
@@ -171,7 +182,8 @@ class MeanGains(_Neighbors, ModalBaseline):
 
     def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return the mean of the nearest training contacts' amplitudes."""
-        nearest = self.amplitudes[nearest_points(self.train.contacts, contacts, count=self.neighbors)]
+        count = self.neighbors(self.count)
+        nearest = self.amplitudes[nearest_points(self.train.contacts, contacts, count=count)]
         return torch.complex(nearest.real.mean(dim=1), nearest.imag.mean(dim=1))
 
 
@@ -183,6 +195,11 @@ class RandomImpact:
     """In its own unit, as long as the sounds that it is compared with."""
     sample_rate: float
     """Samples per second, Hz."""
+
+    @classmethod
+    def of(cls, task: Task) -> "RandomImpact":
+        """Return a recording of another object than a task's."""
+        return cls(task.other_recording(), task.train.sample_rate)
 
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the sound for every contact."""
