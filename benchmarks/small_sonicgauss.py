@@ -32,7 +32,6 @@ from avmsf.baselines.sonicgauss.training import (
     integrate,
     load_tensors,
     train,
-    tune,
 )
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError
@@ -376,7 +375,9 @@ def fit_small(
         return sounds_of(magnitudes, phases, sample_rate=recordings.sample_rate, samples=recordings.sounds.shape[1])[0]
 
     loss = clip_loss(network.train(), features, owners, seen.places(recordings.contacts), latents)
-    return tune(network, network.parameters(), loss, recordings, config, seed=seed, seen=seen, generate=generate)
+    train(network.parameters(), loss, len(recordings), config, seed=seed)
+    network.eval()
+    return TunedRenderer(seen, recordings.sample_rate, recordings.sounds.shape[1], generate)
 
 
 def fit_task(task: Task, *, path: Path) -> TunedRenderer:

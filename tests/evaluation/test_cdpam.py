@@ -16,7 +16,7 @@ RATE = 22050.0
 needs_weights = pytest.mark.skipif(importlib.util.find_spec("cdpam") is None, reason="needs pip install 'avmsf[eval]'")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def cdpam() -> Cdpam:
     return Cdpam.load()
 
@@ -49,10 +49,10 @@ def authors_distance(model: torch.nn.Module, sounds: torch.Tensor) -> torch.Tens
     return model.model_dist(heard, heard.roll(1, dims=0))
 
 
-# 300 samples are near the ends all of them; of the others the middle is not, and their remainders of 16 differ. Faint
-# sounds are where rounding would be heard: the authors' own float32 is 8 % off at a level of .1.
+# 300 samples are near the ends all of them; of 1150 the middle is not. Faint sounds are where rounding would be heard:
+# the authors' own float32 is 8 % off at a level of .1.
 @needs_weights
-@pytest.mark.parametrize(("samples", "level"), [(300, 0.5), (1205, 0.5), (1150, 0.02)])
+@pytest.mark.parametrize(("samples", "level"), [(1, 0.5), (300, 0.5), (1150, 0.02)])
 def test_distances_are_those_of_the_authors_modules(cdpam, authors_model, samples, level):
     sounds = strikes(samples, level=level)[[0, 2]]
     others = sounds.roll(1, dims=0)
@@ -64,23 +64,16 @@ def test_distances_are_those_of_the_authors_modules(cdpam, authors_model, sample
 
 
 @needs_weights
-def test_a_few_samples_have_a_distance(cdpam):
-    for samples in (1, 9):
-        assert bool(torch.isfinite(cdpam.distance(strikes(samples), 0 * strikes(samples), sample_rate=RATE)).all())
-
-
-@needs_weights
 def test_the_sample_rate_hardly_matters(cdpam):
     # Below 3 kHz all; half a sine as fade, so that no edge has more.
     def sounds(rate: float) -> torch.Tensor:
-        times = torch.arange(round(0.2 * rate), dtype=torch.float64) / rate
-        fade = torch.sin(math.pi * times / 0.2) ** 2
+        times = torch.arange(round(0.1 * rate), dtype=torch.float64) / rate
+        fade = torch.sin(math.pi * times / 0.1) ** 2
         return torch.stack([32768 * fade * torch.sin(2 * math.pi * pitch * times) for pitch in (500.0, 2900.0)])
 
     expected = cdpam.distance(sounds(RATE)[:1], sounds(RATE)[1:], sample_rate=RATE)
-    for rate in (44100.0, 48000.0):
-        found = cdpam.distance(sounds(rate)[:1], sounds(rate)[1:], sample_rate=rate)
-        assert torch.allclose(found, expected, rtol=0.01)
+    found = cdpam.distance(sounds(48000.0)[:1], sounds(48000.0)[1:], sample_rate=48000.0)
+    assert torch.allclose(found, expected, rtol=0.01)
 
 
 @needs_weights
@@ -104,7 +97,7 @@ def test_sounds_that_cannot_be_compared_are_refused(cdpam):
     with raises(EvaluationError, name="predicted", value=[3, 400]):
         cdpam.distance(good[:, :400], good, sample_rate=RATE)
     with raises(EvaluationError, name="sounds", row=2):
-        cdpam.embed(good / torch.tensor([[1.0], [1.0], [0.0]]) * torch.tensor([[1.0], [1.0], [0.0]]), sample_rate=RATE)
+        cdpam.embed(good / torch.tensor([[1.0], [1.0], [0.0]]), sample_rate=RATE)
     with raises(EvaluationError, name="sounds", value=[500]):
         cdpam.embed(good[0], sample_rate=RATE)
     for rate in (0.0, -1.0, math.nan, 10.0):
@@ -129,9 +122,8 @@ def test_other_weights_are_refused_unread(tmp_path):
             return Path.touch, (tmp_path / "touched",)
 
     path = tmp_path / "weights.pth"
-    with raises(EvaluationError, file=path, name=None):
-        read_weights(path)
-    torch.save({"state": Touch()}, path)
-    with raises(EvaluationError, file=path, name=None):
-        read_weights(path)
+    for write in (lambda: None, lambda: torch.save({"state": Touch()}, path)):
+        write()
+        with raises(EvaluationError, file=path, name=None):
+            read_weights(path)
     assert not (tmp_path / "touched").exists()

@@ -217,8 +217,8 @@ def test_every_metric_of_the_corpus_says_what_it_said():
         truth, rate = corpus_sound(f"{name}_true")
         predicted = truth if what == "same" else corpus_sound(f"{name}_{what}")[0]
         scores = {key: float(function(predicted, truth, sample_rate=rate)) for key, function in functions.items()}
-        # CDPAM takes longer than all others together: one object will do.
-        if cdpam is not None and name == "bowl":
+        # CDPAM takes longer than all others together: two sounds will do.
+        if cdpam is not None and pair in ("bowl noisy", "bowl silence"):
             scores["cdpam.cdpam"] = float(cdpam.distance(predicted, truth, sample_rate=rate))
         assert set(figures) - set(scores) <= set(tolerances)
         for key, value in scores.items():
@@ -341,7 +341,7 @@ def test_cdpam_is_taken_of_a_few_contacts(monkeypatch: pytest.MonkeyPatch) -> No
     assert [values[row] for row in (1, 4, 6)] == pytest.approx(expected[[1, 4, 6]].tolist(), rel=1e-6)
 
 
-@pytest.mark.parametrize(("count", "nearest", "mean_waveform"), [(8, 0.61, 0.64), (15, 0.47, 0.54), (28, 0.43, 0.40)])
+@pytest.mark.parametrize(("count", "nearest", "mean_waveform"), [(8, 0.61, 0.64), (28, 0.43, 0.40)])
 def test_the_aircraft_scores_what_was_measured_before(shared, count, nearest, mean_waveform):
     """Figures of the measured data's own README, mean of three starts, made by other code."""
     # Read by hand, so that the reference does not hang on the package's own reader.

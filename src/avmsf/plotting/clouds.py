@@ -57,19 +57,15 @@ def plane_of(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "3 3"] 
 
 
 def name_axes(axes: Axes, view: Float[np.ndarray, "3 3"]) -> None:
-    """Draw the directions of x, y and z in the lower left corner; rows of `view` as of `view_from`."""
+    """Draw the directions of x, y and z in the lower left corner, in place of axes; rows of `view` as `view_from`."""
+    axes.set_axis_off()
     for axis, name in enumerate("xyz"):
         across, along = _ARROW * view[:2, axis]
         # What points at the eye or away from it has no direction here.
         if np.hypot(across, along) > 0.4 * _ARROW:
-            systems: dict[str, Any] = {
-                "xycoords": "axes fraction",
-                "textcoords": "offset points",
-                "ha": "center",
-                "va": "center",
-            }
+            how: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "center", "color": FIRST}
             arrow = {"arrowstyle": "<-", "color": FIRST}
-            axes.annotate(name, (0.06, 0.06), (across, along), arrowprops=arrow, color=FIRST, **systems)
+            axes.annotate(name, (0.06, 0.06), (across, along), "axes fraction", arrowprops=arrow, **how)
 
 
 _BEHIND = 0.04
@@ -128,7 +124,6 @@ def draw_cloud(
             name_axes(axes, view)
             reach = 1.12 * radius if radius > 0.0 else 1.0
             axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
-            axes.set_axis_off()
             axes.set_title("{}\nazimuth {:g}°, elevation {:g}°".format(name, *side))
     return figure
 

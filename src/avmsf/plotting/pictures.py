@@ -105,7 +105,6 @@ def draw_gains(
         drawn = scatter_surface(axes, seen, values, inches=3.0, **scale)
         axes.plot(crosses[:, 0], crosses[:, 1], "kx", markersize=5)
         if plane is None:
-            axes.set_axis_off()
             name_axes(axes, view)
         else:
             across, along = ("xyz"[int(row.argmax())] for row in plane[:2])

@@ -62,7 +62,6 @@ def _shade(axes: Axes, mesh: trimesh.Trimesh) -> None:
     )
     axes.autoscale_view()
     axes.set_aspect("equal")
-    axes.set_axis_off()
     name_axes(axes, view)
 
 

@@ -37,7 +37,6 @@ def draw_uncertainty(
     scale: dict[str, Any] = {"cmap": SEQUENTIAL, "vmin": 0.0, "vmax": max(float(values.max()), 1e-12)}
     for axes, frame in zip(grid, frames, strict=True):
         drawn = scatter_surface(axes, places @ frame, values, inches=4.0, **scale)
-        axes.set_axis_off()
         name_axes(axes, frame.T)
         if crosses is not None:
             visible = (crosses @ frame)[in_front(places @ frame, crosses @ frame)]

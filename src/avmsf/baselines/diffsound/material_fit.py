@@ -31,6 +31,9 @@ from avmsf.modal.clips import resampled, with_length
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 
+PerMode = Float64[Tensor, " modes"]
+Point = Float64[Tensor, "3"]
+"""log(E / rho), Poisson's ratio and log(thickness)."""
 MODES = 16
 RATE = 32_000.0
 """Sample rate at which clips are compared, Hz."""
@@ -126,7 +129,7 @@ class DampingCurve:
         least = [float(damping[slow][bins == each].min()) for each in kept]
         return cls(tuple(float(BAND[0] + (each + 0.5) * _CURVE_STEP) for each in kept), tuple(least))
 
-    def __call__(self, frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, " modes"]:
+    def __call__(self, frequency: PerMode) -> PerMode:
         """Return dampings, 1/s: linear between the bins, constant beyond the first and the last."""
         found = np.interp(frequency.detach().cpu().numpy(), self.frequency, self.damping)
         return torch.from_numpy(found).to(frequency)
@@ -149,7 +152,7 @@ def clip_spectra(impacts: Impacts) -> ClipSpectra:
 
 
 def predicted_sound(
-    frequency: Float64[Tensor, " modes"], damping: Float64[Tensor, " modes"]
+    frequency: PerMode, damping: PerMode
 ) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " audible"]]:
     """Return the sum of the modes with equal amplitudes, of peak 1, and the damped frequencies of those in the band.
 
@@ -164,9 +167,7 @@ def predicted_sound(
     return sound / sound.detach().abs().max(), audible[inside]
 
 
-def damped_frequency(
-    frequency: Float64[Tensor, " modes"], damping: Float64[Tensor, " modes"]
-) -> Float64[Tensor, " modes"]:
+def damped_frequency(frequency: PerMode, damping: PerMode) -> PerMode:
     """Return what is heard of modes with undamped frequencies, Hz; 0 for those that do not oscillate."""
     return (frequency.square() - (damping / (2.0 * math.pi)).square()).clamp_min(1e-12).sqrt()
 
@@ -205,10 +206,9 @@ def fit_material(
     return MaterialFit(float(best[0].exp()), float(best[1]), thickness, problem.loss(best), family.at(thickness))
 
 
-def _point(material: Material, log_thickness: Float64[Tensor, ""]) -> Float64[Tensor, "3"]:
-    return torch.tensor(
-        [math.log(material.young / material.density), material.poisson, float(log_thickness)], dtype=torch.float64
-    )
+def _point(material: Material, log_thickness: Float64[Tensor, ""]) -> Point:
+    values = math.log(material.young / material.density), material.poisson, float(log_thickness)
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _bounds(materials: Iterable[Material], family: BodyFamily) -> Float64[Tensor, "2 3"]:
@@ -220,18 +220,18 @@ def _bounds(materials: Iterable[Material], family: BodyFamily) -> Float64[Tensor
     return torch.tensor([low, high], dtype=torch.float64)
 
 
-def _around(point: Float64[Tensor, "3"], bounds: Float64[Tensor, "2 3"]) -> Float64[Tensor, "2 3"]:
+def _around(point: Point, bounds: Float64[Tensor, "2 3"]) -> Float64[Tensor, "2 3"]:
     reach = torch.tensor(_NEAR, dtype=torch.float64)
     return torch.stack([torch.maximum(point - reach, bounds[0]), torch.minimum(point + reach, bounds[1])])
 
 
-_Loss = Callable[[Float64[Tensor, "3"], int], Float[Tensor, ""]]
+_Loss = Callable[[Point, int], Float[Tensor, ""]]
 """Of a point, at a step."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Clips, dampings and bodies. A point is log(E / rho), Poisson's ratio and log(thickness)."""
+    """Clips, dampings and bodies."""
 
     spectra: ClipSpectra
     curve: DampingCurve
@@ -239,11 +239,11 @@ class _Problem:
     bounds: Float64[Tensor, "2 3"]
     """The least and the largest point."""
 
-    def sound(self, point: Float64[Tensor, "3"]) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " audible"]]:
+    def sound(self, point: Point) -> tuple[Float[Tensor, " samples"], Float64[Tensor, " audible"]]:
         frequency = (point[0].exp() * self.family.squares(point[1], point[2])).sqrt() / (2.0 * math.pi)
         return predicted_sound(frequency, self.curve(frequency))
 
-    def loss(self, point: Float64[Tensor, "3"]) -> float:
+    def loss(self, point: Point) -> float:
         """Return the mean difference of spectra; infinite where nothing is heard."""
         with torch.no_grad():
             try:
@@ -251,15 +251,13 @@ class _Problem:
             except EvaluationError:
                 return math.inf
 
-    def transport(self, point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
+    def transport(self, point: Point, step: int) -> Float[Tensor, ""]:
         return self.spectra.transport(*self.sound(point), row=step % len(self.spectra.clips))
 
-    def difference(self, point: Float64[Tensor, "3"], step: int) -> Float[Tensor, ""]:
+    def difference(self, point: Point, step: int) -> Float[Tensor, ""]:
         return self.spectra.difference(self.sound(point)[0])
 
-    def descended(
-        self, start: Float64[Tensor, "3"], loss: _Loss, steps: int, *, rate: float, decay: float
-    ) -> tuple[Float64[Tensor, "3"], Float64[Tensor, "3"]]:
+    def descended(self, start: Point, loss: _Loss, steps: int, *, rate: float, decay: float) -> tuple[Point, Point]:
         """Return where Adam ends on the loss of a point at a step, and the place on the way where it was least."""
         point = start.clone().requires_grad_()
         optimizer = torch.optim.Adam([point], lr=rate)

@@ -45,6 +45,9 @@ from avmsf.modal.synthesis import synthesize
 _FFT_SIZE = 2048
 """Samples at 44.1 and 48 kHz of the spectra that levels are fitted to."""
 
+Contacts = Float[Tensor, "contacts 3"]
+"""Points in the object frame, meters; or as directions, unit vectors."""
+
 
 @dataclass(frozen=True, eq=False)
 class DiffSound:
@@ -67,9 +70,7 @@ class DiffSound:
         """What was fitted, as plain values."""
         return {name: getattr(self.fit, name) for name in ("stiffness", "poisson", "thickness", "difference")}
 
-    def gains(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float64[Tensor, "contacts modes"]:
+    def gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Float64[Tensor, "contacts modes"]:
         """Return signed amplitudes of exp(-d t) sin(2 pi f t), in the recordings' unit.
 
         `directions` are unit vectors along which the hammer moves; without them it moves straight into the surface.
@@ -77,20 +78,16 @@ class DiffSound:
         return _displacements(self.elastic, self.bank, contacts, directions) * self.weight
 
     def complex_gains(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
+        self, contacts: Contacts, *, directions: Contacts | None = None
     ) -> Complex[Tensor, "contacts modes"]:
         """Return amplitudes A, -i times `gains`: sounds are the real part of the sum of A exp((-d + 2 pi i f) t)."""
         gains = self.gains(contacts, directions=directions)
         return torch.complex(torch.zeros_like(gains), -gains)
 
-    def render(
-        self, contacts: Float[Tensor, "contacts 3"], *, directions: Float[Tensor, "contacts 3"] | None = None
-    ) -> Float[Tensor, "contacts samples"]:
+    def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Float[Tensor, "contacts samples"]:
         """Return the sound of an impact at each contact, in the unit of the training sounds."""
-        gains = self.gains(contacts, directions=directions).float()
-        sounds = synthesize(
-            gains, self.bank.frequency, self.bank.damping, samples=len(self.noise), sample_rate=self.sample_rate
-        )
+        gains, bank, samples = self.gains(contacts, directions=directions).float(), self.bank, len(self.noise)
+        sounds = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=self.sample_rate)
         return sounds + self.noise.to(sounds)
 
     def distance(
@@ -151,10 +148,7 @@ def leveled(fit: MaterialFit, curve: DampingCurve, train: Impacts, residual: Res
 
 
 def _displacements(
-    elastic: ElasticModes,
-    bank: ModalBank,
-    contacts: Float[Tensor, "contacts 3"],
-    directions: Float[Tensor, "contacts 3"] | None,
+    elastic: ElasticModes, bank: ModalBank, contacts: Contacts, directions: Contacts | None
 ) -> Float64[Tensor, "contacts modes"]:
     """Return the amplitudes of the displacement that an impulse of 1 Ns sets the modes in motion with."""
     places = contacts.detach().cpu()

@@ -35,7 +35,7 @@ from avmsf.baselines.sonicgauss.training import (
     flow_loss,
     integrate,
     load_tensors,
-    tune,
+    train,
 )
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, from_extra
@@ -266,7 +266,9 @@ def fit_published(
     for part in model.gaussians.modules():
         if isinstance(part, torch.nn.BatchNorm1d):
             part.eval()
-    return tune(model, model.trained(), loss, impacts, config, seed=seed, seen=seen, generate=generate)
+    train(model.trained(), loss, len(impacts), config, seed=seed)
+    model.eval()
+    return TunedRenderer(seen, impacts.sample_rate, impacts.sounds.shape[1], generate)
 
 
 @torch.no_grad()

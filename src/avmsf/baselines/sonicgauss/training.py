@@ -99,23 +99,6 @@ class TunedRenderer:
         return torch.stack(rows) if rows else torch.zeros(0, self.samples)
 
 
-def tune(
-    network: nn.Module,
-    parameters: Iterable[nn.Parameter],
-    loss: Loss,
-    impacts: Impacts,
-    config: TrainingConfig,
-    *,
-    seed: int,
-    seen: Normalized,
-    generate: Callable[[Float[Tensor, "1 3"], int], Float[Tensor, " samples"]],
-) -> TunedRenderer:
-    """Train a network's parameters in place on an object's recordings, and return the renderer of its sounds."""
-    train(parameters, loss, len(impacts), config, seed=seed)
-    network.eval()
-    return TunedRenderer(seen, impacts.sample_rate, impacts.sounds.shape[1], generate)
-
-
 def expect_sound(loudest: float, impacts: Impacts) -> None:
     """Raise EvaluationError where the largest magnitude of the recordings is not above 0."""
     if not loudest > 0.0:
