@@ -16,7 +16,7 @@ from avmsf.fem.supports import EndPatch, Place, Support, patches_about
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
-from avmsf.field.gains.data import GainData, gain_data, orientation_signs
+from avmsf.field.gains.data import GainData, orientation_signs
 from avmsf.field.gains.estimator import MixtureEstimator, RefinedGains
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import off_surface, points_on_object
@@ -35,14 +35,19 @@ from oracles.block import block
 from oracles.known_gains import known_gains
 
 
-def _row(count: int) -> torch.Tensor:
-    return torch.tensor([[0.01 * place, 0.0, 0.0] for place in range(count)], dtype=torch.float64)
-
-
-def test_a_blow_from_the_other_side_of_a_wall_turns_its_sign():
-    directions = torch.tensor([[0.0, 0.0, -1.0]] * 6)
-    directions[2] = -directions[2]
-    assert orientation_signs(_row(6), directions).tolist() == [1, 1, -1, 1, 1, 1]
+@pytest.mark.parametrize(
+    ("places", "up", "expected"),
+    [
+        (range(6), [-1.0, -1, 1, -1, -1, -1], [1, 1, -1, 1, 1, 1]),
+        # Two impacts in one place, from both sides of a wall.
+        ([0, 0, 10], [1.0, -1, 1], [1, -1, 1]),
+        (range(4), None, [1, 1, 1, 1]),
+    ],
+)
+def test_an_impact_from_the_other_side_of_a_wall_turns_its_sign(places, up, expected):
+    contacts = torch.tensor([[0.01 * place, 0.0, 0.0] for place in places], dtype=torch.float64)
+    directions = None if up is None else torch.tensor([[0.0, 0.0, each] for each in up])
+    assert orientation_signs(contacts, directions).tolist() == expected
 
 
 def test_around_a_closed_object_directions_turn_gradually_and_no_sign_does():
@@ -56,17 +61,6 @@ def test_all_directions_turned_change_nothing():
     places = torch.rand(9, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(9, 3, generator=generator), dim=1)
     assert torch.equal(orientation_signs(places, directions), orientation_signs(places, -directions))
-
-
-def test_two_blows_at_one_place_from_both_sides():
-    places = torch.tensor([[0.0, 0, 0], [0.0, 0, 0], [0.1, 0, 0]])
-    directions = torch.tensor([[0.0, 0, 1], [0.0, 0, -1], [0.0, 0, 1]])
-    signs = orientation_signs(places, directions)
-    assert signs[0] == -signs[1] == signs[2] == 1
-
-
-def test_unknown_directions_turn_nothing():
-    assert orientation_signs(_row(4), None).tolist() == [1, 1, 1, 1]
 
 
 COUNT = 12
@@ -95,12 +89,6 @@ def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(delayed,
     apart = fields[0].gains(FEATURES.points) - fields[1].gains(FEATURES.points)
     assert bool((apart.abs() < known[0].posterior(FEATURES.points).std[..., 0]).all())
     assert distance(*(torch.view_as_real(each.measured).flatten(1) for each in known)) < ALIGNED
-
-
-def test_aligned_recordings_are_not_delayed_again(delayed: tuple[Impacts, Extraction]) -> None:
-    train, modes = delayed
-    aligned = modes.aligned(train)
-    assert torch.equal(gain_data(aligned, FEATURES, modes, CONFIG).train.sounds, aligned.sounds)
 
 
 def test_rows_are_grouped_by_place_in_the_order_of_the_table() -> None:
@@ -169,48 +157,29 @@ def test_of_scaled_gains_the_factors_multiply_and_nothing_nests(tmp_path):
     assert torch.equal(loaded.predict(PLACES).mean, twice.predict(PLACES).mean)
     assert loaded.length == 1.5
     assert type(loaded.field) is type(inner)
-
-
-def test_lengths_and_inner_fields_that_cannot_be_are_refused():
-    inner = FIELDS["positional"]()
     for length in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(ValueError):
             ScaledGains(inner, FACTORS, length)
-    record = ScaledGains(inner, FACTORS).record()
     with raises(RecordError, name="fitted_kind", value="scaled"):
-        ScaledGains.skeleton(record | {"fitted_kind": "scaled"})
+        ScaledGains.skeleton(twice.record() | {"fitted_kind": "scaled"})
 
 
 HEIGHT = 0.05
 """Of a false floor above the bar's sheet, meters: an eighth of the length, more than the tolerance."""
 
 
-def closed() -> BodyGains:
-    """Return gains on the bar's sheet whose points lie on the sheet and on a false floor above it."""
+def test_a_place_on_a_false_floor_is_off_the_body_by_its_height_and_no_contact() -> None:
     points = bar_points()
-    return BodyGains(torch.cat([points, points + torch.tensor([0.0, 0.0, HEIGHT])]).float(), bar())
-
-
-def test_a_place_on_a_false_floor_is_off_the_body_by_its_height() -> None:
-    above = torch.tensor([[0.2, 0.05, 0.0], [0.2, 0.05, HEIGHT]])
-    ((row, distance),) = off_surface(above, closed())
-    assert row == 1
-    assert abs(distance - HEIGHT) < 1e-6
-
-
-def test_points_of_the_false_floor_are_no_contacts() -> None:
-    assert torch.equal(points_on_object(closed()), bar_points().float())
+    closed = BodyGains(torch.cat([points, points + torch.tensor([0.0, 0.0, HEIGHT])]).float(), bar())
+    assert torch.equal(points_on_object(closed), points.float())
+    # An edit of the size moves all of it.
+    for length, gains in ((1.0, closed), (2.0, ScaledGains(closed, torch.ones(6, dtype=torch.float64), 2.0))):
+        above = length * torch.tensor([[0.2, 0.05, 0.0], [0.2, 0.05, HEIGHT]])
+        assert off_surface(above, gains) == [(1, pytest.approx(length * HEIGHT, abs=1e-6))]
+        assert len(points_on_object(gains)) == len(points)
+        assert float(gains.surface.vertices[:, 0].max()) == length * float(torch.tensor(LENGTH))
     # Gains without a body are known at all of their points.
     assert torch.equal(points_on_object(positional()), positional().points)
-
-
-def test_an_edited_body_is_scaled() -> None:
-    large = ScaledGains(closed(), torch.ones(6, dtype=torch.float64), 2.0)
-    surface = large.surface
-    assert float(surface.vertices[:, 0].max()) == 2.0 * float(torch.tensor(LENGTH))
-    assert len(points_on_object(large)) == len(bar_points())
-    ((_, distance),) = off_surface(torch.tensor([[0.4, 0.1, 2.0 * HEIGHT]]), large)
-    assert abs(distance - 2.0 * HEIGHT) < 1e-6
     assert positional().surface is None
 
 
@@ -232,27 +201,13 @@ def direction() -> torch.Tensor:
     return draw(2 * MODES, CONTACTS, 1, seed=4).float()
 
 
-def read(gains: RefinedGains) -> torch.Tensor:
-    found = gains.read(torch.arange(CONTACTS))
-    return found.mean.to(torch.complex128).detach()
-
-
-def mean_at_contacts(gains) -> torch.Tensor:
-    found = gains.predict(gains.contacts, gains.training.directions)
-    return found.mean.to(torch.complex128)
-
-
-def test_gains_start_as_the_models_mean_at_the_contacts():
-    assert torch.allclose(read(refined()), mean_at_contacts(model()), rtol=1e-4, atol=1e-4)
-    assert torch.equal(refined().finished(torch.arange(MODES)).values, model().values)
-    assert float(refined().penalty().detach()) == 0.0
-
-
-def test_a_shift_reads_as_the_model_of_the_moved_values():
-    gains = refined(0.01)
+@pytest.mark.parametrize("shift", [0.0, 0.01])
+def test_gains_are_the_mean_at_the_contacts_of_the_model_of_the_moved_values(shift):
+    gains = refined(shift)
     finished = gains.finished(torch.arange(MODES))
-    assert float((finished.values - model().values).abs().max()) > 0.1
-    assert torch.allclose(read(gains), mean_at_contacts(finished), rtol=1e-4, atol=1e-3)
+    assert torch.equal(finished.values, model().values) == (shift == 0.0) == (float(gains.penalty().detach()) == 0.0)
+    expected = finished.predict(finished.contacts, finished.training.directions).mean
+    assert torch.allclose(gains.read(torch.arange(CONTACTS)).mean.detach(), expected, rtol=1e-4, atol=1e-3)
 
 
 def test_a_shift_of_one_six_hundredth_moves_a_value_by_its_standard_error():
@@ -309,6 +264,22 @@ def held_modes(held_at: tuple[Place, ...]) -> HeldModes:
     return HeldModes(block(SIDES, (9, 6, 1)), NOMINAL, count=16, patches=patches_about(held_at) or None)
 
 
+FEET = ((0.04, 0.0267, 0.0), (0.2, 0.08, 0.0))
+
+
+@pytest.mark.parametrize(("held", "stated"), [(True, FEET), (False, ((0.12, 0.08, 0.0),))])
+def test_a_plate_is_held_where_its_user_says_and_it_shows_where_it_was_free(held, stated):
+    support = Support(tuple(patches_about(stated)), 1e10) if held else None
+    true = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12, support=support)
+    report = MixtureEstimator(bodies=Plate(stated)).solve(known_gains(true)[0])[0].report
+    evidence, found = report["support_evidence"], report["bodies"][0]
+    assert (evidence["held"] > evidence["free"]) == held
+    names = "(40, 27, 0) mm and (200, 80, 0) mm" if held else "(120, 80, 0) mm"
+    assert found["support"] == f"held at {names}"
+    assert not held or found["support_stiffness"] > 1e6
+    assert not held or found["frequency_factor"] == pytest.approx(1.0, abs=0.1)
+
+
 LEFT, RIGHT = EndPatch("left", (-1.0, 0.0, 0.0)), EndPatch("right", (1.0, 0.0, 0.0))
 AT = {LEFT: "its end at (0, 80, 2) mm", RIGHT: "its end at (240, 80, 2) mm"}
 
@@ -325,25 +296,6 @@ def test_the_support_of_a_plate_is_found(sides: tuple[EndPatch, ...], stiffness:
     assert set(found["support"].removeprefix("held at ").split(" and ")) == ({AT[each] for each in sides} or {"free"})
     # In the unit of the nominal material, whose plate is not the true one.
     assert found["support_stiffness"] is None or found["support_stiffness"] > 0.1 * min(stiffness, 1e6)
-
-
-def test_a_plate_is_held_where_its_user_says():
-    feet = ((0.04, 0.0267, 0.0), (0.2, 0.08, 0.0))
-    support = Support(tuple(patches_about(feet)), 1e10)
-    true = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12, support=support)
-    report = MixtureEstimator(bodies=Plate(feet)).solve(known_gains(true)[0])[0].report
-    assert report["support_evidence"]["held"] > report["support_evidence"]["free"]
-    found = report["bodies"][0]
-    assert found["support"] == "held at (40, 27, 0) mm and (200, 80, 0) mm"
-    assert found["support_stiffness"] > 1e6
-    assert found["frequency_factor"] == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_free_plate_that_is_said_to_be_held_fits_better_free():
-    free = elastic_modes(block(SIDES, (13, 8, 1)), NOMINAL, count=12)
-    report = MixtureEstimator(bodies=Plate(((0.12, 0.08, 0.0),))).solve(known_gains(free)[0])[0].report
-    assert report["bodies"][0]["support"] == "held at (120, 80, 0) mm"
-    assert report["support_evidence"]["held"] < report["support_evidence"]["free"]
 
 
 def test_supports_are_not_tried_where_the_free_body_predicts_the_gains(monkeypatch: pytest.MonkeyPatch):
@@ -364,10 +316,10 @@ def test_levels_of_recordings_without_forces_are_found():
     uneven = even.divided(1.0 / levels)
     of_unknown_forces = replace(uneven, train=replace(uneven.train, forces=None))
 
-    def levels_of(data: GainData) -> list[float]:
-        return MixtureEstimator(bodies=Plate()).solve(data)[0].report["levels"]
+    def levels_of(data: GainData, bodies: Plate | None = None) -> list[float]:
+        return MixtureEstimator(bodies=bodies).solve(data)[0].report["levels"]
 
-    off = (torch.tensor(levels_of(of_unknown_forces), dtype=torch.float64) / levels).log().abs()
+    off = (torch.tensor(levels_of(of_unknown_forces, Plate()), dtype=torch.float64) / levels).log().abs()
     # Two contacts are so close to edges that the others do not predict them.
     assert int((off < 0.2).sum()) == 10
     assert levels_of(even) == []
