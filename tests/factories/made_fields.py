@@ -1,5 +1,6 @@
 """A plate whose mode shapes are products of cosines: impacts, gain models of them, a gain field of every kind."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -7,6 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from safetensors.torch import load as from_bytes
+from safetensors.torch import save as to_bytes
 
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.elastic_modes import ElasticModes
@@ -194,6 +197,24 @@ def sounding(
     """Return a field of the plate's modes, or of others, with white noise."""
     phases = torch.as_tensor(phase, dtype=torch.float64).expand(len(bank)).clone()
     return SoundField(bank, gains, phases, Residual(torch.full((9,), noise)), rate, samples, origin or Origin("plate"))
+
+
+def record_in(path: Path) -> dict[str, Any]:
+    """Return the record in the header of a field's file."""
+    content = path.read_bytes()
+    return json.loads(json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]["avmsf"])
+
+
+Change = Callable[[dict[str, torch.Tensor], dict[str, Any]], None]
+
+
+def rewritten(path: Path, change: Change) -> Path:
+    """Write a field's file once more beside it, as changed.safetensors, with its tensors and record changed."""
+    tensors, record = from_bytes(path.read_bytes()), record_in(path)
+    change(tensors, record)
+    changed = path.with_name("changed.safetensors")
+    changed.write_bytes(to_bytes(tensors, {"avmsf": json.dumps(record)}))
+    return changed
 
 
 def saved(gains: GainModel, folder: Path) -> Path:

@@ -1,15 +1,11 @@
 """What holds of every gain field, whatever it is made of: the contract of `GainModel`."""
 
-import json
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import load as from_bytes
-from safetensors.torch import save as to_bytes
 
 from avmsf.errors import FieldFileError
 from avmsf.evaluation.task import Renderer
@@ -20,7 +16,7 @@ from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from factories.made_fields import BANK, FIELDS, SIDES, blows, places, sounding
+from factories.made_fields import BANK, FIELDS, SIDES, blows, places, rewritten, sounding
 from factories.raising import raises
 
 FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.25, 3.0], dtype=torch.float64)
@@ -191,18 +187,16 @@ def test_a_sound_is_the_sum_of_damped_sines_and_cosines(name):
 
 def changed(name: str, folder: Path, tensors: dict[str, torch.Tensor], record: dict) -> Path:
     """Save a field of this kind, with some of its tensors and of what it says of itself replaced; None takes it out."""
-    path = folder / "plate.safetensors"
     if not (folder / "whole").exists():
         save(sound_field(ALL[name]()), folder / "whole")
-    with safe_open(folder / "whole", framework="pt") as file:
-        header = json.loads(file.metadata()["avmsf"])
-    held = from_bytes((folder / "whole").read_bytes())
-    for old, new in ((held, {f"gains.{key}": each for key, each in tensors.items()}), (header, record)):
-        old |= new
-        for key in [key for key, value in new.items() if value is None]:
-            del old[key]
-    path.write_bytes(to_bytes(held, {"avmsf": json.dumps(header)}))
-    return path
+
+    def change(held: dict[str, torch.Tensor], header: dict) -> None:
+        for old, new in ((held, {f"gains.{key}": each for key, each in tensors.items()}), (header, record)):
+            old |= new
+            for key in [key for key, value in new.items() if value is None]:
+                del old[key]
+
+    return rewritten(folder / "whole", change)
 
 
 @every_kind
@@ -221,13 +215,13 @@ def test_a_record_is_refused_where_anything_is_missing_or_wrong(name, tmp_path):
             list: [None, 8, "eight", [*value, 8] if isinstance(value, list) else None],
         }
         for other in wrong[type(value)]:
-            with raises(FieldFileError, file="plate.safetensors"):
+            with raises(FieldFileError, file="changed.safetensors"):
                 load(changed(name, tmp_path, {}, {"gains": whole | {key: other}}))
         if key == "spread_share":
             # Files of earlier versions have none.
             continue
         missing = {each: whole[each] for each in whole if each != key}
-        with raises(FieldFileError, file="plate.safetensors", name=key):
+        with raises(FieldFileError, file="changed.safetensors", name=key):
             load(changed(name, tmp_path, {}, {"gains": missing}))
 
 
@@ -241,7 +235,7 @@ def test_sizes_that_are_not_the_tensors_are_refused(name, tmp_path):
     for body in whole.get("bodies", []):
         wrong += [{"bodies": [body | {key: size + 1}]} for key, size in body.items()]
     for each in wrong:
-        with raises(FieldFileError, file="plate.safetensors") as caught:
+        with raises(FieldFileError, file="changed.safetensors") as caught:
             load(changed(name, tmp_path, {}, {"gains": whole | each}))
         assert caught.value.name.startswith("gains.")
     with raises(FieldFileError, name="gains.modes", value=MODES + 1):
