@@ -83,3 +83,14 @@ def plate_fit(config: FitConfig, **changes: Any) -> SoundField:
     modes = changes.pop("modes", None) or plate_extraction(plate_impacts(len(train)))
     gains = changes.pop("gains", Attention())
     return fit(train, changes.pop("features", plate_features()), modes, config, gains=gains, **changes)
+
+
+def tensors_of(field: SoundField) -> dict[str, torch.Tensor]:
+    """Return all that was fitted, of a field with a network."""
+    bank = {"frequency": field.bank.frequency, "damping": field.bank.damping}
+    return {**bank, "magnitude": field.residual.magnitude, **field.gain_field.state_dict()}
+
+
+def same(one: SoundField, other: SoundField) -> bool:
+    mine, others = tensors_of(one), tensors_of(other)
+    return mine.keys() == others.keys() and all(torch.equal(mine[name], others[name]) for name in mine)

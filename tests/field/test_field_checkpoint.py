@@ -16,7 +16,7 @@ from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.data import gain_data
 from avmsf.field.sound_field import SoundField
 from avmsf.field.training import AdamW, Progress, TrainingRun
-from factories.plate_field import QUICK, few_impacts, plate_features, plate_fit
+from factories.plate_field import QUICK, few_impacts, plate_features, plate_fit, same
 from factories.raising import raises
 
 CONFIG = replace(
@@ -37,12 +37,7 @@ def uninterrupted() -> SoundField:
 
 
 def expect_same(field: SoundField, other: SoundField) -> None:
-    assert torch.equal(field.bank.frequency, other.bank.frequency)
-    assert torch.equal(field.bank.damping, other.bank.damping)
-    assert torch.equal(field.residual.magnitude, other.residual.magnitude)
-    mine, others = field.gain_field.state_dict(), other.gain_field.state_dict()
-    assert mine.keys() == others.keys()
-    assert all(torch.equal(mine[name], others[name]) for name in mine)
+    assert same(field, other)
     assert field.origin == other.origin
 
 

@@ -21,7 +21,7 @@ from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
-from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_fit, plate_impacts
+from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_fit, plate_impacts, same, tensors_of
 from factories.raising import raises
 from oracles.plate import plate_modes
 
@@ -46,27 +46,10 @@ def long_fit() -> tuple[SoundField, list[Progress]]:
     return plate_fit(LONG, progress=told.append), told
 
 
-def bits(field: SoundField) -> dict[str, torch.Tensor]:
-    return {
-        "frequency": field.bank.frequency,
-        "damping": field.bank.damping,
-        "magnitude": field.residual.magnitude,
-        **field.gain_field.state_dict(),
-    }
-
-
-def same(one: SoundField, other: SoundField) -> bool:
-    mine, others = bits(one), bits(other)
-    return mine.keys() == others.keys() and all(torch.equal(mine[name], others[name]) for name in mine)
-
-
 def test_a_fit_reproduces_the_contacts_that_it_was_trained_on():
     field, impacts = long_fit()[0], plate_impacts()
-    error = float(
-        relative_stft_error(
-            field.render(impacts.contacts), impacts.sounds, sample_rate=RATE, fft_sizes=(1024, 256)
-        ).mean()
-    )
+    sounds = field.render(impacts.contacts)
+    error = float(relative_stft_error(sounds, impacts.sounds, sample_rate=RATE, fft_sizes=(1024, 256)).mean())
     # Noise 40 dB down alone costs some two hundredths of the spectrum; silence costs 1, and .055 was measured.
     assert error < 0.08
     told = long_fit()[1]
@@ -106,11 +89,7 @@ def test_recordings_in_float64_give_the_same_field():
 
 def flipped(modes: Extraction) -> Extraction:
     order = torch.arange(len(modes.bank)).flip(0)
-    return Extraction(
-        modes.bank.take(order),
-        modes.gains[:, order],
-        modes.residual,
-    )
+    return Extraction(modes.bank.take(order), modes.gains[:, order], modes.residual)
 
 
 def test_modes_come_out_by_frequency():
@@ -237,7 +216,7 @@ def test_a_silent_recording_and_a_mode_that_is_never_excited_do_no_harm():
     zeros = torch.zeros(12, 1)
     more = Extraction(ModalBank(frequency, damping), torch.cat([modes.gains, zeros], 1), modes.residual)
     field = plate_fit(VALIDATED, train=replace(impacts, sounds=sounds), modes=more)
-    assert all(bool(torch.isfinite(each).all()) for each in bits(field).values())
+    assert all(bool(torch.isfinite(each).all()) for each in tensors_of(field).values())
     gains = field.gains(impacts.contacts).abs().mean(0)
     assert float(gains[-1]) < 0.1 * float(gains[:-1].mean())
 

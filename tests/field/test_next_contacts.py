@@ -10,6 +10,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import ArrayError, FitError
 from avmsf.field.gains.elastic import REACH
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -111,9 +112,12 @@ def test_contacts_differ_lie_on_the_object_and_lower_the_error_each(made: type) 
         assert torch.allclose(found.directions, DOWN.expand(8, 3))
 
 
-def test_gains_of_unknown_uncertainty_are_refused() -> None:
-    with raises(FitError, name="field", value="attention"):
-        suggest(replace(sound_field(attention()), bank=MODES))
+def test_fields_without_a_posterior_and_edited_ones_are_refused() -> None:
+    once = positional_field(bar_contacts(1).expand(3, 3), drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2))
+    network, edited = replace(sound_field(attention()), bank=MODES), adjust_modes(of_one_hypothesis())
+    for field, value in ((network, "attention"), (sound_field(once), 1), (edited, "edited")):
+        with raises(FitError, name="field", value=value):
+            suggest(field)
 
 
 ONE = torch.tensor([[0.4, 0.1, 0.0]])
@@ -148,8 +152,6 @@ def test_where_fewer_places_are_left_than_asked_for_all_are_suggested() -> None:
 def test_a_place_that_was_struck_is_not_suggested_again() -> None:
     contacts = bar_contacts(6)
     gains = elastic_field(contacts, drawn_gains(contacts, seed=3))
-    with raises(FitError, name="candidates", value=0):
-        suggest(sound_field(gains), 1, candidates=contacts)
     without = sound_field(gains.without(torch.arange(6) == 4))
     assert suggest(without, 1, candidates=contacts).rows.tolist() == [4]
 
@@ -164,13 +166,6 @@ def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(monkeypatch
     # A quarter of them loses next to nothing.
     assert fewer.after[-1] < whole.after[-1] + 0.1 * (whole.before - whole.after[-1])
     assert len(suggest(field, 40, candidates=candidates).rows) == 40
-
-
-def test_one_place_says_nothing_of_how_gains_vary() -> None:
-    contacts = bar_contacts(1).expand(3, 3)
-    values = drawn_gains(bar_contacts(1), seed=6).expand(3, 4, 2)
-    with raises(FitError, name="field", value=1):
-        suggest(sound_field(positional_field(contacts, values)))
 
 
 WALL = 0.003
@@ -197,9 +192,9 @@ def test_nothing_inside_a_closed_shell_can_be_struck(access, hollow) -> None:  #
     outer, inner = trimesh.creation.icosphere(4, 0.1), trimesh.creation.icosphere(4, hollow)
     inner.invert()
     shell = trimesh.util.concatenate([outer, inner])
-    assert not access(shell, np.array(inner.vertices)[::10]).any()
+    assert not access(shell, np.array(inner.vertices)[::40]).any()
     # Points leave their surface less sure than triangles do.
-    assert access(shell, np.array(outer.vertices)[::10]).mean() > (0.99 if access is by_mesh else 0.95)
+    assert access(shell, np.array(outer.vertices)[::40]).mean() > (0.99 if access is by_mesh else 0.95)
 
 
 @pytest.mark.parametrize("inner", [0.03, 0.05])

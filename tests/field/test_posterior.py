@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from avmsf.editing.modal_edit import adjust_modes
-from avmsf.errors import FieldFileError, FitError
-from avmsf.field.next_contacts import suggest
+from avmsf.errors import FieldFileError
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.field.store import save
 from avmsf.localization.locator import Locator
@@ -26,7 +25,6 @@ from factories.believing_field import (
     sound_field,
 )
 from factories.made_fields import positional, sounding
-from factories.raising import raises
 
 both_models = pytest.mark.parametrize("made", [elastic_field, positional_field])
 
@@ -113,14 +111,6 @@ def test_modes_that_an_edit_has_silenced_are_in_no_doubt() -> None:
     mute = adjust_modes(field, gains_db=[0.0, 0.0, -math.inf, -math.inf])
     points = bar_points()[::5]
     assert torch.equal(above.relative_gain_std(points), mute.relative_gain_std(points))
-
-
-def test_what_cannot_be_said_is_refused() -> None:
-    contacts = bar_contacts(6)
-    values = drawn_gains(contacts, seed=10)
-    field = sound_field(elastic_field(contacts, values))
-    with raises(FitError, name="field", value="edited"):
-        suggest(adjust_modes(field))
 
 
 def field_with(report: dict[str, object]) -> SoundField:
