@@ -1,6 +1,7 @@
 """Surfaces from outlines and depth, against closed forms: closed, hollow, thin, and with wrong masks."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 import torch
 import trimesh
 
+from avmsf._utils.caching import source_digest
 from avmsf.errors import SceneError
 from avmsf.mesh.level_set import enclose
 from avmsf.photographs.visual_hull import Grid
-from avmsf.reconstruction import ObjectShape, object_surface
+from avmsf.reconstruction import ObjectShape, object_shape, object_surface
 from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.hull_distance import Outline, hull_distance
@@ -191,10 +193,19 @@ def test_a_bottom_that_no_view_saw_is_closed_and_reported() -> None:
     assert _shape(block).report.unseen == 0.0
 
 
-def test_the_digest_is_of_all_that_decides_the_surfaces(cup_shape: ObjectShape) -> None:
+def test_the_digest_is_of_all_that_decides_the_surfaces(
+    cup_shape: ObjectShape, monkeypatch: pytest.MonkeyPatch
+) -> None:
     others = [replace(cup_shape, **{name: getattr(cup_shape, name) + 1}) for name in ("outer", "seen", "hollow")]
     others.append(replace(cup_shape, supposed=not cup_shape.supposed))
-    assert len({each.digest() for each in (cup_shape, replace(cup_shape), *others)}) == 5
+    digests = {each.digest() for each in (cup_shape, replace(cup_shape), *others)}
+    assert len(digests) == 5
+    # Of the code that draws them too: bodies of another `shell` are not taken from a cache.
+    read, code = Path.read_bytes, Path(object_shape.__file__)
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"# changed" * (path == code))
+    source_digest.cache_clear()
+    assert cup_shape.digest() not in digests
+    source_digest.cache_clear()
 
 
 @pytest.fixture(scope="module")

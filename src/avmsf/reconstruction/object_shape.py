@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
-from avmsf._utils.caching import content_digest
+from avmsf._utils.caching import content_digest, source_digest
 from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.level_set import difference, enclose
 from avmsf.mesh.surface import Surface
@@ -195,8 +195,9 @@ class ObjectShape:
         return "; ".join(parts)
 
     def digest(self) -> str:
-        """Return a digest of all that decides the surfaces."""
-        return content_digest(self.grid, self.supposed, self.diagonal, self.outer, self.seen, self.hollow)
+        """Return a digest of all that decides the surfaces: the values, and the code that draws them."""
+        code = source_digest(__name__)
+        return content_digest(code, self.grid, self.supposed, self.diagonal, self.outer, self.seen, self.hollow)
 
 
 def facing_similarly(
