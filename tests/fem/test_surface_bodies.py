@@ -191,9 +191,9 @@ def searched(
     def evidence(known: Sequence[CandidateBody]) -> list[float]:
         return [filled if body.thickness is None else of(math.log(body.thickness)) for body in known]
 
-    def make(like: CandidateBody, wall: float) -> CandidateBody | None:
-        asked.append(wall)
-        return walled(wall) if made else None
+    def make(like: CandidateBody, walls: Sequence[float]) -> list[CandidateBody | None]:
+        asked.extend(walls)
+        return [walled(wall) if made else None for wall in walls]
 
     return *search_thickness([walled(each) for each in walls], evidence, make), asked
 
@@ -241,9 +241,9 @@ def test_no_thickness_is_looked_for_where_the_filled_body_is_the_most_probable()
 def test_of_open_and_closed_walls_those_like_the_most_probable_one_are_searched() -> None:
     asked: list[bool] = []
 
-    def make(like: CandidateBody, wall: float) -> CandidateBody:
+    def make(like: CandidateBody, walls: Sequence[float]) -> list[CandidateBody]:
         asked.append(like.closed)
-        return replace(like, thickness=wall)
+        return [replace(like, thickness=wall) for wall in walls]
 
     def evidence(known: Sequence[CandidateBody]) -> list[float]:
         true = {False: 0.0011, True: 0.0029}

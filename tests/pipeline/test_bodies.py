@@ -296,7 +296,7 @@ def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
         # A lid stiffens the sides.
         assert float(cup.elastic.frequency[0]) < 0.8 * float(box.elastic.frequency[0])
     assert walls[5].name == "closed wall of 6 mm"
-    made = found.with_thickness(walls[5], 0.007)
+    [made] = found.with_thicknesses(walls[5], [0.007])
     assert (made.thickness, made.closed) == (0.007, True)
     assert found.refined(made).fine
     assert found.refined(made).closed
@@ -305,7 +305,7 @@ def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
 def test_walls_that_cannot_be_had_are_left_out() -> None:
     found = CandidateBodies(Cup(most=0.01), count=4, dofs=2000)
     assert all(body.thickness is None or body.thickness <= 0.01 for body in found.bodies)
-    assert found.with_thickness(found.bodies[0], 0.011) is None
+    assert found.with_thicknesses(found.bodies[0], [0.011]) == [None]
 
 
 @pytest.mark.slow
@@ -313,7 +313,7 @@ def test_the_thickness_is_searched_for_unless_it_is_known_or_there_is_no_cavity(
     config = BodyConfig(shapes=6, dofs=4000)
     searched = candidate_bodies(Cup(), config)
     assert searched.searches_thickness
-    body = searched.with_thickness(searched.bodies[1], 0.007)
+    [body] = searched.with_thicknesses(searched.bodies[1], [0.007])
     assert body.thickness == 0.007
     known = candidate_bodies(Cup(), BodyConfig(wall=0.005, shapes=6, dofs=4000))
     assert (known.searches_thickness, [each.thickness for each in known.bodies]) == (False, [0.005])

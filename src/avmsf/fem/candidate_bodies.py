@@ -41,6 +41,7 @@ from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Place, Support, patches_about
 from avmsf.mesh.surface import Surface
 
+Given = TypeVar("Given")
 Made = TypeVar("Made")
 Supports = Literal["auto", "free", "try"]
 """Whether bodies are held: where the free one predicts little, never, or always tried."""
@@ -157,9 +158,7 @@ class CandidateBodies:
         walls = [(each, False) for each in wanted if (each, False) not in refused]
         make_one = partial(make, fine=len(walls) == 1)
         walls += [(each, True) for each, _ in walls if each is not None and self._closed is not None]
-        # Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
-        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
-            bodies = [body for body in pool.map(make_one, walls) if body is not None]
+        bodies = [body for body in _side_by_side(make_one, walls) if body is not None]
         ordered = sorted(refused, key=lambda wall: (wall[1], wanted.index(wall[0])))
         reasons = _grouped({wall: refused[wall] for wall in ordered})
         if not bodies:
@@ -228,16 +227,20 @@ class CandidateBodies:
 
         return self._attempt(f"{body.name}: no supports tested", make)
 
-    def with_thickness(self, body: CandidateBody, thickness: float) -> CandidateBody | None:
-        """Return a body like another with a wall of this thickness, meters, coarse as of several; None if that fails.
+    def with_thicknesses(self, body: CandidateBody, thicknesses: Sequence[float]) -> list[CandidateBody | None]:
+        """Return bodies like another with walls so thick, meters, coarse as of several; None where that fails.
 
         `log` is called with the reason.
         """
-        try:
-            return self._body(thickness, body.closed, fine=False)
-        except (SimulationError, MemoryError) as error:
-            self._log_refused(f"{body_name(thickness, closed=body.closed)}: {error}")
-            return None
+
+        def make(thickness: float) -> CandidateBody | None:
+            try:
+                return self._body(thickness, body.closed, fine=False)
+            except (SimulationError, MemoryError) as error:
+                self._log_refused(f"{body_name(thickness, closed=body.closed)}: {error}")
+                return None
+
+        return _side_by_side(make, thicknesses)
 
     def _log_refused(self, reason: str) -> None:
         """Log why a body cannot be had, where there are others; without an error's name and advice."""
@@ -346,6 +349,15 @@ class CandidateBodies:
         settings = self.searches_thickness, self.supports, self.held_at, self.dofs, dict(self.unit_ratios)
         found = [(each.name, each.elastic.frequency, each.elastic.nodes, each.elastic.shapes) for each in self.bodies]
         return content_digest(settings, *chain.from_iterable(found))
+
+
+def _side_by_side(make: Callable[[Given], Made], each: Sequence[Given]) -> list[Made]:
+    """Return what is made of each, in threads.
+
+    Most of the time goes to factorizations, which release the interpreter's lock and keep a processor busy each.
+    """
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
+        return list(pool.map(make, each))
 
 
 def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:

@@ -1,9 +1,9 @@
 """The thickness of an object's wall, found by the evidence of the gains of all modes.
 
 The log evidence of bodies with walls of different thickness is a function of the log thickness, which is computed where
-the next body says most: at the top of the parabola through the three thicknesses around the most probable one, half way
-to a neighbor that is likely or far, or a step below the thinnest where that is the most probable one. The prior is
-uniform in the log thickness over the range that was computed.
+the next bodies say most, two at a time: at the top of the parabola through the three thicknesses around the most
+probable one, half way to a neighbor that is likely or far, or a step below the thinnest where that is the most probable
+one. The prior is uniform in the log thickness over the range that was computed.
 """
 
 import math
@@ -30,6 +30,7 @@ class Tolerances:
     # Below the first range, whose lower end is a guess; with no end, gains that no wall explains made it ever thinner
     # (from 1 to .06 mm).
     max_extension: float = math.log(4.0)
+    at_once: int = 2  # bodies that are computed side by side, on however many processors: the same walls everywhere
     steps: int = 2000  # thicknesses on which the posterior is summed up
 
 
@@ -39,31 +40,30 @@ TOLERANCES = Tolerances()
 def search_thickness(
     bodies: Sequence[CandidateBody],
     evidence: Callable[[Sequence[CandidateBody]], Sequence[float]],
-    with_wall: Callable[[CandidateBody, float], CandidateBody | None],
+    with_walls: Callable[[CandidateBody, Sequence[float]], Sequence[CandidateBody | None]],
 ) -> tuple[list[CandidateBody], dict[str, float] | None]:
     """Return the bodies that are not improbable, the most probable one first, and the posterior of the thickness.
 
     Of this the 5th percentile `low`, the `median` and the 95th percentile `high`, meters.
-    `evidence` has the log evidence of the gains with each body by itself, nats. `with_wall` computes a body like
-    another with a wall of a thickness in meters, None where that fails, and another thickness is tried then. Of open
-    and closed walls only those like the most probable one are searched. There is no posterior where a body without a
-    wall is the most probable one, or where fewer than two thicknesses are known.
+    `evidence` has the log evidence of the gains with each body by itself, nats. `with_walls` computes bodies like
+    another with walls of some thicknesses in meters, None where that fails, and others are tried then. Of open and
+    closed walls only those like the most probable one are searched. There is no posterior where a body without a wall
+    is the most probable one, or where fewer than two thicknesses are known.
     """
     found, failed = dict(zip(bodies, evidence(bodies), strict=True)), list[float]()
     thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - TOLERANCES.max_extension
-    for _ in range(TOLERANCES.max_bodies):
+    for _ in range(0, TOLERANCES.max_bodies, TOLERANCES.at_once):
         walls, best = _walls(found), max(found, key=found.__getitem__)
         if len(walls) < 2 or best.thickness is None:
             break
         known, values = np.log([wall for wall, _ in walls]), np.array([each for _, each in walls])
-        wall = _next(known, values, np.log(failed), thinnest=thinnest)
-        if wall is None:
+        wanted = _next(known, values, np.log(failed), thinnest=thinnest)
+        if not wanted:
             break
-        body = with_wall(best, wall)
-        if body is None:
-            failed.append(wall)
-            continue
-        [found[body]] = evidence([body])
+        made = with_walls(best, wanted)
+        failed += [wall for wall, body in zip(wanted, made, strict=True) if body is None]
+        new = [body for body in made if body is not None]
+        found |= zip(new, evidence(new), strict=True)
     best = max(found, key=found.__getitem__)
     likely = sorted(
         (body for body, each in found.items() if each > found[best] - TOLERANCES.max_evidence_gap),
@@ -80,8 +80,8 @@ def _walls(found: dict[CandidateBody, float]) -> list[tuple[float, float]]:
     return sorted((body.thickness, found[body]) for body in walls if body.thickness and body.closed == closed)
 
 
-def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnest: float) -> float | None:
-    """Return the thickness to compute next, meters; None where all that are likely have near neighbors.
+def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnest: float) -> list[float]:
+    """Return the thicknesses to compute next, meters; none where all that are likely have near neighbors.
 
     `places` are log thicknesses in rising order with their log evidence `values`, `failed` those without a body, and
     `thinnest` is the least.
@@ -102,11 +102,11 @@ def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnes
     fall, apart = values[best] - values, np.abs(places - places[best])
     near = [row for row in near if fall[row] < 4.0 * TOLERANCES.max_evidence_gap or apart[row] > TOLERANCES.max_step]
     proposals += [0.5 * (places[best] + places[row]) for row in sorted(near, key=lambda row: -values[row])]
-    known = np.concatenate([places, failed])
+    chosen = list[float]()
     for each in proposals:
-        if each >= thinnest and float(np.abs(known - each).min()) >= TOLERANCES.min_step:
-            return math.exp(each)
-    return None
+        if each >= thinnest and np.abs(np.concatenate([places, failed, chosen]) - each).min() >= TOLERANCES.min_step:
+            chosen.append(each)
+    return np.exp(chosen[: TOLERANCES.at_once]).tolist()
 
 
 def _posterior(walls: Sequence[tuple[float, float]]) -> dict[str, float]:

@@ -163,7 +163,7 @@ class MixtureEstimator(GainEstimator):
         units = PRESENT_UNIT if known is None else known.unit_ratios
         fit, thickness = Regression(data, self.kinds, sites_of(data, bodies), directional, groups, units), None
         if known is not None and known.searches_thickness:
-            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), known.with_thickness)
+            bodies, thickness = search_thickness(bodies, partial(fit.evidence, every), known.with_thicknesses)
         found = self._refined(fit, bodies)
         (outliers, credibility), evidence = fit.assess(found), dict[str, float]()
         tried = known is not None and _may_be_held(known, credibility)
