@@ -1,10 +1,10 @@
 """The localization of impacts and the score of edits, in evaluations."""
 
 import json
-import math
 import pickle
 from collections import Counter
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from avmsf.evaluation.localization import (
     located,
     nearest_spectrum,
     published_distance,
-    random_distance,
     rendered_gains,
 )
 from avmsf.evaluation.methods import FieldMethod
@@ -37,7 +36,6 @@ from avmsf.evaluation.registry import EditProtocolSettings
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
 from avmsf.evaluation.task import Task
-from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER
 from avmsf.field.fit import fit
 from avmsf.field.gains.estimator import MixtureEstimator
@@ -51,22 +49,17 @@ from factories.made_clap import save_clap
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_fit, plate_impacts
 from factories.plate_set import PlateInputs, fill_plates
 from factories.raising import raises
-from factories.verbs import run_verb
+from factories.verbs import run_verb, sets
 
 
 def test_the_nearest_recording_finds_itself_and_noise_counts_as_a_random_point() -> None:
     train, points = plate_impacts(), plate_features().points
     size = float((points.amax(0) - points.amin(0)).norm())
     assert located(NearestRecording(train), train, train, points)[0] == {"rmed": (0.0,) * len(train)}
-    expected = [random_distance(points, place) / size for place in train.contacts]
+    expected = [float((points.double() - place).norm(dim=1).mean()) / size for place in train.contacts]
     assert located(WhiteNoise(train), train, train, points)[0]["rmed"] == pytest.approx(expected)
     silent = replace(train, sounds=0 * train.sounds)
     assert located(NearestRecording(train), train, silent, points)[0]["rmed"] == pytest.approx(expected)
-
-
-def test_chance_is_the_mean_distance_from_the_right_place() -> None:
-    points = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
-    assert random_distance(points, torch.tensor([0.0, 3.0, 0.0])) == pytest.approx((3 + 5 + math.sqrt(109)) / 3)
 
 
 def test_the_most_similar_spectrum_is_a_sounds_own_however_loud_and_never_that_of_silence() -> None:
@@ -84,32 +77,29 @@ def test_the_most_similar_spectrum_is_a_sounds_own_however_loud_and_never_that_o
     assert nearest(train.sounds[1]) != 1
 
 
-def smooth_field(train: Impacts, features: FeatureField) -> SoundField:
+@cache
+def smooth_field() -> tuple[SoundField, Impacts, torch.Tensor]:
+    """Return a field, its own sounds at every sixtieth point of the plate, and all these points."""
+    train, points, rows = plate_impacts(), plate_features().points, torch.arange(0, 600, 60)
     config = replace(QUICK, warmup_steps=0, steps=1, residual=False)
-    field = fit(train, features, plate_extraction(train), config, gains=MixtureEstimator(("smooth",)))
+    field = fit(train, plate_features(), plate_extraction(train), config, gains=MixtureEstimator(("smooth",)))
     # Localization compares with mean gains: sounds are its own where they are rendered with these.
-    return replace(field, gain_field=replace(field.gain_field, spread_share=0.0))
-
-
-def struck(field: SoundField, points: torch.Tensor) -> Impacts:
-    """Return the field's own sounds at every sixtieth point."""
-    train, rows = plate_impacts(), torch.arange(0, 600, 60)
-    sounds = field.render(points[rows])
-    return replace(train.take(range(len(rows))), contacts=points[rows].to(train.contacts), sounds=sounds)
+    field = replace(field, gain_field=replace(field.gain_field, spread_share=0.0))
+    struck, sounds = points[rows].to(train.contacts), field.render(points[rows])
+    return field, replace(train.take(range(len(rows))), contacts=struck, sounds=sounds), points
 
 
 def test_a_field_finds_where_its_own_sounds_come_from() -> None:
-    train, points, field = plate_impacts(), plate_features().points, smooth_field(plate_impacts(), plate_features())
-    found = located(field, train, struck(field, points), points)[0]
+    field, test, points = smooth_field()
+    found = located(field, plate_impacts(), test, points)[0]
     assert set(found) == {"rmed", "rmed_posterior"}
     assert max(found["rmed"]) < 0.02
     assert sorted(found["rmed_posterior"])[5] < 0.1
 
 
 def test_the_published_distance_is_one_minus_the_cosine_between_the_gains_of_the_regression() -> None:
-    points = plate_features().points[::10]
-    field = smooth_field(plate_impacts(), plate_features())
-    sound = struck(field, plate_features().points).sounds[3]
+    field, test, points = smooth_field()
+    points, sound = points[::10], test.sounds[3]
     recorded = ShortTime().gains(sound[None], field.bank, field.sample_rate)[0].numpy()
     gains = rendered_gains(field, points)
     own = ShortTime().gains(field.render(points, noise=False), field.bank, field.sample_rate).numpy()
@@ -122,13 +112,11 @@ def test_the_published_distance_is_one_minus_the_cosine_between_the_gains_of_the
 
 
 def test_the_published_form_takes_the_least_cosine_distance_and_refuses_no_noise() -> None:
-    points, train = plate_features().points, plate_impacts()
-    field = smooth_field(train, plate_features())
-    test = struck(field, points)
+    field, test, points = smooth_field()
     size = float((points.amax(0) - points.amin(0)).norm())
     noise = torch.randn(test.sounds[0].shape, generator=torch.Generator().manual_seed(1))
     test = replace(test, sounds=torch.cat([test.sounds[:-1], noise[None]]))
-    errors, maps = located(field, train, test, points, published=True, map_rows=(0, len(test) - 1))
+    errors, maps = located(field, plate_impacts(), test, points, published=True, map_rows=(0, len(test) - 1))
     gains = rendered_gains(field, points)
     for row, rmed in enumerate(errors["rmed"]):
         place = points[int(published_distance(field, gains, test.sounds[row]).argmin())]
@@ -139,6 +127,7 @@ def test_the_published_form_takes_the_least_cosine_distance_and_refuses_no_noise
     torch.testing.assert_close(maps[0].distance, published_distance(field, gains, test.sounds[0])[order])
 
 
+@pytest.mark.slow
 def test_a_network_of_the_published_form_finds_its_own_recordings() -> None:
     train, config = plate_impacts(), replace(PAPER, damping="shared", clusters=8, width=16, hidden=64)
     field = plate_fit(replace(config, warmup_steps=300, steps=300, fft_sizes=(1024, 256), interleave=2), train=train)
@@ -251,7 +240,7 @@ def test_the_spectral_distance_is_free_of_level():
 
 
 NAMES = ("a-ceramic", "b-ceramic", "c-wood", "d-wood", "e-glass", "f-glass")
-CHEAP = ("--set", "edit.fields=field-smooth", "--set", "edit.guide.steps=1", "--figures")
+CHEAP = (*sets("edit.fields=field-smooth edit.guide.steps=1 extraction=short-time modes=16"), "--figures")
 
 
 @pytest.fixture
@@ -308,8 +297,8 @@ def test_edits_towards_words_have_a_clap_score_and_its_curve(plates: Path, monke
 
     monkeypatch.setattr(StableAudio, "generate", ringing)
     save_clap(plates.parent / "clap")
-    models = {"model": save_audio(plates.parent / "audio"), "clap": plates.parent / "clap", "generated": "0.5"}
-    words = [word for name, value in models.items() for word in ("--set", f"edit.{name}={value}")]
+    model, clap = save_audio(plates.parent / "audio"), plates.parent / "clap"
+    words = sets(f"edit.model={model} edit.clap={clap} edit.generated=0.5")
     methods = ("unedited", "generation", "edit-independent")
     record, folder = edited(plates, "--objects", "a-ceramic", "--methods", ",".join(methods), *words)
     assert [case.key for case in record.cases] == [f"edit: ceramic to wood: {prompt}" for prompt in PROMPTS["wood"]]

@@ -77,7 +77,8 @@ def located(
             positions, found = find(sound)
         except (LocationError, EvaluationError):
             positions, found = {}, None
-        chance = random_distance(points, truth)
+        # How far a point drawn evenly from the object's is expected to be.
+        chance = float((points - truth).norm(dim=1).mean())
         for name, values in errors.items():
             values.append((float((truth - positions[name]).norm()) if name in positions else chance) / diagonal)
         if found is not None and row in map_rows:
@@ -182,11 +183,6 @@ def _signature(sound: Sound, sample_rate: float) -> Float64[Tensor, " bins"]:
     level = torch.log(power.clamp_min(_POWER_FLOOR * float(power.max())))
     centered = level - level.mean()
     return centered / centered.norm().clamp_min(torch.finfo(torch.float64).tiny)
-
-
-def random_distance(points: Float[Tensor, "points 3"], right: Float[Tensor, " 3"]) -> float:
-    """Return how far a point drawn evenly from an object's points is expected to be from the right point."""
-    return float((points.double() - right.double()).norm(dim=1).mean())
 
 
 def write_map(path: Path, found: ContactPosterior, *, truth: Float[Tensor, " 3"]) -> None:
