@@ -1,6 +1,7 @@
 """Every method by its name: what all renderers have in common, and what each is known to give."""
 
 import math
+import pickle
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
@@ -24,7 +25,7 @@ from avmsf.evaluation.methods import (
     method_named,
     random_modes,
 )
-from avmsf.evaluation.registry import METHODS
+from avmsf.evaluation.registry import METHODS, METRICS, resolve
 from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Renderer, Task, report_of
 from avmsf.features.feature_field import FeatureField
@@ -318,11 +319,16 @@ def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
     assert method_named(f"recorded:{tmp_path}") == RecordedMethod(f"recorded:{tmp_path}", tmp_path)
 
 
-def test_methods_are_told_apart_by_their_words():
-    """A results folder remembers methods by these, so no address of an object may be in them."""
-    words = [repr(method_named(name)) for name in NAMES]
+def test_every_method_is_told_apart_by_its_words_and_can_be_sent_to_a_worker():
+    """A results folder remembers methods by their words, so no address of an object may be in them."""
+    names = [name for name, entry in METHODS.items() if not entry.path]
+    methods = [method_named(name) for name in names]
+    assert [each.name for each in pickle.loads(pickle.dumps(methods))] == names
+    words = [repr(each) for each in methods]
     assert len(set(words)) == len(words)
     assert not [word for word in words if " at 0x" in word]
+    paths = [each.make or each.fit for each in METHODS.values()] + [each.function or print for each in METRICS.values()]
+    assert all(map(callable, map(resolve, paths)))
 
 
 def write_sounds(folder: Path, impacts: Impacts) -> None:
