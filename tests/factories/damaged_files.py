@@ -15,20 +15,19 @@ from contextlib import redirect_stderr, redirect_stdout
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from safetensors.torch import load as from_bytes
 from safetensors.torch import save as to_bytes
 
-from avmsf.cli import options_of
 from avmsf.errors import AvmsfError
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from avmsf.photographs import read_sparse_points, read_views
 
 from .valid_files import SURFACES
+from .verbs import run_verb
 
 _NUMBERS = (
     *(b"nan", b"inf", b"-1", b"0", b"1e308", b"-1e308", b"1e-320", b"1e19", b"9" * 25, b"9" * 400, b"9" * 5000),
@@ -75,9 +74,11 @@ def damage_text(content: bytes, chance: random.Random) -> bytes:
     return content
 
 
-def damage_json(document: Any, chance: random.Random) -> str:
-    """Return a document as text with one to three of its values replaced, removed or repeated."""
-    document = json.loads(json.dumps(document))
+def damage_document(content: bytes, chance: random.Random) -> bytes:
+    """Return JSON with one to three of its values replaced, removed or repeated; or damaged as any text."""
+    if chance.random() < 0.3:
+        return damage_text(content, chance)
+    document = json.loads(content)
     for _ in range(chance.randint(1, 3)):
         # Values near the top as likely as those in long lists.
         if holders := [each for each in _holders(document) if each]:
@@ -89,20 +90,15 @@ def damage_json(document: Any, chance: random.Random) -> str:
                 holder.extend([holder[key]] * 3)
             else:
                 holder[key] = deepcopy(chance.choice(_VALUES))
-    return json.dumps(document)
+    return json.dumps(document).encode()
 
 
 def _holders(value: Any) -> list[Any]:
     """Return all dicts and lists in a document, the outer ones first."""
-    inner = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else []
-    found = [value] if isinstance(value, dict | list) else []
-    return found + [each for one in inner for each in _holders(one)]
-
-
-def _damage_document(content: bytes, chance: random.Random) -> bytes:
-    if chance.random() < 0.3:
-        return damage_text(content, chance)
-    return damage_json(json.loads(content), chance).encode()
+    if not isinstance(value, dict | list):
+        return []
+    inner = value.values() if isinstance(value, dict) else value
+    return [value, *(each for one in inner for each in _holders(one))]
 
 
 def _damage_field(content: bytes, chance: random.Random) -> bytes:
@@ -115,7 +111,7 @@ def _damage_field(content: bytes, chance: random.Random) -> bytes:
         flat = tensors[chance.choice(sorted(tensors))].flatten()
         flat[chance.randrange(len(flat))] = chance.choice((float("nan"), 1e38, -1e38, 0.0, -1.0, 1e-38))
     else:
-        metadata["avmsf"] = damage_json(json.loads(metadata["avmsf"]), chance)
+        metadata["avmsf"] = damage_document(metadata["avmsf"].encode(), chance).decode(errors="replace")
     return to_bytes(tensors, metadata)
 
 
@@ -130,11 +126,10 @@ class Family:
     """Reads the damaged file in the copied folder of seeds; raises `AvmsfError` for a refusal."""
 
 
-def run_verb(*words: str) -> None:
-    """Run a verb in this process, without what turns errors into exit codes; raises AvmsfError for a refusal."""
-    verb = import_module(f"avmsf.cli.{words[0]}")
+def _run(*words: str) -> None:
+    """Run a verb in silence; raise AvmsfError for a refusal."""
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        code = verb.run(options_of(words[0], words[1:]))
+        code = run_verb(*words)
     # `check` refuses a capture by its code: its report says why.
     if code == 2:
         raise AvmsfError(" ".join(words))
@@ -143,13 +138,13 @@ def run_verb(*words: str) -> None:
 
 
 def _check(folder: Path, _: Path) -> None:
-    run_verb("check", str(folder / "capture"))
-    run_verb("modes", str(folder / "capture"), "--json")
+    _run("check", str(folder / "capture"))
+    _run("modes", str(folder / "capture"), "--json")
 
 
 def _surface(folder: Path, path: Path) -> None:
     shutil.copyfile(path, folder / "capture" / f"surface{path.suffix}")
-    run_verb("check", str(folder / "capture"))
+    _run("check", str(folder / "capture"))
     read_textured_mesh(path)
 
 
@@ -160,9 +155,8 @@ def _views(folder: Path, path: Path) -> None:
 
 
 def _field(folder: Path, path: Path) -> None:
-    output = folder / "sounds"
-    run_verb("info", str(path))
-    run_verb("render", str(path), "--position", "0.05", "0.05", "0.002", "--output", str(output))
+    _run("info", str(path))
+    _run("render", str(path), "--position", "0.05", "0.05", "0.002", "--output", str(folder / "sounds"))
 
 
 def _seeds(folder: str, *names: str) -> tuple[str, ...]:
@@ -173,7 +167,7 @@ FAMILIES = {
     "wav": Family(_seeds("capture", "a.wav", "b.wav", "c.wav"), damage_bytes, _check),
     "csv": Family(("capture/impacts.csv",), damage_text, _check),
     "toml": Family(("capture/capture.toml",), damage_text, _check),
-    "transforms": Family(("transforms/transforms.json",), _damage_document, _views),
+    "transforms": Family(("transforms/transforms.json",), damage_document, _views),
     "pictures": Family(
         _seeds("transforms", "images/0.png", "images/1.jpg", "images/2.webp", "masks/0.png"), damage_bytes, _views
     ),
@@ -183,7 +177,7 @@ FAMILIES = {
     "ply text": Family(("surface_text.ply",), damage_text, _surface),
     "obj": Family(("surface.obj",), damage_text, _surface),
     "off": Family(("surface.off",), damage_text, _surface),
-    "gltf": Family(("surface.gltf",), _damage_document, _surface),
+    "gltf": Family(("surface.gltf",), damage_document, _surface),
     "splats": Family(("splats.ply",), damage_bytes, lambda _, path: read_splats(path)),
     "field": Family(("attention.safetensors", "mixture.safetensors"), _damage_field, _field),
 }

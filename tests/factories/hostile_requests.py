@@ -4,11 +4,13 @@ import http.client
 import io
 import json
 import math
+import random
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import soundfile
@@ -16,6 +18,7 @@ import soundfile
 from avmsf.field.store import save
 
 from .capture_folder import RATE, fill, ring
+from .damaged_files import damage_bytes
 from .made_fields import elastic, sounding
 
 _BODY_BYTES = 1 << 18
@@ -64,11 +67,9 @@ class Fuzzer:
         while True:
             yield Request("POST", "edit", self._edit())
             yield Request("POST", choose(("locate", "capture/check")), self._recording())
-            yield Request("POST", "edit", self._edit())
-            places = (choose(("0.01", "-0.02", "0", "nan", "inf", "1e308", "101", "x")) for _ in range(7))
             names = ("x", "y", "z", "nx", "ny", "nz", "newtons")
-            query = "&".join(map("=".join, zip(names, places, strict=True)))
-            yield Request("POST", f"capture/strikes?{query}", self._recording())
+            query = "&".join(f"{name}={choose(_NUMBERS)}" for name in names)
+            yield Request("POST", f"capture/strikes?{quote(query, safe='=&')}", self._recording())
             yield Request("PUT", "capture/strikes/a.wav", self._recording())
             words = choose(({"base": self.base}, {"base": self.base, "name": choose(_NAMES)}))
             yield Request("POST", choose(("save", "edit", "undo")), json.dumps(words).encode())
@@ -82,44 +83,40 @@ class Fuzzer:
     def _choose(self, values: Any) -> Any:
         return values[int(self.random.integers(len(values)))]
 
-    def _chance(self, part: float) -> bool:
-        return bool(self.random.random() < part)
-
-    def _members(self, *names: str) -> str:
-        return ",".join(f"{json.dumps(name)}:{self._choose(_NUMBERS)}" for name in names if self._chance(0.5))
-
     def _edit(self) -> bytes:
-        modes = ",".join(f"{{{self._members('mode', 'db', 'pitch', 'decay')}}}" for _ in range(self._choose(range(8))))
-        modes = self._choose((modes, f'{{"mode":{self._choose(range(4))},"pitch":{self._choose(_NUMBERS)}}}'))
-        names = {key: self._choose(_NAMES) for key in ("from", "to")}
-        others = {
-            f'"modes":[{modes}]': 0.5,
-            f'"material":{json.dumps(names)}': 0.3,
-            f'"law":{json.dumps(self._choose(_NAMES))}': 0.2,
-            f"{json.dumps(self._choose(_NAMES))}:{self._choose(_NUMBERS)}": 0.1,
-        }
-        parts = [f'"base":{self.base}', self._members("size", "pitch", "decay", "brightness")]
-        parts += [text for text, part in others.items() if self._chance(part)]
-        return ("{" + ",".join(filter(None, parts)) + "}").encode()
+        """Return an edit, of members that are there or not, with hostile numbers and names."""
+
+        def members(*names: str) -> list[str]:
+            return [f"{json.dumps(name)}:{self._choose(_NUMBERS)}" for name in names if self._choose((True, False))]
+
+        modes = (f"{{{','.join(members('mode', 'db', 'pitch', 'decay'))}}}" for _ in range(self._choose(range(8))))
+        pitched = f'{{"mode":{self._choose(range(4))},"pitch":{self._choose(_NUMBERS)}}}'
+        name, other = json.dumps(self._choose(_NAMES)), json.dumps(self._choose(_NAMES))
+        parts = [f'"modes":[{self._choose((",".join(modes), pitched))}]', f'"law":{name}', f"{name}:1"]
+        parts += [f'"material":{{"from":{name},"to":{other}}}']
+        chosen = [part for part in parts if self._choose((True, False, False))]
+        return (
+            "{" + ",".join([f'"base":{self.base}', *members("size", "pitch", "decay", "brightness"), *chosen]) + "}"
+        ).encode()
 
     def _recording(self) -> bytes:
         """Return a sound file, whole, of hostile samples, or damaged."""
         sound = ring(self._choose((1, 2, 30, 900, 4000)) / RATE)
         sound *= self._choose((1.0, 1.0, 1.0, 0.0, 1e-12, 1e16, 1e308, -1.0))
-        if self._chance(0.1):
-            sound[len(sound) // 2] = self._choose((math.nan, math.inf, 1e300))
+        sound[len(sound) // 2] = self._choose((*[sound[0]] * 27, math.nan, math.inf, 1e300))
         kind, subtype = self._choose(_FORMATS)
         if subtype not in ("FLOAT", "DOUBLE"):
             sound = np.clip(np.nan_to_num(sound), -1, 1)
-        channels = np.repeat(sound[:, None], int(self._choose((1, 1, 1, 2, 8))), axis=1)
         memory = io.BytesIO()
         with np.errstate(over="ignore"):
+            channels = np.repeat(sound[:, None], self._choose((1, 1, 1, 2, 8)), axis=1)
             soundfile.write(memory, channels, RATE, subtype=subtype, format=kind)
-        content = bytearray(memory.getvalue())
-        if self._chance(0.6):
-            for place in self.random.integers(0, min(len(content), 80), int(self.random.integers(1, 8))):
-                content[place] = int(self._choose((0, 1, 0x7F, 0x80, 0xFF, int(self.random.integers(256)))))
-        return bytes(content[: int(self.random.integers(len(content)))] if self._chance(0.1) else content)
+        content = memory.getvalue()
+        return (
+            damage_bytes(content, random.Random(int(self.random.integers(1 << 30))))
+            if self._choose((True, False))
+            else content
+        )
 
 
 def fuzz(ask: Callable[[Request], tuple[int, bytes]], *, count: int, seed: int = 0) -> dict[str, float]:
