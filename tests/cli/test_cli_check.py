@@ -20,13 +20,13 @@ from avmsf.cli import main
 from avmsf.errors import SceneError
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
-from avmsf.mesh.surface import surface_points
+from avmsf.mesh.surface import Surface, surface_points
 from avmsf.photographs.folder import read_camera_file, write_frames
 from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced
 from factories.capture_folder import RATE, fill, ring
 from factories.plate_capture import fill_plate
 from factories.raising import raises
-from factories.small_scene import slab, slab_views, write_surface_file
+from factories.small_scene import slab, slab_views
 from factories.verbs import results_of
 from factories.views_folder import frames, write_image, write_transforms
 from factories.views_folder import ring as camera_ring
@@ -108,12 +108,7 @@ COMMANDS = ("check", "modes", "fit -o OUT.safetensors", *(f"fit --until {stage}"
 def test_every_command_names_the_unit_of_the_mesh_and_writes_nothing(command, tmp_path, capsys):
     # Contacts in meters, and a mesh in a unit that the settings do not name.
     folder = fill_plate(tmp_path / "plate", surface=False)
-    write_surface_file(folder)
-    lines = [line.split() for line in (folder / "surface.obj").read_text().splitlines()]
-    for line in lines:
-        if line[0] == "v":
-            line[1:] = [f"{1000 * float(value):.9g}" for value in line[1:]]
-    (folder / "surface.obj").write_text("\n".join([*map(" ".join, lines), ""]))
+    Surface(1000 * slab().vertices, slab().faces).write(folder / "surface.ply")
     before = sorted(folder.rglob("*"))
     verb, *words = command.replace("OUT", str(tmp_path / "out")).split()
     assert main([verb, str(folder), *words]) == 2
@@ -194,7 +189,7 @@ def test_a_mesh_video_and_gaussians_are_named(tmp_path: Path) -> None:
     assert len(found(tmp_path).problems) == 1
     (tmp_path / "transforms.json").write_text("{}")
     assert "transforms.json" in found(tmp_path).problems[0]
-    write_surface_file(tmp_path)
+    slab().write(tmp_path / "surface.ply")
     # Pictures next to a mesh may be its textures.
     assert found(tmp_path).mesh is not None
     assert not found(tmp_path).reconstructs

@@ -20,7 +20,7 @@ from avmsf.photographs.folder import write_frames, write_views
 from avmsf.plotting.surfaces import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 from factories.plate_capture import PLATE, TINY, fill_plate
-from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views, write_surface_file
+from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views
 from factories.verbs import results_of, sets
 
 Streams = pytest.CaptureFixture[str]
@@ -127,7 +127,7 @@ def test_a_folder_that_shows_nothing_has_no_features_and_is_fitted_in_a_box(tmp_
 def test_a_mesh_is_written_as_it_is_in_meters(kind: str, tmp_path: Path) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()
-    write_surface_file(folder)
+    slab().write(folder / "surface.ply")
     (folder / "capture.toml").write_text('surface_unit = "mm"')
     for option, name in (("--output", "a"), ("-o", "b")):
         assert main(["fit", str(folder), "--until", "surface", option, str(tmp_path / f"{name}.{kind}")]) == 0
@@ -173,7 +173,7 @@ def test_contacts_are_drawn_in_the_view_and_near_each_cut() -> None:
 def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()
-    write_surface_file(folder)
+    slab().write(folder / "surface.ply")
     values, _ = results_of(capsys, "fit", folder, "--until", "surface", "--plots", tmp_path)
     assert (values["kind"], values["triangles"]) == ("surface", len(slab().faces))
     assert (tmp_path / "surface.png").read_bytes().startswith(b"\x89PNG")

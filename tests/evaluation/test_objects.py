@@ -27,7 +27,7 @@ from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.views import find_source
 from factories.plate_set import fill_plates
 from factories.raising import raises
-from factories.small_scene import slab, slab_views, write_surface_file
+from factories.small_scene import slab, slab_views
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
 
@@ -54,7 +54,7 @@ class OneObject(Dataset):
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("slab")
-    write_surface_file(folder)
+    slab().write(folder / "surface.ply")
     return folder
 
 
@@ -125,7 +125,7 @@ def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> Non
 
 def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) -> None:
     write_views(slab_views(), tmp_path)
-    write_surface_file(tmp_path)
+    slab().write(tmp_path / "surface.ply")
     found = (find_source(tmp_path, CaptureSettings(), prefer=each) for each in ("best", "mesh"))
     assert [source and source.kind for source in found] == ["cameras", "mesh"]
 

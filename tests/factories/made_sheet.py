@@ -24,12 +24,12 @@ def sheet_over(
 
 def tile(path: Path, *, bend: float = 1.0) -> Path:
     """Write a bent tile in four colors, open below; without a bend it is flat."""
-    across, along = np.meshgrid(np.linspace(-0.1, 0.1, 13), np.linspace(-0.07, 0.07, 9), indexing="ij")
-    places = np.stack([across, along, bend * (0.6 * across**2 + 0.3 * across * along)], axis=-1).reshape(-1, 3)
-    rows = np.arange(13 * 9).reshape(13, 9)
-    corners = [rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]]
-    faces = np.stack([corners[0], corners[1], corners[2], corners[0], corners[2], corners[3]], axis=-1).reshape(-1, 3)
+    sheet = sheet_over(
+        np.linspace(-0.1, 0.1, 13), np.linspace(-0.07, 0.07, 9), lambda x, y: bend * (0.6 * x**2 + 0.3 * x * y)
+    )
+    places = sheet.vertices.double().numpy()
     colors = np.array([[200, 40, 30], [30, 90, 200], [240, 220, 60], [70, 160, 80]], dtype=np.uint8)
     painted = colors[(places[:, 0] > 0) + 2 * (places[:, 1] > 0)]
-    path.write_bytes(trimesh.Trimesh(places, faces, vertex_colors=painted, process=False).export(file_type="ply"))
+    mesh = trimesh.Trimesh(places, sheet.faces.numpy(), vertex_colors=painted, process=False)
+    path.write_bytes(mesh.export(file_type="ply"))
     return path

@@ -2,15 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.capture import Capture, write_capture
 from avmsf.errors import SceneError, SimulationError
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
-from avmsf.fem.candidate_bodies import CandidateBodies
-from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.simulate.ground_truth import TRUTH, Truth, write_truth
 from factories.plate_field import CONTACT_TIME, HIGHEST, plate_impacts, rectangle
 from oracles.plate import Plate, plate_modes, plate_surface_points
@@ -52,11 +50,10 @@ class PlateInputs(ObjectInputs):
             raise SceneError(f"{identifier}: nothing shows its look")
         return FeatureField.from_points(plate_surface_points(plate_named(identifier), 200))
 
-    def bodies(self, identifier: str) -> CandidateBodies:
+    def bodies(self, identifier: str) -> Any:
         raise SimulationError(f"{identifier} has no shape here")
 
-    def family(self, identifier: str) -> BodyFamily:
-        raise SimulationError(f"{identifier} has no shape here")
-
-    def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
+    def cloud(self, identifier: str, views: int | None = None) -> Any:
         raise SceneError(f"{identifier}: nothing shows its look")
+
+    family = bodies

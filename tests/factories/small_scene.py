@@ -1,7 +1,5 @@
 """A small painted thing, photographed from all sides, and the plate's blows on it."""
 
-from pathlib import Path
-
 import torch
 
 from avmsf.mesh import Surface
@@ -31,11 +29,3 @@ def slab_views(size: int = 48) -> tuple[View, ...]:
     mesh = TexturedMesh.build(surface.vertices, surface.faces, colors=paint[surface.faces])
     cameras = orbit_cameras(mesh.surface, size=size, azimuths=8)
     return render_views(mesh, cameras, background=(0.0, 0.0, 0.0), supersample=2)
-
-
-def write_surface_file(folder: Path) -> None:
-    """Write the slab as `surface.obj`."""
-    surface = slab()
-    lines = [f"v {x} {y} {z}" for x, y, z in surface.vertices.tolist()]
-    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in surface.faces.tolist()]
-    (folder / "surface.obj").write_text("\n".join([*lines, ""]))
