@@ -17,7 +17,7 @@ from avmsf.export.writing import write_folder
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.studio.routes import PAGE
-from opened_plate import blow
+from served import blow
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Route

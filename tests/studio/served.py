@@ -1,7 +1,8 @@
-"""The real server in a thread, asked over a socket, so that nothing tidies up what the tests send."""
+"""A small plate to open, and the real server in a thread, asked over a socket: nothing tidies up what tests send."""
 
 import asyncio
 import http.client
+import io
 import json
 import threading
 import time
@@ -9,16 +10,48 @@ from collections.abc import Coroutine, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+import soundfile
+
+from avmsf.field.sound_field import SoundField
+from avmsf.field.store import save
 from avmsf.studio.guard import MAX_UPLOAD_BYTES, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.routes import make_app
 from avmsf.studio.server import listen, make_server
 from avmsf.studio.studio import Studio, StudioConfig
+from factories.capture_folder import ring
+from factories.made_fields import FIELDS, sounding
 
+RATE = 8000
 T = TypeVar("T")
+
+
+def plate_field(kind: str = "positional") -> SoundField:
+    return sounding(FIELDS[kind](), noise=1e-6, samples=2400)
+
+
+def open_plate(home: Path, kind: str = "positional") -> Opened:
+    home.mkdir(parents=True, exist_ok=True)
+    path = home / "plate.safetensors"
+    save(plate_field(kind), path)
+    return Opened("plate", home, field=path)
+
+
+def wav(samples: np.ndarray, *, rate: int = RATE, subtype: str = "FLOAT", kind: str = "WAV") -> bytes:
+    memory = io.BytesIO()
+    soundfile.write(memory, samples, rate, subtype=subtype, format=kind)
+    return memory.getvalue()
+
+
+@cache
+def blow(seed: int = 0, **options: float) -> bytes:
+    """Return a wav file; the same object again, for its header holds the time at which it was written."""
+    return wav(ring(before=0.1, seed=seed, **options))
 
 
 def run_async(coroutine: Coroutine[Any, Any, T]) -> T:

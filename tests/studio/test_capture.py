@@ -23,7 +23,7 @@ from avmsf.studio.capture import CaptureEditor, read_contact
 from avmsf.studio.responses import RequestError, response_to
 from factories.capture_folder import fill, ring
 from factories.raising import raises
-from opened_plate import blow, wav
+from served import blow, wav
 
 
 def contact(x: float) -> Impact:

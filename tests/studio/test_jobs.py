@@ -24,8 +24,7 @@ from avmsf.studio.worker import EventWriter, lead, make_field
 from factories.capture_folder import fill
 from factories.raising import raises
 from factories.running import alive, gone
-from opened_plate import blow, plate_field
-from served import run_async
+from served import blow, plate_field, run_async
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
 pytestmark = [

@@ -23,8 +23,7 @@ from avmsf.studio.studio import Studio
 from factories.capture_folder import fill
 from factories.raising import raises
 from factories.ringing_field import SameGains
-from opened_plate import plate_field
-from served import served
+from served import plate_field, served
 
 SIDES = (0.24, 0.16, 0.02)
 

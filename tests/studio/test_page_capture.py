@@ -13,9 +13,8 @@ import soundfile
 from avmsf.capture import read_capture
 from avmsf.field.store import save
 from avmsf.studio.opening import open_target
-from opened_plate import blow, plate_field
 from plate_page import Open, answer, on_screen, plate_object, upload, words_on
-from served import Served, wait_until
+from served import Served, blow, plate_field, wait_until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Route

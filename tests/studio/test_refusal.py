@@ -17,8 +17,7 @@ from avmsf.studio.server import serve
 from factories.capture_folder import fill
 from factories.hostile_requests import Request, fuzz, write_object
 from factories.raising import raises
-from opened_plate import blow, open_plate, wav
-from served import Answer, Served, run_async, served
+from served import Answer, Served, blow, open_plate, run_async, served, wav
 
 PLACE = "capture/strikes?x=0.01&y=0.02&z=0"
 

@@ -23,7 +23,7 @@ from avmsf.studio.responses import RequestError
 from avmsf.studio.session import Revision, Session, file_name
 from factories.made_fields import FIELDS
 from factories.raising import raises
-from opened_plate import plate_field
+from served import plate_field
 
 WOODEN = {"material": {"from": "ceramic", "to": "wood"}, "size": 1.5, "pitch": 0.8, "decay": 2.0, "brightness": 1.0}
 
