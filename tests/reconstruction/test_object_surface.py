@@ -20,17 +20,17 @@ from avmsf.reconstruction.hull_distance import Outline, hull_distance
 from avmsf.reconstruction.object_shape import ShapeReport
 from factories.looked_at import HEIGHT, RADIUS, ball, cup, cup_volume, depth_of, mesh_of, tube, views_of
 
-CELLS, COARSE = 64, 48
+CELLS = 48
 WALL = 0.004
 
 
-def _shape(mesh: trimesh.Trimesh, *, behind: float = 0.0, **look: object) -> ObjectShape:
-    return object_surface(views_of(mesh, **look), depth_of(mesh, behind=behind), cells=CELLS)
+def _shape(mesh: trimesh.Trimesh, *, behind: float = 0.0, cells: int = CELLS, **look: object) -> ObjectShape:
+    return object_surface(views_of(mesh, **look), depth_of(mesh, behind=behind), cells=cells)
 
 
 @pytest.fixture(scope="module")
 def cup_shape() -> ObjectShape:
-    return _shape(cup(wall=WALL))
+    return _shape(cup(wall=WALL), cells=64)
 
 
 def test_a_ball_is_a_closed_ball_without_a_cavity() -> None:
@@ -109,7 +109,7 @@ def test_a_tube_is_open_at_both_ends() -> None:
 
 def test_a_thin_plate_seen_from_both_sides_keeps_its_thickness() -> None:
     sides = (0.1, 0.06, 0.002)
-    mesh = mesh_of(_shape(trimesh.creation.box(sides)).as_seen())
+    mesh = mesh_of(_shape(trimesh.creation.box(sides), cells=64).as_seen())
     assert mesh.volume == pytest.approx(np.prod(sides), rel=0.2)
 
 
@@ -125,7 +125,7 @@ def test_a_slender_shape_has_a_shell_below_a_face_that_may_be_open() -> None:
     # Half a rod that lies on its round side: cells are much smaller than the flat face is wide.
     rod = trimesh.creation.cylinder(radius=0.02, height=0.2, sections=96)
     half = trimesh.PointCloud(rod.vertices[rod.vertices[:, 1] < 1e-9]).convex_hull
-    shape = object_surface(views_of(half), depth_of(half))
+    shape = _shape(half, cells=96)
     assert (shape.supposed, int(shape.hollow.max())) == (True, 1)
     wall, area = 0.002, np.pi * 0.02 * 0.2 + np.pi * 0.02**2
     assert mesh_of(shape.shell(wall)).volume == pytest.approx(area * wall, rel=0.15)
@@ -215,8 +215,7 @@ def block() -> ObjectShape:
 
 
 def _cylinder(**look: object) -> ObjectShape:
-    solid = trimesh.creation.cylinder(radius=0.03, height=0.05, sections=96)
-    return object_surface(views_of(solid, **look), depth_of(solid), cells=COARSE)
+    return _shape(trimesh.creation.cylinder(radius=0.03, height=0.05, sections=96), **look)
 
 
 def test_both_ends_of_a_cylinder_may_be_open(block: ObjectShape) -> None:
@@ -265,7 +264,7 @@ def test_masks_that_are_all_too_large_or_too_small_leave_the_size_as_it_is(pixel
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(pixels) + 1,) * 2)
     change = cv2.dilate if pixels > 0 else cv2.erode
     views = [replace(view, mask=torch.from_numpy(change(view.mask.numpy(), kernel))) for view in views_of(mesh)]
-    shape = object_surface(views, depth_of(mesh), cells=COARSE)
+    shape = object_surface(views, depth_of(mesh), cells=CELLS)
     # A pixel is 1 mm wide there.
     radii = np.linalg.norm(mesh_of(shape.solid()).vertices, axis=1)
     assert float(radii.mean()) == pytest.approx(RADIUS, abs=0.0005)
@@ -282,19 +281,17 @@ def test_a_mask_that_is_wrong_about_a_small_part_is_left_out() -> None:
     wrong = (3, 9)
     for row in wrong:
         views[row] = replace(views[row], mask=views[row].mask.flip((0, 1)).clone())
-    shape = object_surface(views, depth_of(mesh), cells=COARSE)
+    shape = object_surface(views, depth_of(mesh), cells=CELLS)
     assert set(shape.report.rejected) == {views[row].name for row in wrong}
     assert float(shape.solid().vertices[:, 0].max()) == pytest.approx(0.065, abs=0.002)
 
 
-@pytest.mark.parametrize(
-    "few", [lambda view: replace(view, mask=None), lambda view: view], ids=["no masks", "one side"]
-)
-def test_views_without_masks_or_from_one_side_are_refused(few) -> None:
+def test_views_without_masks_or_from_one_side_are_refused() -> None:
     mesh = ball(RADIUS)
-    views = [few(view) for view in views_of(mesh, elevations=(0.0,), azimuths=72)[:3]]
-    with pytest.raises(SceneError):
-        object_surface(views, depth_of(mesh), cells=COARSE)
+    views = views_of(mesh, elevations=(0.0,), azimuths=72, size=48)[:3]
+    for few in (views, [replace(view, mask=None) for view in views]):
+        with pytest.raises(SceneError):
+            object_surface(few, depth_of(mesh), cells=CELLS)
 
 
 @pytest.mark.parametrize("wall", [0.0, -1.0, float("nan"), 0.05, 1.2 * RADIUS])
