@@ -4,7 +4,6 @@ import itertools
 
 import torch
 
-from avmsf.errors import SimulationError
 from avmsf.fem.solid import Solid
 
 
@@ -12,12 +11,8 @@ def block(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Soli
     """Return a block from the origin to `size` meters, `cells` boxes along each axis, six tetrahedra a box.
 
     The tetrahedra of a box are the six ways from its lowest corner to its highest along the axes, so that those of
-    neighboring boxes meet in whole sides. Raises SimulationError for sizes and numbers that are not positive.
+    neighboring boxes meet in whole sides.
     """
-    if not all(0 < side < float("inf") for side in size) or min(cells) < 1:
-        raise SimulationError.expected(
-            "sizes above 0 and 1 box or more per axis", (size, cells), got=f"{size} m in {cells} boxes", name="block"
-        )
     places = [
         torch.linspace(0.0, side, number + 1, dtype=torch.float64) for side, number in zip(size, cells, strict=True)
     ]

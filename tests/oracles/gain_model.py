@@ -81,10 +81,7 @@ def learned_prior(joint: Array, category: Sequence[int], start: Array, *, rounds
     for _ in range(rounds):
         counts = pseudo_count * joint.shape[2] * start
         for series in range(joint.shape[2]):
-            weights = np.array(
-                [[np.exp(each) for each in row] for row in joint[..., series] - joint[..., series].max()]
-            )
-            weights *= learned[list(category)]
+            weights = np.exp(joint[..., series] - joint[..., series].max()) * learned[list(category)]
             for kernel, weight in zip(category, weights / weights.sum(), strict=True):
                 counts[kernel] += weight
         learned = counts / counts.sum()
