@@ -47,7 +47,7 @@ from avmsf.symmetry.characters import groups_of
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
 from benchmarks.records import REPOSITORY, MissingDataError, Settings
-from tests.oracles.plate import Plate, plate_surface_points, sample_contacts, strike
+from tests.oracles.plate import Plate, plate_surface_points, strike
 
 STARTS = (0, 18, 37)
 """First contacts of the splits of a measured capture, as far as it has so many."""
@@ -96,13 +96,12 @@ class PlateCase:
         highest: float = 8000.0,
     ) -> Impacts:
         """Return impacts at contacts drawn with seed 0; the noise comes from the same generator."""
-        generator = torch.Generator().manual_seed(0)
         return strike(
             self.plate,
-            sample_contacts(self.plate, count, generator=generator),
+            count,
             sample_rate=sample_rate,
             seconds=seconds,
-            generator=generator,
+            seed=0,
             noise_db=noise_db,
             highest=highest,
             contact_time=self.contact_time,

@@ -16,7 +16,7 @@ from avmsf.capture.preprocess import preprocess, start_with_impact
 from avmsf.capture.table import Impact
 from factories.capture_folder import RATE, ROWS, fill, ring
 from factories.plate_capture import fill_plate
-from oracles.plate import Plate, sample_contacts, strike
+from oracles.plate import Plate, strike
 
 HAMMER = CaptureSettings(force_channel=1, response_channel=2, seconds=0.4)
 MARGIN = 160
@@ -282,7 +282,7 @@ def test_a_deconvolved_response_is_known_before_the_push_too() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::avmsf.errors.CaptureWarning")  # the tree was struck twice at each point
-@pytest.mark.parametrize("name", ["aircraft_response", "ruler10", "tree43"])
+@pytest.mark.parametrize("name", ["aircraft_response", "ruler10", pytest.param("tree43", marks=pytest.mark.slow)])
 def test_measured_impulse_responses_are_not_cut(shared: Path, name: str) -> None:
     folder = shared / name
     impacts = read_capture(folder, CaptureSettings()).impacts
@@ -324,12 +324,9 @@ def test_a_displacement_s_and_a_velocity_s_response_start_with_the_impact(tmp_pa
 @pytest.mark.parametrize("contact_time", [0.0, 5e-4])
 @pytest.mark.parametrize("lead", [0, 6, 100])
 def test_a_plate_s_responses_start_with_the_impact_at_any_rate(rate: float, contact_time: float, lead: int) -> None:
-    plate, generator = Plate(alpha=40.0), torch.Generator().manual_seed(0)
-    contacts = sample_contacts(plate, 12, generator=generator)
-    sounds = strike(
-        plate, contacts, sample_rate=rate, seconds=0.3, generator=generator, noise_db=-40.0, highest=2500.0,
-        contact_time=contact_time,
-    ).sounds.double().numpy()  # fmt: skip
+    excited = {"highest": 2500.0, "contact_time": contact_time}
+    impacts = strike(Plate(alpha=40.0), 12, sample_rate=rate, seconds=0.3, seed=0, noise_db=-40.0, **excited)
+    sounds = impacts.sounds.double().numpy()
     # Before the impact there is noise 40 dB down as well.
     noise = (
         1e-2 * np.sqrt(np.mean(sounds**2)) * np.random.default_rng(0).standard_normal((12, round(lead * rate / 8e3)))

@@ -49,7 +49,7 @@ def field_of(frequency: torch.Tensor, damping: torch.Tensor, gains: torch.Tensor
     """Return a field that has these gains at these contacts, and smooth ones between them."""
     values = torch.complex(gains, 0.5 * gains.roll(1, dims=1))
     size, bank = float((contacts.amax(0) - contacts.amin(0)).norm()), ModalBank(frequency, damping)
-    model = mixture_of(contacts, values, bank, contacts, families=[Smooth], size=size)
+    model = mixture_of(contacts, values, bank=bank, points=contacts, positional=[Smooth], size=size)
     # The mean at the contacts is linear in the gains measured there: these have it pass through the given ones.
     series = torch.cat([values.real, values.imag], dim=1).double()
     passed = torch.linalg.solve(model.mixture.smoother(), series.T[..., None])[..., 0].T

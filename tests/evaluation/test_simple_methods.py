@@ -34,9 +34,7 @@ X, Y, OPPOSITE = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]
 
 
 def plate_impacts(count: int = 30, *, noise_db: float | None = None) -> Impacts:
-    generator = torch.Generator().manual_seed(0)
-    contacts = sample_contacts(PLATE, count, generator=generator)
-    return strike(PLATE, contacts, sample_rate=22050.0, seconds=0.2, generator=generator, noise_db=noise_db)
+    return strike(PLATE, count, sample_rate=22050.0, seconds=0.2, seed=0, noise_db=noise_db)
 
 
 def true_extraction(impacts: Impacts) -> Extraction:

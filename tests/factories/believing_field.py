@@ -1,7 +1,6 @@
 """A flat bar whose elastic mode shapes are cosines, and gains that are drawn from what the gain model assumes."""
 
-from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -9,13 +8,12 @@ from torch import Tensor
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL
 from avmsf.field.gains.elastic import PERTURBATIONS, RESIDUALS, WIDTHS, Elastic
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import KernelFamily, Sites, Smooth, ThinPlate, Unstructured
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
-from factories.made_fields import sounding
+from factories.made_fields import mixture, sounding
 
 LENGTH, WIDTH = 0.4, 0.1
 SIZE = (LENGTH**2 + WIDTH**2) ** 0.5
@@ -85,23 +83,15 @@ def drawn_gains(contacts: Tensor, *, seed: int) -> Tensor:
     return (smooth + own).transpose(0, 1)
 
 
-def _fitted(families: Sequence[KernelFamily], values: Tensor, *, directional: bool) -> MixtureGains:
-    nothing = torch.zeros(len(BANK), dtype=torch.float64)
-    measured = MeasuredGains(torch.view_as_complex(values.contiguous()), nothing, BANK.frequency, BANK.damping)
-    return fit_mixture(families, measured, bar_points(), directional=directional)
+def elastic_field(contacts: Tensor, values: Tensor, *, directional: bool = True) -> MixtureGains:
+    """Return the model of gains at contacts with all families, or one that knows neither directions nor a body."""
+    sites, complex_values = impacts(contacts), torch.view_as_complex(values.contiguous())
+    body = [Elastic(sites, SIZE, bar())] if directional else []
+    about = {"bank": BANK, "points": bar_points(), "size": SIZE, "variance": 0.0}
+    return mixture(sites, complex_values, *body, directional=directional, **about)
 
 
-def elastic_field(contacts: Tensor, values: Tensor) -> MixtureGains:
-    """Return the model of gains at contacts with all families."""
-    sites = impacts(contacts)
-    families = [each(sites, SIZE) for each in (Unstructured, Smooth, ThinPlate)]
-    return _fitted([*families, Elastic(sites, SIZE, bar())], values, directional=True)
-
-
-def positional_field(contacts: Tensor, values: Tensor) -> MixtureGains:
-    """Return the model that knows neither directions nor a body."""
-    sites = impacts(contacts)
-    return _fitted([each(sites, SIZE) for each in (Unstructured, Smooth, ThinPlate)], values, directional=False)
+positional_field = partial(elastic_field, directional=False)
 
 
 def one_hypothesis(contacts: Tensor, values: Tensor) -> MixtureGains:

@@ -3,11 +3,12 @@
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import torch
 
-from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import Sites, Smooth, ThinPlate, Unstructured
+from avmsf.capture.impacts import Impacts
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import Gains
 from avmsf.field.sound_field import Origin, SoundField
@@ -15,8 +16,8 @@ from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
-from factories.made_fields import StandIn, sounding
-from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+from factories.made_fields import StandIn, mixture, sounding
+from oracles.plate import Plate, plate_modes, plate_surface_points, strike
 
 PLATE = Plate()
 RATE, SECONDS, HIGHEST = 18000.0, 0.4, 8000.0
@@ -63,40 +64,25 @@ def locator_of(taps: int | None = None) -> Locator:
         return Locator.of(true_field())
     impacts = struck(taps, seed=5)
     values = fit_gains(impacts.sounds, bank(), sample_rate=RATE).to(torch.complex128)
-    return Locator.of(field_of(mixture_of(impacts.contacts, values, bank(), plate_surface_points(PLATE, 1500))))
-
-
-def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLATE):
-    generator = torch.Generator().manual_seed(seed)
-    contacts = sample_contacts(plate, count, generator=generator)
-    return strike(
-        plate, contacts, sample_rate=RATE, seconds=SECONDS, generator=generator, noise_db=noise_db, highest=HIGHEST
+    return Locator.of(
+        field_of(mixture_of(impacts.contacts, values, bank=bank(), points=plate_surface_points(PLATE, 1500)))
     )
 
 
-def mixture_of(
-    contacts: torch.Tensor,
-    values: torch.Tensor,
-    modes: ModalBank,
-    points: torch.Tensor,
-    *,
-    families=(Unstructured, Smooth, ThinPlate),
-    size: float = DIAGONAL,
-) -> MixtureGains:
-    """Return gains fitted to those measured at contacts of a plate, or of another object of that size."""
+def struck(count: int, *, seed: int, noise_db: float = -40.0, plate: Plate = PLATE) -> Impacts:
+    return strike(plate, count, sample_rate=RATE, seconds=SECONDS, seed=seed, noise_db=noise_db, highest=HIGHEST)
+
+
+def mixture_of(contacts: torch.Tensor, values: torch.Tensor, **about: Any) -> MixtureGains:
+    """Return gains fitted to those measured at contacts of the plate, or of another object, struck from above."""
     sites = Sites(contacts, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(contacts))
-    measured = MeasuredGains(values, torch.zeros_like(modes.damping), modes.frequency, modes.damping)
-    return fit_mixture([each(sites, size) for each in families], measured, points.float(), directional=False)
+    return mixture(sites, values, directional=False, variance=0.0, **{"size": DIAGONAL, **about})
 
 
 def mirrored(contact: torch.Tensor) -> torch.Tensor:
     """Return the contact and its images in the plate's two planes of symmetry, which sound the same."""
-    across, along = contact.clone(), contact.clone()
-    across[0] = PLATE.length - contact[0]
-    along[1] = PLATE.width - contact[1]
-    both = across.clone()
-    both[1] = along[1]
-    return torch.stack([contact, across, along, both]).float()
+    x, y, z = contact.tolist()
+    return torch.tensor([[a, b, z] for a in (x, PLATE.length - x) for b in (y, PLATE.width - y)])
 
 
 def missed(found: ContactPosterior, row: int, contact: torch.Tensor) -> float:

@@ -1,7 +1,7 @@
 """A plate whose mode shapes are products of cosines: impacts, gain models of them, a gain field of every kind."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -135,12 +135,22 @@ def attention(*, spatial_damping: bool = False) -> AttentionGains:
     return network.eval().requires_grad_(False)
 
 
-def mixture(sites: Sites, values: torch.Tensor, *more: KernelFamily, directional: bool) -> MixtureGains:
-    """Return a model of the positional families and some more."""
-    variance = torch.full((len(BANK),), 1e-4, dtype=torch.float64)
-    measured = MeasuredGains(values, variance, BANK.frequency, BANK.damping)
+def mixture(
+    sites: Sites,
+    values: torch.Tensor,
+    *more: KernelFamily,
+    directional: bool,
+    positional: Sequence[type[KernelFamily]] = POSITIONAL,
+    bank: ModalBank = BANK,
+    points: torch.Tensor | None = None,
+    size: float = SIZE,
+    variance: float = 1e-4,
+) -> MixtureGains:
+    """Return a model of the positional families and some more: of this plate's gains, or of another object's."""
+    measured = MeasuredGains(values, torch.full_like(bank.damping, variance), bank.frequency, bank.damping)
+    points = places(150, seed=0) if points is None else points
     return fit_mixture(
-        [*families(sites, elastic=False), *more], measured, places(150, seed=0).float(), directional=directional
+        [*(kind(sites, size) for kind in positional), *more], measured, points.float(), directional=directional
     )
 
 

@@ -15,7 +15,7 @@ from avmsf.mesh import Surface
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
-from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+from oracles.plate import Plate, plate_modes, plate_surface_points, strike
 
 PLATE = Plate()
 CONTACT_TIME = 5e-4
@@ -23,31 +23,15 @@ HIGHEST = 2500.0
 RATE = 8000.0
 
 QUICK = FitConfig(
-    clusters=8,
-    width=16,
-    hidden=32,
-    warmup_steps=12,
-    steps=12,
-    fft_sizes=(1024, 256),
-    early=1024,
-    damping="shared",
+    clusters=8, width=16, hidden=32, warmup_steps=12, steps=12, fft_sizes=(1024, 256), early=1024, damping="shared"
 )
 
 
 def plate_impacts(
     count: int = 12, *, seconds: float = 0.3, forces: bool = False, plate: Plate = PLATE, seed: int = 0
 ) -> Impacts:
-    generator = torch.Generator().manual_seed(seed)
-    impacts = strike(
-        plate,
-        sample_contacts(plate, count, generator=generator),
-        sample_rate=RATE,
-        seconds=seconds,
-        generator=generator,
-        noise_db=-40.0,
-        highest=HIGHEST,
-        contact_time=CONTACT_TIME,
-    )
+    excited = {"highest": HIGHEST, "contact_time": CONTACT_TIME}
+    impacts = strike(plate, count, sample_rate=RATE, seconds=seconds, seed=seed, noise_db=-40.0, **excited)
     return replace(impacts, forces=torch.full((count,), 2.0)) if forces else impacts
 
 

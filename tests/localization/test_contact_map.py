@@ -103,7 +103,7 @@ def plate_field(taps: int, *, copies: int = 1, again: int = 1) -> SoundField:
     higher = torch.linspace(1.0, 1.5, copies, dtype=torch.float64).repeat_interleave(len(modes.frequency))
     bank = ModalBank(modes.frequency.repeat(copies) * higher, modes.damping.repeat(copies))
     values = torch.complex(modes.gains, torch.zeros_like(modes.gains)).repeat(1, copies)
-    gains = mixture_of(contacts, values, bank, plate_surface_points(PLATE, 600))
+    gains = mixture_of(contacts, values, bank=bank, points=plate_surface_points(PLATE, 600))
     return sounding(gains, bank=bank, noise=1e-3, samples=4000)
 
 

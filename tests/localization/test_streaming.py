@@ -19,7 +19,7 @@ from avmsf.modal.synthesis import synthesize
 from factories.located_plate import TrueGains
 from factories.made_fields import BANK, positional, sounding
 from factories.raising import raises
-from oracles.plate import Plate, plate_modes, plate_surface_points, sample_contacts, strike
+from oracles.plate import Plate, plate_modes, plate_surface_points, strike
 
 RATE = 8000.0
 STRUCK = (68, 60, 102, 8, 107)
@@ -196,11 +196,8 @@ def damped_locator(material: str) -> Locator:
 
 def damped_blows(material: str, *, length: float = LENGTH, heard_by: str, noise_db: float = -40.0) -> Tensor:
     """Return eight blows on a plate, up to the highest frequency that the field of material `heard_by` knows."""
-    generator = torch.Generator().manual_seed(0)
-    struck = plate(material, length)
-    contacts = sample_contacts(struck, 8, generator=generator)
-    recorder = {"sample_rate": PLATE_RATE, "seconds": SECONDS, "generator": generator, "noise_db": noise_db}
-    return strike(struck, contacts, highest=HIGHEST[heard_by], **recorder).sounds
+    recorder = {"sample_rate": PLATE_RATE, "seconds": SECONDS, "seed": 0, "noise_db": noise_db}
+    return strike(plate(material, length), 8, highest=HIGHEST[heard_by], **recorder).sounds
 
 
 FOREIGN = [("wood", "wood", 0.2), ("wood", "wood", 0.33), ("plastic", "wood", 0.2), ("plastic", "plastic", 0.2)]

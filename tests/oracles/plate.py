@@ -90,21 +90,23 @@ def plate_modes(
 
 def strike(
     plate: Plate,
-    contacts: Float[Tensor, "contacts 3"],
+    count: int,
     *,
     sample_rate: float,
     seconds: float,
-    generator: torch.Generator,
+    seed: int,
     noise_db: float | None = None,
     highest: float = 8000.0,
     contact_time: float = 0.0,
 ) -> Impacts:
-    """Record a blow of one newton-second, straight down, at each contact, as `plate_modes` has it.
+    """Record blows of one newton-second, straight down, at `count` drawn contacts, as `plate_modes` has them.
 
     `noise_db` is the level of the white Gaussian noise that is added to all sounds: its root mean square over that of
     the noiseless sounds, both taken over all sounds and their whole length, so that -40.0 is noise 40 dB down and one
     recorder's floor for loud and faint blows alike. None adds none. Frequencies in Hz.
     """
+    generator = torch.Generator().manual_seed(seed)
+    contacts = sample_contacts(plate, count, generator=generator)
     modes = plate_modes(plate, contacts, highest=highest, contact_time=contact_time)
     times = torch.arange(round(seconds * sample_rate), dtype=torch.float64) / sample_rate
     sounds = torch.zeros(len(contacts), len(times), dtype=torch.float64)

@@ -20,7 +20,7 @@ from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.synthesis import synthesize
 from factories.raising import raises
-from oracles.plate import Plate, PlateModes, plate_modes, sample_contacts, strike
+from oracles.plate import Plate, PlateModes, plate_modes, strike
 
 RATE = 16000.0
 PLATE = Plate(alpha=20.0)
@@ -32,12 +32,9 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def recorded(noise_db: float, *, contacts: int = 6, seconds: float = 0.5) -> tuple[Impacts, PlateModes]:
-    generator = seeded(1)
-    places = sample_contacts(PLATE, contacts, generator=generator)
-    impacts = strike(
-        PLATE, places, sample_rate=RATE, seconds=seconds, generator=generator, noise_db=noise_db, highest=HIGHEST
-    )
-    return impacts, plate_modes(PLATE, places, highest=HIGHEST)
+    recorder = {"sample_rate": RATE, "seconds": seconds, "noise_db": noise_db}
+    impacts = strike(PLATE, contacts, highest=HIGHEST, seed=1, **recorder)
+    return impacts, plate_modes(PLATE, impacts.contacts, highest=HIGHEST)
 
 
 def matched(bank: ModalBank, truth: PlateModes) -> tuple[Tensor, Tensor, Tensor]:
@@ -221,10 +218,7 @@ def test_a_kept_file_that_lacks_a_tensor_is_made_again(tmp_path: Path, lacking: 
 
 
 def test_the_same_sounds_give_the_same_modes_to_the_last_bit() -> None:
-    plate = Plate()
-    contacts = sample_contacts(plate, 4, generator=torch.Generator().manual_seed(1))
-    generator = torch.Generator().manual_seed(2)
-    sounds = strike(plate, contacts, sample_rate=20000.0, seconds=0.3, noise_db=-20.0, generator=generator).sounds
+    sounds = strike(Plate(), 4, sample_rate=20000.0, seconds=0.3, noise_db=-20.0, seed=1).sounds
     # Wherever they lie in memory: shifted by one float, which no vector register is aligned to.
     shifted = torch.empty(sounds.numel() + 1)[1:].view_as(sounds).copy_(sounds)
     first, second = (extract_sounds(each, sample_rate=20000.0).bank for each in (sounds, shifted))
