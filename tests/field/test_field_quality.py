@@ -88,30 +88,35 @@ def test_force_scales_the_modes_and_leaves_the_background():
 CONFIG = FitConfig(warmup_steps=0, steps=3)
 
 
-def parted(recorded):
-    """Return 16 recordings to fit to and 4 others, without their margins: they are aligned."""
-    final = replace(recorded, before=None, after=None)
+def parted(*, clicks: bool = False):
+    """Return 16 recordings to fit to and 4 others, without their margins: they are aligned.
+
+    With clicks, all of them have the same burst, which no mode explains.
+    """
+    final = replace(strikes(20), before=None, after=None)
+    if clicks:
+        burst = 0.3 * torch.randn(SAMPLES, generator=torch.Generator().manual_seed(1))
+        burst[300:] = 0.0
+        final = replace(final, sounds=final.sounds + burst)
     return final.take(range(16)), final.take(range(16, 20))
 
 
 @cache
+def modes(*, clicks: bool = False):
+    return extract_modes(parted(clicks=clicks)[0])
+
+
+def fitted(train, modes, config=CONFIG):
+    return fit(train, FeatureField.from_contacts(strikes(20).contacts, count=300), modes, config)
+
+
+@cache
 def plain() -> SoundField:
-    return fitted(parted(strikes(20))[0])
-
-
-def fitted(train, config=CONFIG):
-    return fit(train, FeatureField.from_contacts(strikes(20).contacts, count=300), extract_modes(train), config)
-
-
-def with_clicks(recorded):
-    """Return recordings that have the same burst, which no mode explains, in all of them."""
-    burst = 0.3 * torch.randn(SAMPLES, generator=torch.Generator().manual_seed(1))
-    burst[300:] = 0.0
-    return replace(recorded, sounds=recorded.sounds + burst)
+    return fitted(parted()[0], modes())
 
 
 def test_the_error_at_contacts_left_out_is_about_that_at_new_ones():
-    (train, test), field = parted(strikes(20)), plain()
+    (train, test), field = parted(), plain()
     # Two of the sixteen contacts are in one place.
     assert field.quality.positions == 15
     assert field.quality.error < field.quality.nearest_mean
@@ -122,9 +127,8 @@ def test_the_error_at_contacts_left_out_is_about_that_at_new_ones():
 
 
 def test_repeats_at_a_position_do_not_count_as_independent():
-    train, _ = parted(strikes(20))
-    single = train.take(range(14))
-    once, twice = (fitted(single.take(rows)).quality for rows in (range(14), [*range(14), *range(14)]))
+    train, _ = parted()
+    once, twice = (fitted(train.take(rows), modes().take(rows)).quality for rows in ([*range(14)], [*range(14)] * 2))
     assert once.positions == twice.positions
     assert twice.standard_error == pytest.approx(once.standard_error, rel=0.1)
 
@@ -135,8 +139,8 @@ def earlier(field):
 
 
 def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
-    train, test = parted(with_clicks(strikes(20)))
-    field = fitted(train)
+    train, test = parted(clicks=True)
+    field = fitted(train, modes(clicks=True))
     assert field.residual.recordings is not None
     report = field.origin.report["residual"]
     assert report["recordings"] < report["noise"]
@@ -169,7 +173,7 @@ def test_where_places_say_nothing_the_spread_counts_and_new_sounds_are_nearer():
     order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
     mixed = replace(recorded, contacts=recorded.contacts[order])
     train, test = mixed.take(range(16)), mixed.take(range(16, 20))
-    field = fitted(train)
+    field = fitted(train, modes())
     assert field.gain_field.spread_share > 0.0
     means = replace(field, gain_field=replace(field.gain_field, spread_share=0.0))
     with_spread, without = (evaluate(each, test).mean()["relative_stft"] for each in (field, means))
@@ -177,22 +181,22 @@ def test_where_places_say_nothing_the_spread_counts_and_new_sounds_are_nearer():
 
 
 def test_without_a_residual_none_is_kept():
-    train, _ = parted(with_clicks(strikes(20)))
-    field = fitted(train, replace(CONFIG, residual=False))
+    field = fitted(parted(clicks=True)[0], modes(clicks=True), replace(CONFIG, residual=False))
     assert field.residual.recordings is None
     assert not field.residual.magnitude.any()
     assert set(field.origin.report["residual"]) == {"noise"}
 
 
 def test_independent_noise_is_rendered_as_noise():
-    train, _ = parted(strikes(20))
+    train, _ = parted()
     noise = 0.05 * torch.randn(train.sounds.shape, generator=torch.Generator().manual_seed(2))
-    assert fitted(replace(train, sounds=train.sounds + noise)).residual.recordings is None
+    train = replace(train, sounds=train.sounds + noise)
+    assert fitted(train, extract_modes(train)).residual.recordings is None
 
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_few_places_say_nothing_of_quality(count):
-    assert fitted(parted(strikes(20))[0].take(range(count))).quality is None
+    assert fitted(parted()[0].take(range(count)), modes().take(range(count))).quality is None
 
 
 def test_an_edited_field_has_no_quality_and_its_surroundings_no_next_contact():
@@ -204,12 +208,13 @@ def test_an_edited_field_has_no_quality_and_its_surroundings_no_next_contact():
 
 
 def test_the_next_contact_is_where_no_contact_is_and_lowers_the_expected_error_most(tmp_path):
-    train = parted(strikes(20))[0]
+    train = parted()[0]
     # Nothing was recorded on the right half of the plate.
-    left = train.take(torch.nonzero(train.contacts[:, 0] < 0.5).flatten().tolist())
+    rows = torch.nonzero(train.contacts[:, 0] < 0.5).flatten().tolist()
+    left = train.take(rows)
     side = torch.linspace(0.0, 1.0, 30)
     plate = torch.cat([torch.cartesian_prod(side, side), torch.zeros(900, 1)], 1)
-    field = fit(left, FeatureField.from_points(plate), extract_modes(left), CONFIG)
+    field = fit(left, FeatureField.from_points(plate), modes().take(rows), CONFIG)
     assert field.quality.next_contact[0] > 0.5
     contact = torch.tensor(field.quality.next_contact, dtype=torch.float64)
     assert field.quality.next_distance == pytest.approx(float((left.contacts - contact).norm(dim=1).min()))
