@@ -127,12 +127,16 @@ def attention(*, spatial_damping: bool = False) -> AttentionGains:
         shape=shape,
         generator=torch.Generator().manual_seed(0),
     )
+    return with_biases(network).eval().requires_grad_(False)
+
+
+def with_biases(network: AttentionGains) -> AttentionGains:
+    """Draw what starts at zero, biases and the logarithms of damping factors, so that a test sees it."""
     with torch.no_grad():
-        # Biases start at zero and damping factors at one; a test has to see them.
         for number, parameter in enumerate(network.parameters()):
             if parameter.ndim == 1 or not bool(parameter.any()):
                 parameter.normal_(std=0.1, generator=torch.Generator().manual_seed(number))
-    return network.eval().requires_grad_(False)
+    return network
 
 
 def mixture(

@@ -1,5 +1,6 @@
 """What holds of every gain field, whatever it is made of: the contract of `GainModel`."""
 
+import math
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
@@ -11,12 +12,16 @@ from avmsf.errors import FieldFileError
 from avmsf.evaluation.task import Renderer
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.estimator import RefinedGains
+from avmsf.field.gains.kernels import Visual
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.gains.scaled import ScaledGains
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from factories.made_fields import BANK, FIELDS, SIDES, blows, places, rewritten, sounding
+from avmsf.symmetry.characters import groups_of
+from avmsf.symmetry.symmetries import MirrorSymmetry, Symmetries
+from factories.made_fields import BANK, FIELDS, SIDES, SIZE, blows, draw, mixture, places, rewritten, sounding, struck
 from factories.raising import raises
 
 FACTORS = torch.tensor([2.0, -0.5, 1.5, 0.25, 3.0], dtype=torch.float64)
@@ -25,7 +30,20 @@ SCALED = {
     for name in ("attention with dampings", "positional", "elastic", "body")
 }
 """Of every kind that can be inside; other sizes have tests of their own, for these objects have the same."""
-ALL = {**FIELDS, **SCALED}
+
+
+@cache
+def symmetric_and_visual() -> MixtureGains:
+    """Return a model of few gains that say nothing, so that no family is left out."""
+    (sites, values), origin = struck(5), torch.zeros(3, dtype=torch.float64)
+    planes = tuple(MirrorSymmetry(each, origin, 0.0) for each in torch.eye(3, dtype=torch.float64)[:2])
+    groups = groups_of(Symmetries((), planes, 0.01, 0.38, math.inf))
+    points, noise = places(150, seed=0).float(), torch.view_as_complex(draw(*values.shape, 2, seed=5))
+    looks = Visual(sites, SIZE, points, draw(150, 2, seed=7).float())
+    return mixture(sites, noise, Symmetric(sites, SIZE, groups, directional=True), looks, directional=True)
+
+
+ALL = {**FIELDS, **SCALED, "symmetric and visual": symmetric_and_visual}
 MODES = len(BANK)
 PLACES = places(7, seed=8)
 BLOWS = blows(PLACES, seed=9)
@@ -33,9 +51,9 @@ PHASE = torch.tensor([0.0, 0.4, -1.2, 3.0, 1.6], dtype=torch.float64)
 
 every_field = pytest.mark.parametrize("name", ALL)
 every_kind = pytest.mark.parametrize(
-    "name", ["attention", "positional", "elastic", "body", "scaled elastic", "scaled body"]
+    "name", ["attention", "positional", "symmetric and visual", "elastic", "body", "scaled elastic", "scaled body"]
 )
-DIRECTIONAL = ("directional", "elastic", "scaled elastic", "body", "scaled body")
+DIRECTIONAL = ("directional", "elastic", "scaled elastic", "body", "scaled body", "symmetric and visual")
 """Fields that know directions of impacts."""
 REAL = ("attention", "attention with dampings", "scaled attention with dampings", "body", "scaled body")
 """Fields of real gains, without a standard deviation."""
@@ -120,7 +138,7 @@ def test_without_a_direction_an_impact_goes_straight_into_the_body_or_as_its_nei
     contacts = field.points[:7]
     assumed = torch.zeros_like(contacts)
     assumed[:, 2] = -contacts[:, 2].sign()
-    if name == "directional":
+    if name in ("directional", "symmetric and visual"):
         near = torch.cdist(contacts.double(), field.training.points).argmin(1)
         assumed = field.training.directions[near]
     expect_close(parts(field, contacts), parts(field, contacts, assumed))
@@ -153,6 +171,7 @@ def test_a_field_comes_back_from_its_file_to_the_last_bit(name, tmp_path):
         assert all(torch.equal(*each) for each in said)
         sounds = [each.render(PLACES, directions=directions) for each in (loaded, saved)]
         assert torch.equal(*sounds)
+    assert name != "symmetric and visual" or {Symmetric.kind, Visual.kind} <= set(field.record()["families"])
     if isinstance(field, MixtureGains):
         assert torch.equal(loaded.gain_field.standardized_errors(), field.standardized_errors())
     save(loaded, tmp_path / "two")

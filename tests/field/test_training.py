@@ -17,6 +17,7 @@ from avmsf.field.training import AdamW, Targets, TrainingRun
 from avmsf.mesh.points import cluster
 from avmsf.modal.residual_noise import noise_power
 from avmsf.modal.spectra import magnitude_stft
+from factories.made_fields import with_biases
 from factories.plate_field import QUICK, plate_extraction, plate_features, plate_impacts
 from oracles.plain_training import STEPS, PlainRun, full_setting, start
 
@@ -33,19 +34,9 @@ def features() -> FeatureField:
     return FeatureField(points(), descriptors, "test")
 
 
-def network(shape: AttentionShape = SHAPE, field: FeatureField | None = None, *, seed: int = 2) -> AttentionGains:
-    made = AttentionGains(
-        features() if field is None else field,
-        gain_scale=GAIN_SCALE,
-        shape=shape,
-        generator=torch.Generator().manual_seed(seed),
-    )
-    with torch.no_grad():
-        # Biases start at zero and damping factors at one; a test has to see them.
-        for number, parameter in enumerate(made.parameters()):
-            if parameter.ndim == 1 or not bool(parameter.any()):
-                parameter.normal_(std=0.1, generator=torch.Generator().manual_seed(number))
-    return made
+def network(shape: AttentionShape = SHAPE, field: FeatureField | None = None) -> AttentionGains:
+    known, generator = features() if field is None else field, torch.Generator().manual_seed(2)
+    return with_biases(AttentionGains(known, gain_scale=GAIN_SCALE, shape=shape, generator=generator))
 
 
 def paper_gains(net: AttentionGains, contact: torch.Tensor) -> list[float]:
