@@ -104,15 +104,13 @@ def fingerprint(data: GainData, estimator: GainEstimator) -> str:
 
 
 def _with_noise(field: SoundField, train: Impacts) -> SoundField:
-    """Return a field with the background that its modes leave of the recordings, unless noise is trained or not wanted.
-
-    In a recording that is not divided by its force, the background has one level: it is measured in all together.
-    """
+    """Return a field with the background that its modes leave of the recordings, unless noise is trained or off."""
     config, bins = field.origin.config, len(field.residual.magnitude)
     if not config.residual or config.noise_rate or not config.steps:
         return field
     modes = field.render(train.contacts, directions=train.directions, noise=False)
     forces = torch.ones(len(train)) if train.forces is None else train.forces
+    # In recordings that are not divided by their forces, the background has one level.
     average = float(forces.log().mean().exp())
     relative = (forces / average)[:, None]
     found = estimate_residual(relative * train.sounds, relative * modes, bins=bins)
@@ -120,12 +118,7 @@ def _with_noise(field: SoundField, train: Impacts) -> SoundField:
 
 
 def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundField:
-    """Return a field with the residual and spread share that predict its own contacts best, and its quality reported.
-
-    The residual is stationary noise or what the nearest recordings have in addition to their modes; of the shares the
-    smallest within one standard error counts, since fewer contacts leave more spread. `train` is row for row the gain
-    model's; `advise` says whether to name the contact to record next.
-    """
+    """Return a field with the residual and spread share that predict its own contacts best, and its quality."""
     gains = field.gain_field
     if not isinstance(gains, MixtureGains) or gains.place_count < _MIN_PLACES:
         return field
@@ -145,6 +138,7 @@ def _with_quality(field: SoundField, train: Impacts, *, advise: bool) -> SoundFi
     best = min(errors, key=lambda kind: float(errors[kind].mean(1).min()))
     if best == "recordings":
         field = replace(field, residual=replace(field.residual, recordings=recordings))
+    # Fewer contacts leave more spread.
     chosen = smallest_within_error(errors[best])
     field = replace(field, gain_field=replace(gains, spread_share=_SPREAD_SHARES[chosen]))
     reached = {kind: float(each[chosen].mean()) for kind, each in errors.items()}

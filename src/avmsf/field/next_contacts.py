@@ -184,10 +184,7 @@ def _choose(
 def _reachable(
     gains: MixtureGains, points: Float64[Tensor, "points 3"]
 ) -> tuple[Float64[Tensor, "places 3"], Float64[Tensor, "places 3"] | None]:
-    """Return those of the points, moved onto the body's surface, that a hammer can strike, and along which direction.
-
-    Without a body they stay where they are, and have no directions.
-    """
+    """Return the points that a hammer can strike, with a body moved onto its surface, and along which direction."""
     body, places, axes = gains.body, points.numpy(), None
     if body is None:
         reached = reached_on_points(gains.points.double().numpy(), places)

@@ -42,7 +42,7 @@ def test_kernels_are_the_written_ones():
     """Among the contacts and between them and other places."""
     given, frequency, others = family(), plate().frequency, impacts(5, seed=2)
     known = given.reference
-    both = Sites(torch.cat([known.points, others.points]), torch.cat([known.directions, others.directions]))
+    both = Sites.joined([known, others])
     shapes = plate().gains(both.points, both.directions)
     squares = (both.points[:, None] - known.points).square().sum(2)
     smooth = torch.exp(-0.5 * squares / (REACH * SIZE) ** 2) * both.cosine(known)

@@ -95,8 +95,7 @@ def test_the_family_of_the_page_takes_part_in_fits_and_files(monkeypatch):
 def test_kernels_are_covariances_of_mean_one_at_the_contacts(kind, count):
     """Symmetric and positive semidefinite among the contacts and any other impacts, with `own` on the diagonal."""
     family, others = made(kind, impacts(count, seed=1)), impacts(9, seed=2)
-    known = family.reference
-    both = Sites(torch.cat([known.points, others.points]), torch.cat([known.directions, others.directions]))
+    both = Sites.joined([family.reference, others])
     joint = family.between(both, both)
     torch.testing.assert_close(joint, joint.mT, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(joint[:, :count, :count], family.kernels(), rtol=1e-9, atol=1e-9)

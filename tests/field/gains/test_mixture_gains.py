@@ -29,8 +29,7 @@ def deviation_at(given: MixtureGains, sites: Sites = ASKED) -> torch.Tensor:
 
 def joint_kernels(given: MixtureGains) -> torch.Tensor:
     """Return all kept kernels among the training impacts and the asked ones."""
-    training = given.training
-    both = Sites(torch.cat([training.points, ASKED.points]), torch.cat([training.directions, ASKED.directions]))
+    both = Sites.joined([given.training, ASKED])
     return torch.cat([family.between(both, both) for family in given.families])
 
 

@@ -51,9 +51,7 @@ def reflected(sites: Sites) -> Sites:
 def test_kernels_are_the_written_ones() -> None:
     """Of one mirror: thin plates of all images, the impacts' and the moved ones', with signs of both characters."""
     known, others = impacts(9), impacts(5, seed=1)
-    image = reflected(known)
-    orbit = Sites(torch.cat([known.points, image.points]), torch.cat([known.directions, image.directions]))
-    plate = ThinPlate(orbit, SIZE)
+    plate = ThinPlate(Sites.joined([known, reflected(known)]), SIZE)
 
     def written(one: Sites, other: Sites, sign: float, share: float, row: int) -> torch.Tensor:
         same, moved = (plate.between(one, each)[row] for each in (other, reflected(other)))
@@ -97,7 +95,7 @@ def test_gains_on_the_other_side_are_those_of_the_mirrored_contact_with_the_mode
     points = torch.cat([CENTER + (near.points - CENTER).abs(), reflected(near).points[:3]])
     near = Sites(points[:6], near.directions)
     images = reflected(near).take(torch.arange(3))
-    known = Sites(torch.cat([near.points, images.points]), torch.cat([near.directions, images.directions]))
+    known = Sites.joined([near, images])
     generator = torch.Generator().manual_seed(3)
     values = torch.randn(6, 4, generator=generator, dtype=torch.complex128)
     # Contacts 0 to 2 are struck on both sides, which gives the sign; 3 to 5 on one alone.

@@ -201,11 +201,8 @@ class Elastic(KernelFamily):
         log_frequency: Float64[Tensor, " some"],
         measured: Float64[Tensor, " modes"],
     ) -> Iterator[Float64[Tensor, "factors shapes some"]]:
-        """Yield for each error the log probability of each shape, times the density of a log frequency if it is that.
-
-        Shapes within the range of the measured modes are equally probable, and the density is over that of a frequency
-        of which nothing is known.
-        """
+        """Yield for each error the log probability of each shape times the density of a log frequency if it is that."""
+        # Shapes within the range of the measured modes are equally probable.
         low, high = float(measured.min()) - _MARGIN, float(measured.max()) + _MARGIN
         nominal = torch.log(factors[:, None] * self.modes.frequency)
         inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()

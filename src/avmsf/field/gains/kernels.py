@@ -4,7 +4,7 @@ A family states one assumption about how gains vary over an object. Its kernels 
 impacts, each times the cosine between their directions.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
@@ -70,6 +70,11 @@ class Sites:
         if bool(unknown.any()):
             used[unknown] = otherwise(points[unknown])
         return cls(points, used)
+
+    @classmethod
+    def joined(cls, parts: Sequence["Sites"]) -> "Sites":
+        """Return the impacts of all parts, in their order."""
+        return cls(torch.cat([each.points for each in parts]), torch.cat([each.directions for each in parts]))
 
     def cosine(self, other: "Sites") -> Float64[Tensor, "sites others"]:
         """Return the cosines between directions.

@@ -196,11 +196,7 @@ class KernelMixture:
         return found
 
     def _left_out(self, rows: Int[Tensor, " rows"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the weights of the `_pairs` without the rows' values, and their errors and variances of these.
-
-        The variances are those without noise, and last that of the noise. The shapes are (pairs,), twice (pairs, rows)
-        and (pairs,).
-        """
+        """Return of the `_pairs` without the rows' values: weight, error and variance of these, and noise variance."""
         count, left, pairs = len(self.values), max(len(self.values) - len(rows), 1), self._pairs
         along = self.eigen[1][pairs.kernel[:, None], rows]
         solved = torch.einsum("pkn,pn->pk", along, pairs.solved)

@@ -311,10 +311,8 @@ def _search(fit: Fit, sites: Sites, measured: MeasuredGains) -> PredictiveRatios
 def _located(search: PredictiveRatios, row: int, places: Sites, mean: float) -> Outlier | None:
     """Return a contact as an outlier if it is one by the standard of the others' mean ratio."""
     contacts = search.sites
-    points, directions = (
-        torch.cat([getattr(each, name) for each in (contacts, places)]) for name in ("points", "directions")
-    )
-    ratios = search.elsewhere(row, search.aside, Sites(points, directions))
+    everywhere = Sites.joined([contacts, places])
+    ratios = search.elsewhere(row, search.aside, everywhere)
     own, best = float(ratios[0, row]), int(ratios.amax(0).argmax())
     ratio, needed = float(ratios[:, best].max()), _EXPLAINED * mean
     here = search.elsewhere(row, search.aside, contacts.take(torch.tensor([row])), _GAINS)[:, 0]
@@ -324,8 +322,8 @@ def _located(search: PredictiveRatios, row: int, places: Sites, mean: float) -> 
     if own >= _REFUTED or (ratio < needed and not better):
         return None
     best = row if better else best
-    x, y, z = points[best].tolist()
-    distance = float((points[best] - contacts.points[row]).norm())
+    x, y, z = everywhere.points[best].tolist()
+    distance = float((everywhere.points[best] - contacts.points[row]).norm())
     return Outlier(row, own, (x, y, z), distance, float(ratios[1, row]) >= needed, level_db if better else 0.0)
 
 

@@ -40,7 +40,7 @@ class Symmetric(KernelFamily):
         """Set up; `directional` says whether directions of impacts are known."""
         super().__init__(reference, size)
         self.groups, self._directional = tuple(groups), directional
-        self._bases = [ThinPlate(self._orbit(group), size) for group in groups]
+        self._bases = [ThinPlate(Sites.joined(list(self._images(group, reference))), size) for group in groups]
         kernels = len(self._bases[0])
         one = torch.eye(kernels, dtype=torch.float64)
         characters = [group.characters for group in groups]
@@ -74,10 +74,6 @@ class Symmetric(KernelFamily):
         """Return the log probability of each character in its group: all are equally probable."""
         count = torch.bincount(self._category)[self._category].double()
         return -count.log()[:, None].expand(-1, len(log_frequency))
-
-    def _orbit(self, group: Group) -> Sites:
-        images = list(self._images(group, self.reference))
-        return Sites(torch.cat([each.points for each in images]), torch.cat([each.directions for each in images]))
 
     def _images(self, group: Group, sites: Sites) -> Iterator[Sites]:
         """Yield the impacts as each motion leaves them; it turns their directions only where these are known."""
