@@ -73,17 +73,24 @@ def remeshed(mesh: Trimesh, length: float) -> Trimesh:
 
 def _refined(mesh: Trimesh, longest: float) -> Trimesh:
     """Return a mesh with all longer edges halved, again and again."""
-    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    while True:
-        ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
-        keys, which = np.unique(ends[..., 0] * len(points) + ends[..., 1], return_inverse=True)
-        first, second = keys // len(points), keys % len(points)
-        split = np.linalg.norm(points[first] - points[second], axis=1) > longest
-        if not split.any():
-            return Trimesh(points, faces, process=False)
-        middle = np.where(split, len(points) + np.cumsum(split) - 1, -1)[which.reshape(-1, 3)]
-        points = np.concatenate([points, 0.5 * (points[first[split]] + points[second[split]])])
-        faces = np.concatenate([_split(faces, middle, pattern) for pattern in range(8)])
+    points, faces, count = np.asarray(mesh.vertices), np.asarray(mesh.faces), 0
+    while len(faces) > count:
+        count = len(faces)
+        points, faces = halved(points, faces, longest)
+    return Trimesh(points, faces, process=False)
+
+
+def halved(
+    points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"], longest: float = 0.0
+) -> tuple[Float64[np.ndarray, "more 3"], Int[np.ndarray, "parts 3"]]:
+    """Return triangles with each edge that is longer than `longest` meters halved once, the new points last."""
+    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
+    keys, which = np.unique(ends[..., 0] * len(points) + ends[..., 1], return_inverse=True)
+    first, second = keys // len(points), keys % len(points)
+    split = np.linalg.norm(points[first] - points[second], axis=1) > longest
+    middle = np.where(split, len(points) + np.cumsum(split) - 1, -1)[which.reshape(-1, 3)]
+    points = np.concatenate([points, 0.5 * (points[first[split]] + points[second[split]])])
+    return points, np.concatenate([_split(faces, middle, pattern) for pattern in range(8)])
 
 
 def _split(faces: np.ndarray, middle: np.ndarray, pattern: int) -> np.ndarray:

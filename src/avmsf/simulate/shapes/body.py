@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,25 +15,6 @@ from avmsf.fem.solid import Solid, prism_cells
 
 _MIN_MITRE_COSINE = 0.4
 """Least mean of the cosines between the normal at a corner and the faces around it that a mitre is made for."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sheet:
-    """Triangles on the middle of a wall."""
-
-    middle: Float64[np.ndarray, "points 3"]
-    """Meters."""
-    walls: Float64[np.ndarray, " points"]
-    """Thickness at each point, measured across the triangles, meters."""
-    triangles: Int[np.ndarray, "triangles 3"]
-    """Rows of `middle`."""
-    order: Int[np.ndarray, " points"]
-    """Numbers that differ along every edge; they decide how the wall is cut into tetrahedra."""
-
-    @cached_property
-    def offsets(self) -> Float64[np.ndarray, "points 3"]:
-        """From the middle to the upper side of the wall, the side from which triangles are counter-clockwise."""
-        return 0.5 * self.walls[:, None] * mitred_normals(self.middle, self.triangles)
 
 
 def mitred_normals(
@@ -67,12 +48,24 @@ class SolidBuilder:
         self._cells: list[np.ndarray] = []
         self._count = 0
 
-    def lay(self, sheet: Sheet) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, " points"]]:
-        """Add a wall of one layer; return the rows of its points on the lower and on the upper side."""
-        lower = self.place(sheet.middle - sheet.offsets)
-        upper = self.place(sheet.middle + sheet.offsets)
-        self.stack(sheet.triangles, sheet.order, [lower, upper])
-        return lower, upper
+    def lay(
+        self,
+        middle: Float64[np.ndarray, "points 3"],
+        walls: Float64[np.ndarray, " points"] | float,
+        triangles: Int[np.ndarray, "triangles 3"],
+        order: Int[np.ndarray, " points"],
+    ) -> tuple["Patch", "Patch"]:
+        """Add a wall of one layer on both sides of triangles; return its lower and its upper side, all of them.
+
+        `walls` is the thickness across the triangles, meters, which are counter-clockwise seen from the upper side.
+        Numbers in `order` differ along every edge; they decide how the wall is cut into tetrahedra.
+        """
+        offsets = 0.5 * np.reshape(walls, (-1, 1)) * mitred_normals(middle, triangles)
+        below, above = middle - offsets, middle + offsets
+        lower = Patch(self, self.place(below), below, triangles, order)
+        upper = Patch(self, self.place(above), above, triangles, order)
+        lower.grow(above[:0, None], end=upper)
+        return replace(lower, triangles=triangles[:, ::-1]), upper
 
     def place(self, places: Float64[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
         """Add points; return their rows."""
@@ -100,16 +93,6 @@ class SolidBuilder:
         made.expect_volume(advice="use thinner walls or a larger shape")
         return Solid.build(made.points, made.cells)
 
-    def stack(
-        self,
-        triangles: Int[np.ndarray, "triangles 3"],
-        order: Int[np.ndarray, " columns"],
-        rows: Sequence[Int[np.ndarray, " columns"]],
-    ) -> None:
-        """Add prisms over triangles of columns, counter-clockwise seen from above, through levels of points."""
-        for below, above in itertools.pairwise(rows):
-            self.fill(prism_cells(triangles, order, below, above).transpose(1, 0, 2).reshape(-1, 4))
-
 
 @dataclass(frozen=True, eq=False)
 class Patch:
@@ -124,10 +107,20 @@ class Patch:
     """Columns, counter-clockwise seen from where it grows to."""
     order: Int[np.ndarray, " columns"]
 
+    def part(self, columns: Int[np.ndarray, " some"]) -> "Patch":
+        """Return the patch of some of the columns and of the triangles that are left among them."""
+        place = np.full(len(self.order), -1)
+        place[columns] = np.arange(len(columns))
+        inside = place[self.triangles]
+        inside = inside[(inside >= 0).all(axis=1)]
+        return Patch(self.body, self.rows[columns], self.places[columns], inside, self.order[columns])
+
     def grow(self, layers: Float64[np.ndarray, "layers columns 3"], *, end: "Patch | None" = None) -> None:
         """Add prisms through layers of points, and to another patch, if any."""
-        levels = [self.rows, *(self.body.place(layer) for layer in layers)]
-        self.body.stack(self.triangles, self.order, levels if end is None else [*levels, end.rows])
+        levels = [self.rows, *(self.body.place(layer) for layer in layers), *([] if end is None else [end.rows])]
+        for below, above in itertools.pairwise(levels):
+            cells = prism_cells(self.triangles, self.order, below, above)
+            self.body.fill(cells.transpose(1, 0, 2).reshape(-1, 4))
 
 
 def halves(

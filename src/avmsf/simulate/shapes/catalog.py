@@ -12,6 +12,7 @@ from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
+from avmsf.fem.remeshing import halved
 from avmsf.fem.solid import Solid
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
@@ -107,13 +108,7 @@ def _skin(solid: Solid) -> tuple[Float64[np.ndarray, "points 3"], Int[np.ndarray
     used, rows = np.unique(solid.boundary.numpy(), return_inverse=True)
     points, faces = solid.points.numpy()[used], rows.reshape(-1, 3)
     while len(faces) < _MIN_FACES:
-        ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
-        edges, which = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
-        a, b, c = faces.T
-        ab, bc, ca = (which.reshape(-1, 3) + len(points)).T
-        points = np.concatenate([points, 0.5 * (points[edges // len(points)] + points[edges % len(points)])])
-        cut = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-        faces = np.concatenate([np.stack(each, axis=1) for each in cut])
+        points, faces = halved(points, faces)
     return points, faces
 
 

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Float64
 from scipy.interpolate import BSpline
 
-from avmsf.simulate.shapes.body import ROUND, UP, Draft, Patch, Rings, Sheet, SolidBuilder, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import ROUND, UP, Draft, Patch, Rings, SolidBuilder, Symmetry, drawn_wall
 
 DEFAULT_POINTS = 900
 """Points in the middle of a wall: about 12 nodes of second order each, so some 32,000 degrees of freedom."""
@@ -108,10 +108,11 @@ class Turned:
 
     body: SolidBuilder
     rings: Rings
-    sheet: Sheet
-    lower: Int[np.ndarray, " points"]
-    """Rows in the body: below where the profile runs outwards, outside where it rises."""
-    upper: Int[np.ndarray, " points"]
+    middle: Float64[np.ndarray, "points 3"]
+    """The rings' points in the middle of the wall, meters."""
+    lower: Patch
+    """The side that lies below where the profile runs outwards, outside where it rises."""
+    upper: Patch
 
     @classmethod
     def lay(
@@ -140,44 +141,28 @@ class Turned:
         if warp is not None:
             radius, height = warp(angles, along, values[:, :2])
         middle = np.stack([radius * np.cos(angles), radius * np.sin(angles), height], axis=1)
-        sheet = Sheet(middle, values[:, 2], rings.triangles, rings.order)
-        return cls(body, rings, sheet, *body.lay(sheet))
+        return cls(body, rings, middle, *body.lay(middle, values[:, 2], rings.triangles, rings.order))
 
     @property
     def radii(self) -> Float64[np.ndarray, " rings"]:
         """Distance of each ring's first point from the axis, meters."""
-        return np.hypot(*self.sheet.middle[self.rings.starts[:-1], :2].T)
+        return np.hypot(*self.middle[self.rings.starts[:-1], :2].T)
 
     def side_patch(self, rings: range, half: int, *, falling: bool = False) -> Patch:
         """Return the outside of these rings within `half` points of angle 0, ring by ring, from below or from above."""
         places = np.arange(-half, half + 1)
         rows = [self.rings.rows(ring, places) for ring in (reversed(rings) if falling else rings)]
-        return self._patch(np.concatenate(rows), lower=True)
-
-    def middle_patch(self, last: int, *, lower: bool) -> Patch:
-        """Return the rings about the pole up to one, on the lower or on the upper side."""
-        return self._patch(np.arange(self.rings.starts[last + 1]), lower=lower)
+        return self.lower.part(np.concatenate(rows))
 
     def add_foot(self, radius: float, height: float) -> None:
         """Add a foot of about this radius and this height below the lowest point, under a band of two equal rings."""
         counts = np.diff(self.rings.starts)
         equal = np.flatnonzero(counts[1:-1] == counts[2:]) + 1
         ring = int(equal[np.argmin(np.abs(self.radii[equal] - radius))])
-        patch = self._patch(np.arange(self.rings.starts[ring], self.rings.starts[ring + 2]), lower=True)
+        patch = self.lower.part(np.arange(self.rings.starts[ring], self.rings.starts[ring + 2]))
         places = patch.places.copy()
-        places[:, 2] = float((self.sheet.middle - self.sheet.offsets)[:, 2].min()) - height
+        places[:, 2] = float(self.lower.places[:, 2].min()) - height
         patch.grow(places[None])
-
-    def _patch(self, rows: Int[np.ndarray, " columns"], *, lower: bool) -> Patch:
-        """Return the patch of these rows of the sheet's points, on its lower side or its upper one."""
-        column = np.full(len(self.sheet.order), -1)
-        column[rows] = np.arange(len(rows))
-        inside = column[self.sheet.triangles]
-        inside = inside[(inside >= 0).all(axis=1)]
-        middle, offsets, order = self.sheet.middle[rows], self.sheet.offsets[rows], self.sheet.order[rows]
-        if lower:
-            return Patch(self.body, self.lower[rows], middle - offsets, inside[:, ::-1], order)
-        return Patch(self.body, self.upper[rows], middle + offsets, inside, order)
 
 
 _STEM_LAYERS = 16
@@ -231,7 +216,8 @@ def goblet(random: np.random.Generator, wall: float | None) -> Draft:
         rings = type(rings)(rings.counts[:-1], pole=True)
     sole = Profile([(0.0, 0.004, 1.8 * wall), (0.35 * radius, 0.004, 1.6 * wall), (foot * radius, 0.0, 1.2 * wall)])
     base = Turned.lay(sole, rings=rings, body=cup.body)
-    above, below = cup.middle_patch(last, lower=True), base.middle_patch(last, lower=False)
+    disc = np.arange(rings.starts[last + 1])
+    above, below = cup.lower.part(disc), base.upper.part(disc)
     start, end = above.places, below.places
     part = np.linspace(0.0, 1.0, _STEM_LAYERS + 1)[1:-1, None, None]
     thinnest = random.uniform(0.0032, 0.0042) / around
@@ -334,7 +320,8 @@ def dish(random: np.random.Generator, wall: float | None) -> Draft:
 
 def _crown(turned: Turned, radius: float, top: float, *, swell: float, taper: float) -> None:
     """Grow a massive grip of about this radius from the middle of a wall up to a height, meters."""
-    patch = turned.middle_patch(max(1, int(np.argmin(np.abs(turned.radii - radius)))), lower=False)
+    last = max(1, int(np.argmin(np.abs(turned.radii - radius))))
+    patch = turned.upper.part(np.arange(turned.rings.starts[last + 1]))
     start = patch.places
     part = np.linspace(0.0, 1.0, 11)[1:, None]
     wide = 1.0 + swell * np.sin(math.pi * part) ** 2 - taper * np.clip(part - 0.8, 0.0, None) / 0.2

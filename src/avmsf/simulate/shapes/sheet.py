@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 
-from avmsf.simulate.shapes.body import MIRRORED, UP, Draft, Rings, Sheet, SolidBuilder, Symmetry, drawn_wall, halves
+from avmsf.simulate.shapes.body import MIRRORED, UP, Draft, Rings, SolidBuilder, Symmetry, drawn_wall, halves
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ def platter(random: np.random.Generator, wall: float | None) -> Draft:
     places = grid.parts * (0.5 * length, 0.5 * width * length)
     middle = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
     # Half turns about x, y and z.
-    return _draft(grid, middle, wall, Symmetry(UP, 2, torch.eye(3, dtype=torch.float64)))
+    return _draft(middle, wall, grid.triangles, grid.order, Symmetry(UP, 2, torch.eye(3, dtype=torch.float64)))
 
 
 def boomerang(random: np.random.Generator, wall: float | None) -> Draft:
@@ -74,7 +74,7 @@ def boomerang(random: np.random.Generator, wall: float | None) -> Draft:
     one, other = grid.parts.T
     out, angle = radius + width * other * (1.0 - taper * one**2), 0.5 * arc * one
     middle = np.stack([out * np.cos(angle), out * np.sin(angle), np.zeros(len(one))], axis=1)
-    return _draft(grid, middle, wall, Symmetry(mirrors=torch.eye(3).double()[1:]))
+    return _draft(middle, wall, grid.triangles, grid.order, Symmetry(mirrors=torch.eye(3).double()[1:]))
 
 
 def channel(random: np.random.Generator, wall: float | None) -> Draft:
@@ -87,7 +87,7 @@ def channel(random: np.random.Generator, wall: float | None) -> Draft:
     one, other = grid.parts.T
     aside, up = _bent(0.5 * across * np.abs(other), 0.5 * width, 0.5 * math.pi, bend)
     middle = np.stack([0.5 * length * one, np.sign(other) * aside, up], axis=1)
-    return _draft(grid, middle, wall, _HALF_TURN)
+    return _draft(middle, wall, grid.triangles, grid.order, _HALF_TURN)
 
 
 def scallop(random: np.random.Generator, wall: float | None) -> Draft:
@@ -101,7 +101,7 @@ def scallop(random: np.random.Generator, wall: float | None) -> Draft:
     part, angle = 0.2 + 0.4 * (1.0 + other), spread * one
     up = depth * (1.0 - part**2) * np.cos(0.5 * angle) + rib * part * np.cos(2.0 * ribs * angle)
     middle = radius * np.stack([part * np.cos(angle), part * np.sin(angle), up], axis=1)
-    return _draft(grid, middle, wall, MIRRORED)
+    return _draft(middle, wall, grid.triangles, grid.order, MIRRORED)
 
 
 def tray(random: np.random.Generator, wall: float | None) -> Draft:
@@ -120,7 +120,7 @@ def tray(random: np.random.Generator, wall: float | None) -> Draft:
         ],
         axis=1,
     )
-    return _draft(grid, middle, wall, _HALF_TURN)
+    return _draft(middle, wall, grid.triangles, grid.order, _HALF_TURN)
 
 
 def bracket(random: np.random.Generator, wall: float | None) -> Draft:
@@ -140,7 +140,7 @@ def bracket(random: np.random.Generator, wall: float | None) -> Draft:
         kept &= _punch(grid, flat, row, column)
     x, z = _bent(flat[:, 0], lengths[0], angle, bend)
     middle = np.stack([x, flat[:, 1], z], axis=1)
-    return Draft(_body(middle, wall, grid.triangles[kept], grid.order), wall, Symmetry())
+    return _draft(middle, wall, grid.triangles[kept], grid.order, Symmetry())
 
 
 def spoon(random: np.random.Generator, wall: float | None) -> Draft:
@@ -183,10 +183,9 @@ def spoon(random: np.random.Generator, wall: float | None) -> Draft:
         axis=-1,
     ).reshape(-1, 3)
     triangles, order = _attach(rings, rim, rows)
-    swelling = np.repeat(wall * (1.0 + 0.9 * np.sin(math.pi * part_along[:, 0]) ** 0.5), len(across))
-    walls = np.concatenate([np.full(len(disc), wall), swelling])
-    body = _body(np.concatenate([disc, strip]), walls, triangles, order)
-    return Draft(body, wall, MIRRORED)
+    swelling = np.repeat(1.0 + 0.9 * np.sin(math.pi * part_along[:, 0]) ** 0.5, len(across))
+    swelling = np.concatenate([np.ones(len(disc)), swelling])
+    return _draft(np.concatenate([disc, strip]), wall, triangles, order, MIRRORED, swelling=swelling)
 
 
 def _even_grid(length: float, width: float) -> Grid:
@@ -195,14 +194,19 @@ def _even_grid(length: float, width: float) -> Grid:
     return Grid(2 * round(0.5 * _POINTS / columns) + 1, columns)
 
 
-def _draft(grid: Grid, middle: np.ndarray, wall: float, symmetry: Symmetry) -> Draft:
-    return Draft(_body(middle, wall, grid.triangles, grid.order), wall, symmetry)
-
-
-def _body(middle: np.ndarray, walls: np.ndarray | float, triangles: np.ndarray, order: np.ndarray) -> SolidBuilder:
+def _draft(
+    middle: np.ndarray,
+    wall: float,
+    triangles: np.ndarray,
+    order: np.ndarray,
+    symmetry: Symmetry,
+    *,
+    swelling: np.ndarray | float = 1.0,
+) -> Draft:
+    """Return the shape of one sheet, `swelling` times as thick as the wall at each point."""
     body = SolidBuilder()
-    body.lay(Sheet(middle, np.broadcast_to(walls, len(middle)), triangles, order))
-    return body
+    body.lay(middle, wall * swelling, triangles, order)
+    return Draft(body, wall, symmetry)
 
 
 def _punch(grid: Grid, flat: np.ndarray, row: int, column: int) -> np.ndarray:

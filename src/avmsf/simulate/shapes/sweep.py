@@ -163,6 +163,6 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
 
 def _ring_at(turned: Turned, height: float) -> int:
     """Return the lowest ring of a patch whose middle lies at a height on the wall."""
-    heights = turned.sheet.middle[turned.rings.starts[:-1], 2]
+    heights = turned.middle[turned.rings.starts[:-1], 2]
     # Beyond the bottom, where heights rise.
     return int(np.argmin(np.abs(heights - height))) - _BANDS // 2
