@@ -43,6 +43,8 @@ from avmsf.mesh.surface import Surface
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
+Wall = tuple[float | None, bool]
+"""Thickness, meters, None for a solid body; and whether it goes all round its cavity."""
 Supports = Literal["auto", "free", "try"]
 """Whether bodies are held: where the free one predicts little, never, or always tried."""
 THICKNESS_RATIOS = tuple(float(ratio) for ratio in np.geomspace(0.003, 0.05, 6))
@@ -140,27 +142,25 @@ class CandidateBodies:
     @cached_property
     def bodies(self) -> tuple[CandidateBody, ...]:
         """The free bodies that can be had, at least one: the solid one first, then walls from thin to thick."""
-        wanted = list(dict.fromkeys(self._guesses() if self._thicknesses is None else self._thicknesses))
-        refused: dict[tuple[float | None, bool], SimulationError] = {}
+        thicknesses = self._guesses() if self._thicknesses is None else self._thicknesses
+        wanted: list[Wall] = [(each, False) for each in dict.fromkeys(thicknesses)]
+        refused: dict[Wall, SimulationError] = {}
 
-        def make(wall: tuple[float | None, bool], *, fine: bool) -> CandidateBody | None:
+        def attempt(make: Callable[..., Made], wall: Wall, **settings: bool) -> Made | None:
             try:
-                return self._body(*wall, fine=fine)
+                return make(*wall, **settings)
             except SimulationError as error:
                 refused[wall] = error
                 return None
 
-        for thickness in wanted:
-            try:
-                self._expect_possible(thickness)
-            except SimulationError as error:
-                refused[thickness, False] = error
-        walls = [(each, False) for each in wanted if (each, False) not in refused]
-        make_one = partial(make, fine=len(walls) == 1)
+        for wall in wanted:
+            attempt(self._expect_possible, wall)
+        walls = [wall for wall in wanted if wall not in refused]
+        fine = len(walls) == 1
         walls += [(each, True) for each, _ in walls if each is not None and self._closed is not None]
-        bodies = [body for body in _side_by_side(make_one, walls) if body is not None]
-        ordered = sorted(refused, key=lambda wall: (wall[1], wanted.index(wall[0])))
-        reasons = _grouped({wall: refused[wall] for wall in ordered})
+        made = _side_by_side(lambda wall: attempt(self._body, wall, fine=fine), walls)
+        bodies = [body for body in made if body is not None]
+        reasons = _grouped({wall: refused[wall] for wall in (*wanted, *walls) if wall in refused})
         if not bodies:
             causes = {str(error.name) for error in refused.values()}
             name = min(causes) if causes <= _MEANS else "surface"
@@ -266,7 +266,7 @@ class CandidateBodies:
         between = self.shape.thickness_range
         return [None] if between is None else [None, *np.geomspace(*between, _SHAPE_THICKNESSES).tolist()]
 
-    def _expect_possible(self, thickness: float | None) -> None:
+    def _expect_possible(self, thickness: float | None, closed: bool) -> None:
         """Raise SimulationError where a body is out of the question before tetrahedra are made."""
         if thickness is None:
             self.checked.expect_filling()
@@ -371,7 +371,7 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
     return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
 
 
-def _grouped(refused: Mapping[tuple[float | None, bool], SimulationError]) -> list[str]:
+def _grouped(refused: Mapping[Wall, SimulationError]) -> list[str]:
     """Return each reason once, after the names of all that it holds for."""
     names: dict[str, list[str]] = {}
     for (thickness, closed), error in refused.items():

@@ -20,6 +20,8 @@ from avmsf.fem.solid import Solid
 
 _EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 """Corners at the ends of the edges on whose middles a cell's nodes 4 to 9 lie."""
+_SIDES = np.array([[1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6], [0, 1, 3, 4, 8, 7], [0, 2, 1, 6, 5, 4]])
+"""A cell's nodes on its sides: corners in the order of `Solid.boundary`, then the middles of the edges between them."""
 _INNER, _OUTER = (5.0 + 3.0 * np.sqrt(5.0)) / 20.0, (5.0 - np.sqrt(5.0)) / 20.0
 _QUADRATURE = np.full((4, 4), _OUTER) + np.eye(4) * (_INNER - _OUTER)
 """Barycentric coordinates of four points of equal weight, exact to the second degree."""
@@ -49,13 +51,7 @@ class SecondOrder:
     @cached_property
     def boundary(self) -> Int[np.ndarray, "triangles 6"]:
         """Rows of `nodes` on the outer triangles: corners, then the middles of the edges 01, 12 and 20."""
-        corners = self.solid.boundary.numpy()
-        points = len(self.solid.points)
-        ends = np.sort(self.cells[:, :4][:, _EDGES], axis=-1).reshape(-1, 2)
-        keys, first = np.unique(ends[:, 0] * points + ends[:, 1], return_index=True)
-        outer = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
-        found = first[np.searchsorted(keys, outer[..., 0] * points + outer[..., 1])]
-        return np.concatenate([corners, self.cells[:, 4:].ravel()[found]], axis=1)
+        return self.cells[:, _SIDES].reshape(-1, 6)[self.solid.outer]
 
     @cached_property
     def surface(self) -> tuple[Int[np.ndarray, " outer"], Int[np.ndarray, "triangles 6"]]:

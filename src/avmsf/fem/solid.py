@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
 from avmsf.errors import SimulationError
@@ -65,10 +65,15 @@ class Solid:
         return which.ravel(), count
 
     @cached_property
+    def outer(self) -> Bool[np.ndarray, " sides"]:
+        """Which sides are on the outside, four a cell."""
+        which, count = self._sides
+        return count[which] == 1
+
+    @property
     def boundary(self) -> Int[Tensor, "triangles 3"]:
         """Rows of `points` at the corners of the outer triangles, counter-clockwise from outside, cell by cell."""
-        which, count = self._sides
-        return self.cells[:, _FACES].reshape(-1, 3)[torch.from_numpy(count[which] == 1)]
+        return self.cells[:, _FACES].reshape(-1, 3)[torch.from_numpy(self.outer)]
 
     @property
     def surface(self) -> Surface:
