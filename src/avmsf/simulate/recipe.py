@@ -225,12 +225,6 @@ EXAMPLE_FOLDER = Path(__file__).parents[1] / "example"
 
 
 SET = "sim-20"
-_OBJECTS = (
-    "mug-ceramic", "bowl-glass", "skillet-iron", "plate-ceramic", "spoon-steel", "goblet-glass", "bracket-steel",
-    "bell-iron", "blob-polycarbonate", "pot-steel", "dish-ceramic", "fluted-ceramic", "jug-glass", "tray-polycarbonate",
-    "mug-plastic", "tube-steel", "spoon-wood", "platter-wood", "jug-ceramic", "bowl-wood",
-)  # fmt: skip
-"""Kinds and materials; an object's place here, counted from 1, is its seed."""
 _WALLS = {
     "mug-ceramic": 0.003,
     "skillet-iron": 0.0025,
@@ -241,23 +235,26 @@ _WALLS = {
 }
 _SIZES = {"blob-polycarbonate": 0.5, "tube-steel": 0.5}
 """Walls and longest sides that differ from what is drawn, meters: where few modes would be heard, or most too low."""
-SIM20 = {
-    name: ObjectRecipe(kind=kind, material=material, seed=seed, size=_SIZES.get(name), thickness=_WALLS.get(name))
-    for seed, name in enumerate(_OBJECTS, start=1)
-    for kind, material in (name.split("-"),)
-}
-"""Recipes by the objects' names, in the order in which they are made."""
+
+
+def _recipes(*names: str, seed: int) -> dict[str, ObjectRecipe]:
+    """Return recipes by the objects' names, which are kinds and materials; the first has the seed, others the next."""
+    parts = ((name, *name.split("-"), each) for each, name in enumerate(names, start=seed))
+    return {
+        name: ObjectRecipe(kind, material=material, seed=each, size=_SIZES.get(name), thickness=_WALLS.get(name))
+        for name, kind, material, each in parts
+    }
+
+
+SIM20 = _recipes(
+    "mug-ceramic", "bowl-glass", "skillet-iron", "plate-ceramic", "spoon-steel", "goblet-glass", "bracket-steel",
+    "bell-iron", "blob-polycarbonate", "pot-steel", "dish-ceramic", "fluted-ceramic", "jug-glass", "tray-polycarbonate",
+    "mug-plastic", "tube-steel", "spoon-wood", "platter-wood", "jug-ceramic", "bowl-wood", seed=1,
+)  # fmt: skip
+"""In the order in which they are made."""
 ABLATED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
 """Objects of the smaller studies: with and without symmetry, ringing and dull, thick and thin."""
-
-
-HELD_OUT = {
-    name: ObjectRecipe(kind=kind, material=material, seed=seed)
-    for seed, name in enumerate(
-        ("bottle-glass", "lid-ceramic", "boomerang-wood", "channel-steel", "scallop-polycarbonate"), start=101
-    )
-    for kind, material in (name.split("-"),)
-}
+HELD_OUT = _recipes("bottle-glass", "lid-ceramic", "boomerang-wood", "channel-steel", "scallop-polycarbonate", seed=101)
 """Objects of kinds that no constant of the reconstruction, of walls, masks, symmetries and gains was chosen on."""
 NON_SYMMETRIC = tuple(
     name

@@ -181,26 +181,20 @@ class Rings:
         """Rows of points."""
         found = []
         for ring in range(self.number - 1):
-            inner, outer = (int(self.starts[each + 1] - self.starts[each]) for each in (ring, ring + 1))
-            if inner == 1:
-                k = np.arange(outer)
-                found.append(np.stack([np.zeros_like(k), self.rows(1, k), self.rows(1, k + 1)], axis=1))
-            elif outer == inner:
-                found.append(self._band(ring, np.arange(inner)))
-            else:
-                found.append(self._doubling(ring, np.arange(inner)))
+            inner, outer = np.diff(self.starts[ring : ring + 3])
+            # From the pole all triangles of a ring start in one point.
+            k = np.arange(outer if inner == 1 else inner)
+            a, after = self.rows(ring, k), self.rows(ring, k + 1)
+            if outer == 2 * inner:
+                b, between, beyond = (self.rows(ring + 1, 2 * k + step) for step in range(3))
+                corners = ((a, b, between), (a, between, after), (after, between, beyond))
+                found += [np.stack(each, axis=1) for each in corners]
+                continue
+            b, beyond = self.rows(ring + 1, k), self.rows(ring + 1, k + 1)
+            found += (
+                [np.stack([a, b, beyond], axis=1)] if inner == 1 else halves(a, b, beyond, after, (k + ring) % 2 == 0)
+            )
         return np.concatenate(found)
-
-    def _band(self, ring: int, k: np.ndarray) -> np.ndarray:
-        a, after = self.rows(ring, k), self.rows(ring, k + 1)
-        b, beyond = self.rows(ring + 1, k), self.rows(ring + 1, k + 1)
-        return np.concatenate(halves(a, b, beyond, after, (k + ring) % 2 == 0))
-
-    def _doubling(self, ring: int, k: np.ndarray) -> np.ndarray:
-        a, after = self.rows(ring, k), self.rows(ring, k + 1)
-        b, between, beyond = (self.rows(ring + 1, 2 * k + step) for step in range(3))
-        corners = ((a, b, between), (a, between, after), (after, between, beyond))
-        return np.concatenate([np.stack(each, axis=1) for each in corners])
 
 
 @dataclass(frozen=True, eq=False)
