@@ -239,10 +239,10 @@ _SIZES = {"blob-polycarbonate": 0.5, "tube-steel": 0.5}
 
 def _recipes(*names: str, seed: int) -> dict[str, ObjectRecipe]:
     """Return recipes by the objects' names, which are kinds and materials; the first has the seed, others the next."""
-    parts = ((name, *name.split("-"), each) for each, name in enumerate(names, start=seed))
     return {
         name: ObjectRecipe(kind, material=material, seed=each, size=_SIZES.get(name), thickness=_WALLS.get(name))
-        for name, kind, material, each in parts
+        for each, name in enumerate(names, start=seed)
+        for kind, material in (name.split("-"),)
     }
 
 
