@@ -30,7 +30,7 @@ example: $(VENV)/developed
 # Neighbors stay on one worker where possible (worksteal), so that a module's fixtures are made once.
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
 
-# The fast tests of every package: 6 minutes at most on two idle cores.
+# The fast tests of every package: 5 minutes at most on two idle cores.
 test: $(VENV)/developed
 	$(PYTEST)
 
