@@ -18,9 +18,9 @@ def ball_color(normals: Tensor) -> Tensor:
     return 0.5 + 0.3 * torch.sin(normals * torch.tensor([4.0, 5.0, 6.0], dtype=normals.dtype) + 1.0)
 
 
-def ball_normals(count: int, *, seed: int = 1) -> Tensor:
+def ball_normals(count: int) -> Tensor:
     """Return random directions, evenly over all; points of the ball lie at `MIDDLE + RADIUS` times these."""
-    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(1))
     return torch.nn.functional.normalize(normals, dim=1)
 
 

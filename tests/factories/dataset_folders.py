@@ -102,7 +102,7 @@ def microphones() -> np.ndarray:
     return np.stack([spot.real, spot.imag, height], axis=-1).reshape(-1, 3)
 
 
-def write_realimpact(folder: Path, name: str, *, samples: int = 2400) -> Path:
+def write_realimpact(folder: Path, name: str) -> Path:
     """Write an object of RealImpact, each row's sound a decay as high as the row's number, over 3000, plus one."""
     home = folder / name / "preprocessed"
     mesh = write_mesh(home / "transformed.obj", radius=0.08, middle=(0.013, 0.047, 0.21))
@@ -111,8 +111,8 @@ def write_realimpact(folder: Path, name: str, *, samples: int = 2400) -> Path:
     np.save(home / "vertexID.npy", np.repeat(vertices, 600).astype(np.int64))
     np.save(home / "vertexXYZ.npy", np.repeat(np.asarray(mesh.vertices)[vertices], 600, axis=0))
     np.save(home / "listenerXYZ.npy", listeners)
-    sounds = np.lib.format.open_memmap(home / "deconvolved_0db.npy", mode="w+", dtype=np.float32, shape=(ROWS, samples))
-    time = np.arange(samples)
+    sounds = np.lib.format.open_memmap(home / "deconvolved_0db.npy", mode="w+", dtype=np.float32, shape=(ROWS, 2400))
+    time = np.arange(2400)
     # Sound takes a while to arrive: the first samples, which belong to the response, are faint.
     shape = np.where(time < 40, 0.01, 1) * np.exp(-time / 400) * (-1.0) ** time
     sounds[:] = (1 + np.arange(ROWS)[:, None] / ROWS) * shape

@@ -53,9 +53,5 @@ def cup(*, radius: float = RADIUS, height: float = HEIGHT, wall: float = 0.004) 
     return trimesh.creation.revolve(np.array(outline), sections=96)
 
 
-def cup_volume(wall: float, *, radius: float = RADIUS, height: float = HEIGHT) -> float:
-    return float(np.pi * (radius**2 * height - (radius - wall) ** 2 * (height - wall)))
-
-
-def tube(*, radius: float = 0.03, height: float = 0.08, wall: float = 0.003) -> trimesh.Trimesh:
-    return trimesh.creation.annulus(radius - wall, radius, height, sections=96)
+def cup_volume(wall: float) -> float:
+    return float(np.pi * (RADIUS**2 * HEIGHT - (RADIUS - wall) ** 2 * (HEIGHT - wall)))

@@ -92,14 +92,13 @@ def measured(sites: Sites, *, noise: float = 0.02, factor: float = 1.0) -> Measu
 
 
 @cache
-def model(*, elastic: bool = True, directional: bool = True, count: int = 14) -> MixtureGains:
+def model(*, elastic: bool = True) -> MixtureGains:
     """Return the model of some impacts, two of them at one place; the second mode is affine, the last one noise."""
-    sites = impacts(count, seed=1)
-    sites = sites.take(torch.tensor([*range(count - 1), 0]))
+    sites = impacts(14, seed=1).take(torch.tensor([*range(13), 0]))
     gains, points = measured(sites), impacts(50, seed=9).points.float()
     gains.values[:, 1] += sites.directions[:, 2] * (1.0 + sites.points @ (40.0 * draw(3, seed=6))) * (300.0 - 100.0j)
-    gains.values[:, 4] = torch.view_as_complex(draw(count, 2, seed=7))
-    return fit_mixture(families(sites, elastic=elastic), gains, points, directional=directional)
+    gains.values[:, 4] = torch.view_as_complex(draw(14, 2, seed=7))
+    return fit_mixture(families(sites, elastic=elastic), gains, points, directional=True)
 
 
 BANK = ModalBank(

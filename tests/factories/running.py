@@ -13,9 +13,9 @@ def alive(process: int) -> bool:
     return state != "Z"
 
 
-def gone(processes: Iterable[int], seconds: float = 10.0) -> bool:
+def gone(processes: Iterable[int]) -> bool:
     """Wait until none of the processes runs, and return whether that came."""
-    numbers, deadline = list(processes), time.monotonic() + seconds
+    numbers, deadline = list(processes), time.monotonic() + 10.0
     while any(map(alive, numbers)) and time.monotonic() < deadline:
         time.sleep(0.05)
     return not any(map(alive, numbers))

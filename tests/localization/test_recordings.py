@@ -19,11 +19,11 @@ from factories.located_plate import PLATE, RATE, locator_of, missed, struck, tru
 from factories.raising import raises
 
 
-def recorded(sound: torch.Tensor, *, before: float = 0.1, rate: float = RATE, seed: int = 0) -> Recording:
+def recorded(sound: torch.Tensor) -> Recording:
     """Return the sound with faint noise before it and beneath, as it would come from a recorder."""
-    samples = np.concatenate([np.zeros(round(before * rate)), sound.double().numpy()])
-    noise = 1e-3 * np.abs(samples).max() * np.random.default_rng(seed).standard_normal(len(samples))
-    return Recording("hit.wav", (0.5 * (samples + noise) / np.abs(samples).max())[None], rate, "FLOAT")
+    samples = np.concatenate([np.zeros(round(0.1 * RATE)), sound.double().numpy()])
+    noise = 1e-3 * np.abs(samples).max() * np.random.default_rng(0).standard_normal(len(samples))
+    return Recording("hit.wav", (0.5 * (samples + noise) / np.abs(samples).max())[None], RATE, "FLOAT")
 
 
 def read_by(settings: CaptureSettings) -> SoundField:

@@ -46,8 +46,8 @@ def stream(*, noise: float = 1e-3) -> Tensor:
     return total + level * torch.randn(len(total), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-def heard(listener: StreamingLocalizer, sound: Tensor, block: int = 100) -> list[LocatedImpact]:
-    return [blow for part in torch.split(sound, block) for blow in listener.process(part)]
+def heard(listener: StreamingLocalizer, sound: Tensor) -> list[LocatedImpact]:
+    return [blow for part in torch.split(sound, 100) for blow in listener.process(part)]
 
 
 def spot(blow: LocatedImpact) -> int:

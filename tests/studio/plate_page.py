@@ -64,14 +64,10 @@ def plate_shapes(points: torch.Tensor) -> torch.Tensor:
     return torch.stack([(math.pi * a * along).cos() * (math.pi * b * across).cos() for a, b in WAVES], dim=1)
 
 
-def plate_strikes(table: SampledField, rows: tuple[int, ...] = (100, 500)) -> Impacts:
+def plate_strikes(table: SampledField) -> Impacts:
     """Return recordings of blows at some contacts, which are the model's own sounds."""
-    return Impacts(
-        contacts=table.points[list(rows)].double(),
-        sounds=table.render(torch.tensor(rows)),
-        sample_rate=table.sample_rate,
-        names=tuple(f"{row:03d}.wav" for row in rows),
-    )
+    rows = torch.tensor([100, 500])
+    return Impacts(table.points[rows].double(), table.render(rows), table.sample_rate, ("100.wav", "500.wav"))
 
 
 def plate_object(kind: str, folder: Path) -> Path | None:

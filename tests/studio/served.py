@@ -103,9 +103,8 @@ class Served:
     def manifest(self) -> Any:
         return self.get("manifest.json").words
 
-    def events(self, job: str, *, after: str | None = None) -> list[Any]:
-        headers = {} if after is None else {"Last-Event-ID": after}
-        text = self.ask("GET", f"jobs/{job}/events", headers=headers).content.decode()
+    def events(self, job: str) -> list[Any]:
+        text = self.get(f"jobs/{job}/events").content.decode()
         return [json.loads(part.partition("data: ")[2]) for part in text.split("\n\n") if part]
 
 
@@ -131,8 +130,8 @@ def served(
         assert not thread.is_alive()
 
 
-def wait_until(done: Any, seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
+def wait_until(done: Any) -> None:
+    end = time.monotonic() + 20.0
     while not done():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.01)
