@@ -39,8 +39,10 @@ def write_seeds(folder: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     colored = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=np.full((len(ball.vertices), 4), 200, np.uint8))
     for suffix in SURFACES:
-        (folder / f"surface{suffix}").write_bytes(_exported(colored, suffix[1:]))
-    (folder / "surface_text.ply").write_bytes(_exported(colored, "ply", encoding="ascii"))
+        # The buffers of a glTF are files of their own otherwise.
+        options: dict[str, Any] = {"embed_buffers": True} if suffix == ".gltf" else {}
+        colored.export(folder / f"surface{suffix}", **options)
+    colored.export(folder / "surface_text.ply", encoding="ascii")
     _write_views(folder)
     write_splats(random_cloud(40, degree=1), folder / "splats.ply")
     for name, gains in (("attention", attention()), ("mixture", elastic())):
@@ -54,15 +56,6 @@ def _write_capture(folder: Path) -> None:
     fill(folder, header=f"{HEADER},nx,ny,nz,force_newtons", rows=rows, replace=sounds, settings=SETTINGS)
     for name, subtype in (("a.wav", "PCM_16"), ("c.wav", "DOUBLE")):
         soundfile.write(folder / name, sounds[name], RATE, subtype=subtype)
-
-
-def _exported(mesh: trimesh.Trimesh, kind: str, **options: Any) -> bytes:
-    # The buffers of a glTF are files of their own otherwise.
-    options |= {"embed_buffers": True} if kind == "gltf" else {}
-    content = mesh.export(file_type=kind, **options)
-    if isinstance(content, dict):
-        (content,) = content.values()
-    return content if isinstance(content, bytes) else str(content).encode()
 
 
 def _write_views(folder: Path) -> None:
