@@ -75,10 +75,9 @@ def test_counts_in_the_file_are_bounded_before_anything_is_built(tmp_path, monke
 
 
 def test_buffers_within_a_text_gltf_may_be_larger_than_other_json(tmp_path: Path) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=8, radius=0.25)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.25)
     (content,) = trimesh.exchange.gltf.export_gltf(ball, embed_buffers=True).values()
-    assert len(content) > MAX_TEXT_BYTES
-    (tmp_path / "ball.gltf").write_bytes(content)
+    (tmp_path / "ball.gltf").write_bytes(content + b" " * MAX_TEXT_BYTES)
     assert len(read_surface(tmp_path / "ball.gltf").faces) == len(ball.faces)
     with open(tmp_path / "ball.gltf", "ab") as file:
         file.truncate(MAX_GLTF_BYTES + 1)

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import fsolve
 
 from avmsf.errors import CaptureError
 from avmsf.photographs import read_sparse_points, read_views
@@ -198,13 +197,10 @@ def scene(points: np.ndarray) -> np.ndarray:
 
 
 def photograph(project: Project) -> np.ndarray:
-    """What the lens makes of the scene: for each pixel the point that it images, sought by Powell's method."""
-    pixels = pixel_centers()
-    start = (pixels - np.array(CENTER)[:, None]) / np.array(FOCAL)[:, None]
-    points = np.empty_like(start)
-    for at in range(pixels.shape[1]):
-        goal = pixels[:, at : at + 1]
-        points[:, at] = fsolve(lambda point, goal=goal: (project(point[:, None]) - goal)[:, 0] / FOCAL[0], start[:, at])
+    """What the lens makes of the scene: for each pixel the point that it images, by fixed-point iteration."""
+    pixels, points = pixel_centers(), np.zeros((2, WIDTH * HEIGHT))
+    for _ in range(100):
+        points += (pixels - project(points)) / np.array(FOCAL)[:, None]
     assert np.abs(project(points) - pixels).max() < 1e-5
     return scene(points).reshape(HEIGHT, WIDTH, 3)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.photographs import find_foreground, read_views
@@ -150,8 +150,7 @@ def test_a_shadow_as_dark_as_the_wall_is_filled_and_spots_are_dropped(views: lis
     for row in (1, 7, 12):
         there = seen(row)[0]
         # The pixel of the ring that lies deepest inside it, and all within three pixels of it.
-        depth = np.array([np.hypot(rows[~there] - y, columns[~there] - x).min() for y, x in np.argwhere(there)])
-        y, x = np.argwhere(there)[depth.argmax()]
+        y, x = np.unravel_index(distance_transform_edt(there).argmax(), there.shape)
         shadows[row] = np.hypot(rows - y, columns - x) <= 3
         assert there[shadows[row]].all()
         views[row] = painted(views[row], shadows[row], (2.0, 2.0, 2.0))

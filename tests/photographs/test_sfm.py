@@ -24,7 +24,7 @@ from avmsf.photographs.sfm import WORKER, estimate_cameras
 from factories.raising import raises
 from factories.running import gone
 
-VIEWS, SIZE = 10, 256
+VIEWS, SIZE = 7, 256
 
 
 def scene() -> TexturedMesh:
@@ -71,7 +71,7 @@ def found(taken: tuple[View, ...], tmp_path_factory: pytest.TempPathFactory) -> 
     cv2.imwrite(str(folder / "images/wall.png"), np.full((SIZE, SIZE, 3), 90, dtype=np.uint8))
     (folder / "images/zero.jpg").write_bytes(b"\xff\xd8\xff")
     with pytest.warns(CaptureWarning) as caught:
-        model = estimate_cameras(folder / "images", folder, features=1024, threads=1, timeout=120.0)
+        model = estimate_cameras(folder / "images", folder, features=512, threads=1, timeout=120.0)
     assert model == folder / "sparse/0"
     return folder, {each.message.name: each.message.value for each in caught}
 
