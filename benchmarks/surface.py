@@ -17,7 +17,7 @@ from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
 from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.rays import RayCaster
-from avmsf.mesh.surface import Surface, read_surface
+from avmsf.mesh.surface import Surface
 from avmsf.photographs import find_foreground
 from avmsf.photographs.cameras import View
 from avmsf.reconstruction import ObjectShape, object_surface
@@ -78,7 +78,7 @@ def _degraded(settings: Settings) -> Iterator[Record]:
 def _material(name: str, settings: Settings) -> tuple[Sequence[View], GaussianCloud, _Truth]:
     views, cloud = views_and_gaussians(name, settings)
     assert settings.sim20 is not None
-    mesh = _mesh(read_surface(settings.sim20 / name / "surface.ply"))
+    mesh = _mesh(Surface.read(settings.sim20 / name / "surface.ply"))
     points, normals = _sampled(mesh)
     outside = _openness(mesh, points, normals) >= OPEN
     hit = _rays(mesh, points[outside], -normals[outside])

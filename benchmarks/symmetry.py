@@ -12,8 +12,7 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from avmsf.mesh import Surface
-from avmsf.mesh.surface import read_surface
+from avmsf.mesh.surface import Surface
 from avmsf.simulate.recipe import named_recipe
 from avmsf.simulate.shapes import make_shape
 from avmsf.symmetry.find import find_symmetries
@@ -179,7 +178,7 @@ CONDITIONS: dict[str, Callable[[Points, np.random.Generator], Points]] = {
 
 
 def _scan(name: str) -> trimesh.Trimesh:
-    return _mesh(read_surface(shared_data() / "meshes" / name / "textured.obj"))
+    return _mesh(Surface.read(shared_data() / "meshes" / name / "textured.obj"))
 
 
 def _made(name: str) -> trimesh.Trimesh:

@@ -12,7 +12,7 @@ from avmsf.capture import CaptureSettings
 from avmsf.capture.placement import FACTORS, check_placement
 from avmsf.capture.table import parse_row, read_rows
 from avmsf.errors import CaptureError
-from avmsf.mesh import Surface, read_surface
+from avmsf.mesh import Surface
 from avmsf.mesh.surface import contacted_part, surface_points
 from factories.looked_at import surface_of
 from factories.raising import raises
@@ -161,7 +161,7 @@ def test_nothing_to_judge_is_refused(contacts: torch.Tensor, points: torch.Tenso
 def test_the_aircrafts_contacts_lie_on_it_and_its_mistakes_are_named(shared: Path) -> None:
     strikes = [parse_row(row, CaptureSettings()) for row in read_rows(shared / "aircraft")[0]]
     contacts = torch.tensor([strike.contact for strike in strikes], dtype=torch.float64)
-    points = surface_points(read_surface(shared / "aircraft/surface.obj"))
+    points = surface_points(Surface.read(shared / "aircraft/surface.obj"))
     placement = check_placement(contacts, points)
     assert placement.fault == "none"
     assert float(placement.distances.max()) < 0.01

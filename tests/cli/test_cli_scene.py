@@ -15,7 +15,7 @@ from avmsf.errors import EvaluationError
 from avmsf.features.store import load_features, read_report
 from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
-from avmsf.mesh import Surface, read_surface
+from avmsf.mesh import Surface
 from avmsf.photographs.folder import write_frames, write_views
 from avmsf.plotting.surfaces import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
@@ -132,7 +132,7 @@ def test_a_mesh_is_written_as_it_is_in_meters(kind: str, tmp_path: Path) -> None
     for option, name in (("--output", "a"), ("-o", "b")):
         assert main(["fit", str(folder), "--until", "surface", option, str(tmp_path / f"{name}.{kind}")]) == 0
     for name in "ab":
-        written, given = read_surface(tmp_path / f"{name}.{kind}"), slab()
+        written, given = Surface.read(tmp_path / f"{name}.{kind}"), slab()
         assert torch.allclose(written.vertices, given.vertices / 1000, atol=1e-8)
         assert torch.equal(written.faces, given.faces)
 

@@ -17,7 +17,7 @@ from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import DISCREPANCY, MATERIALS, NOMINAL, factor_range
 from avmsf.fem.thickness import search_thickness
-from avmsf.mesh.surface import Surface, read_surface
+from avmsf.mesh.surface import Surface
 from factories.looked_at import surface_of
 from factories.made_dome import bodies
 from factories.made_sheet import sheet_over
@@ -113,7 +113,7 @@ def test_boxes_that_overlap_are_one_body():
 
 @pytest.mark.slow
 def test_the_aircraft_is_filled(shared: Path):
-    surface = read_surface(shared / "aircraft_response/surface.obj")
+    surface = Surface.read(shared / "aircraft_response/surface.obj")
     found = computed(surface, count=6, dofs=12_000)
     assert [body.name for body in found.bodies] == ["solid body"]
     # Its wings bend first, far below all else: as metal plates of 8 mm over 1.5 m do.

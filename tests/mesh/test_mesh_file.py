@@ -11,7 +11,7 @@ import trimesh
 
 from avmsf._utils.text import MAX_TEXT_BYTES
 from avmsf.errors import CaptureError
-from avmsf.mesh import read_surface
+from avmsf.mesh import Surface
 from avmsf.mesh.io import MAX_GLTF_BYTES
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from factories.raising import raises
@@ -50,7 +50,7 @@ def triangle(*, nodes: int = 1, count: int = 3, matrix: list[float] | None = Non
 def test_every_format_gives_the_same_triangles(tmp_path: Path, suffix: str) -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.25)
     ball.export(tmp_path / f"ball.{suffix}")
-    surface = read_surface(tmp_path / f"ball.{suffix}")
+    surface = Surface.read(tmp_path / f"ball.{suffix}")
     corners = surface.vertices[surface.faces]
     assert surface.faces.shape == (len(ball.faces), 3)
     torch.testing.assert_close(corners, torch.tensor(np.array(ball.triangles)).float(), atol=1e-6, rtol=0)
@@ -71,18 +71,18 @@ def test_counts_in_the_file_are_bounded_before_anything_is_built(tmp_path, monke
     monkeypatch.setattr(trimesh, "load", build)
     monkeypatch.setattr(trimesh, "load_scene", build)
     with raises(CaptureError, file=name, name=counted, value=found):
-        read_surface(tmp_path / name)
+        Surface.read(tmp_path / name)
 
 
 def test_buffers_within_a_text_gltf_may_be_larger_than_other_json(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.25)
     (content,) = trimesh.exchange.gltf.export_gltf(ball, embed_buffers=True).values()
     (tmp_path / "ball.gltf").write_bytes(content + b" " * MAX_TEXT_BYTES)
-    assert len(read_surface(tmp_path / "ball.gltf").faces) == len(ball.faces)
+    assert len(Surface.read(tmp_path / "ball.gltf").faces) == len(ball.faces)
     with open(tmp_path / "ball.gltf", "ab") as file:
         file.truncate(MAX_GLTF_BYTES + 1)
     with raises(CaptureError, file="ball.gltf", name="bytes", value=MAX_GLTF_BYTES + 1):
-        read_surface(tmp_path / "ball.gltf")
+        Surface.read(tmp_path / "ball.gltf")
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_buffers_within_a_text_gltf_may_be_larger_than_other_json(tmp_path: Path
 def test_white_space_of_an_obj_changes_nothing(tmp_path: Path, old: str, new: str) -> None:
     text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
     (tmp_path / "a.obj").write_text(text.replace(old, new, 1 if new[0] == "\ufeff" else -1), encoding="utf-8")
-    surface = read_surface(tmp_path / "a.obj")
+    surface = Surface.read(tmp_path / "a.obj")
     assert surface.faces.tolist() == [[0, 1, 2], [0, 1, 3]]
     assert surface.vertices[:2].tolist() == [[0, 0, 0], [1, 0, 0]]
 
@@ -101,7 +101,7 @@ def test_white_space_of_an_obj_changes_nothing(tmp_path: Path, old: str, new: st
 def test_negative_indices_count_back_from_where_they_stand(tmp_path: Path) -> None:
     blocks = [f"v {row} 0 0\nv {row} 1 0\nv {row} 0 1\nvt 0 0\nf -3/-1 -2/-1 -1/-1\n" for row in range(3)]
     (tmp_path / "a.obj").write_text("".join(blocks))
-    surface = read_surface(tmp_path / "a.obj")
+    surface = Surface.read(tmp_path / "a.obj")
     assert surface.vertices[surface.faces][:, :, 0].tolist() == [[row] * 3 for row in range(3)]
 
 
@@ -117,7 +117,7 @@ def test_normalized_integers_are_from_minus_one_to_one(tmp_path: Path) -> None:
     }
     corners = np.array([[32767, 0, 0, 7], [0, -32768, 0, 7], [0, 0, 16384, 7]], dtype="<i2")
     (tmp_path / "a.glb").write_bytes(glb(record, corners.tobytes()))
-    vertices = read_surface(tmp_path / "a.glb").vertices
+    vertices = Surface.read(tmp_path / "a.glb").vertices
     torch.testing.assert_close(vertices, 0.5 * torch.diag(torch.tensor([1.0, -1.0, 0.5])), atol=1e-4, rtol=0)
 
 
@@ -148,7 +148,7 @@ CLOUD = trimesh.PointCloud(np.eye(3)).export(file_type="ply")
         ("none.obj", None, {"name": None}),
     ],
 )
-@pytest.mark.parametrize("read", [read_surface, read_textured_mesh])
+@pytest.mark.parametrize("read", [Surface.read, read_textured_mesh])
 def test_what_is_no_mesh_is_refused(tmp_path: Path, read, name: str, content: bytes | None, attributes: dict) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
@@ -158,7 +158,7 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path, read, name: str, content: by
 
 def test_points_alone_are_a_surface_and_no_mesh_with_colors(tmp_path: Path) -> None:
     (tmp_path / "cloud.ply").write_bytes(CLOUD)
-    assert read_surface(tmp_path / "cloud.ply").vertices.shape == (3, 3)
+    assert Surface.read(tmp_path / "cloud.ply").vertices.shape == (3, 3)
     with raises(CaptureError, file="cloud.ply", name="faces", value=0):
         read_textured_mesh(tmp_path / "cloud.ply")
 
@@ -168,7 +168,7 @@ def test_parts_of_a_scene_stay_where_they_lie(tmp_path: Path) -> None:
     for place in (0.0, 2.0):
         scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([place, 0, 0]))
     scene.export(tmp_path / "two.glb")
-    surface = read_surface(tmp_path / "two.glb", meters=0.1)
+    surface = Surface.read(tmp_path / "two.glb", meters=0.1)
     assert surface.faces.shape == (24, 3)
     assert surface.faces.max() == len(surface.vertices) - 1
     assert [surface.vertices[:, 0].min(), surface.vertices[:, 0].max()] == pytest.approx([-0.05, 0.25], rel=1e-6)

@@ -22,9 +22,8 @@ from avmsf.field.store import load
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
-from avmsf.mesh import Surface, read_surface
+from avmsf.mesh import Surface
 from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.mesh.surface import write_surface
 from avmsf.photographs.folder import write_frames
 from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.pipeline.config import CACHE, PRESETS, SURFACE, LiftConfig
@@ -117,7 +116,7 @@ def test_cameras_or_contacts_in_another_unit_are_refused_with_it(unit: str) -> N
 
 def test_reconstruct_refuses_them_before_it_fits_gaussians(tmp_path: Path) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
-    write_surface(slab(), folder / "surface.ply")
+    slab().write(folder / "surface.ply")
     write_frames(slab_views(), folder)
     with open(folder / "capture.toml", "a") as file:
         file.write('views_unit = "cm"\n')
@@ -249,6 +248,6 @@ def test_the_thickness_of_a_wall_reaches_the_report(tmp_path: Path, capsys: Stre
     field = load(made["field"])
     assert field.origin.report["thickness"] == found
     # Gaussians lie below the surface; the field's points are on it.
-    surface = read_surface(folder / CACHE / SURFACE)
+    surface = Surface.read(folder / CACHE / SURFACE)
     nearest = ClosestPoints(surface.vertices.double().numpy()[surface.faces.numpy()])
     assert nearest(field.gain_field.points.double().numpy()).distances.max() < 1e-6

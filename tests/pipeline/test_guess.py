@@ -18,7 +18,7 @@ from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated_pressure
 from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.mesh.surface import Surface, write_surface
+from avmsf.mesh.surface import Surface
 from avmsf.pipeline.bodies import expect_no_recordings, guess_field
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from factories.made_modes import breathing_sphere
@@ -119,7 +119,7 @@ def test_what_cannot_vibrate_or_is_in_another_unit_is_refused():
 
 
 def test_recordings_are_not_passed_over(tmp_path: Path):
-    write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
+    box(LENGTH, WIDTH, HEIGHT).write(tmp_path / "surface.ply")
     for rows in ("", "file,x,y,z\n"):
         (tmp_path / "impacts.csv").write_text(rows)
         expect_no_recordings(tmp_path)
@@ -134,7 +134,7 @@ def test_recordings_are_not_passed_over(tmp_path: Path):
 
 
 def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):
-    write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "bar.ply")
+    box(LENGTH, WIDTH, HEIGHT).write(tmp_path / "bar.ply")
     config = PipelineConfig(modes=12, body=QUICK)
     made = [
         avmsf.fit(each, material="steel", config=config, progress=False)
@@ -147,7 +147,7 @@ def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):
 
 
 def test_a_mesh_and_a_material_give_a_field_from_the_command_line(tmp_path: Path):
-    write_surface(box(LENGTH, WIDTH, HEIGHT), tmp_path / "surface.ply")
+    box(LENGTH, WIDTH, HEIGHT).write(tmp_path / "surface.ply")
     words = ["fit", str(tmp_path), "--material", "steel", *sets("modes=12 body.dofs=6000")]
     words += ["--output", str(tmp_path / "field.safetensors")]
     assert main(words) == 0

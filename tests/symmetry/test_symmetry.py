@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avmsf.errors import SceneError
-from avmsf.mesh.surface import read_surface
+from avmsf.mesh.surface import Surface
 from avmsf.symmetry.alignment import TOLERANCE, SymmetryTest
 from avmsf.symmetry.find import find_group, find_symmetries
 from avmsf.symmetry.motions import Motions, reflections, rotations
@@ -175,7 +175,7 @@ def test_a_bowl_that_is_part_of_a_ball_has_one_axis_only():
 
 @pytest.mark.slow
 def test_a_scanned_bowl_is_round(shared: Path):
-    surface = read_surface(shared / "meshes" / "bowl" / "textured.obj")
+    surface = Surface.read(shared / "meshes" / "bowl" / "textured.obj")
     found = find(draw(mesh_of(surface), count=6000))
     assert [each.order for each in found.rotations] == [None]
     assert found.mirrors == ()

@@ -17,7 +17,7 @@ from avmsf.capture.placement import Placement, check_placement
 from avmsf.capture.settings import METRES, SETTINGS, TABLE, CaptureSettings
 from avmsf.capture.table import Impact, fitting_units, parse_rows, read_rows
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.surface import Surface, contacted_part, read_surface, surface_points
+from avmsf.mesh.surface import Surface, contacted_part, surface_points
 
 NARROWEST, WIDEST = 1e-3, 10.0
 """Meters across below or beyond which contacts are more likely in another unit."""
@@ -139,4 +139,4 @@ def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[st
 def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
     """Read what `find_surface_file` finds; None where it finds nothing."""
     path = find_surface_file(folder, settings)
-    return None if path is None else read_surface(path, meters=settings.surface_meters)
+    return None if path is None else Surface.read(path, meters=settings.surface_meters)

@@ -20,7 +20,7 @@ from avmsf.capture.preprocess import check_levels, preprocess
 from avmsf.capture.settings import SETTINGS, TABLE, CaptureSettings, settings_of
 from avmsf.capture.table import DIRECTION, FORCE, REQUIRED, Impact, in_folder, is_inside, present_impacts, read_impacts
 from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.surface import Surface, write_surface
+from avmsf.mesh.surface import Surface
 
 UNCUT = "all recordings start with the impact, as impulse responses do, and are not cut"
 TEXT_ORDER = (
@@ -201,7 +201,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
         (begun / TABLE).write_text(csv_text(rows), encoding="utf-8", newline="")
         (begun / SETTINGS).write_text(settings, encoding="utf-8")
         if capture.surface is not None:
-            write_surface(capture.surface, begun / "surface.ply")
+            capture.surface.write(begun / "surface.ply")
 
 
 def _file_names(names: tuple[str, ...]) -> list[str]:

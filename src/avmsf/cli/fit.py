@@ -334,7 +334,7 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
     from avmsf.capture.proposals import contacts_of
     from avmsf.capture.table import in_folder, read_rows
     from avmsf.cli.info import describe_shape
-    from avmsf.mesh.surface import read_surface, write_surface
+    from avmsf.mesh.surface import Surface
     from avmsf.pipeline.scene import CLOUD, SceneStages
     from avmsf.pipeline.shape import keep_surface, object_shape
 
@@ -361,7 +361,7 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
         path = options.output or made.path
         kind = _MESH_KINDS.get(path.suffix.lower())
         if kind is not None:
-            write_whole(path, partial(write_surface, read_surface(made.path), kind=kind), raising=OutputError)
+            write_whole(path, partial(Surface.read(made.path).write, kind=kind), raising=OutputError)
         elif options.output is not None:
             copy_whole(made.path, options.output)
         values = describe_shape(path, options.plots, contacts)

@@ -207,10 +207,10 @@ def _features(path: Path) -> "_Described":
 def _surface(path: Path, contacts: "Float[Tensor, 'contacts 3'] | None") -> "_Described":
     import trimesh
 
-    from avmsf.mesh.surface import read_surface
+    from avmsf.mesh.surface import Surface
     from avmsf.plotting.surfaces import draw_surface
 
-    surface = read_surface(path)
+    surface = Surface.read(path)
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
     extent = " x ".join(f"{1000 * side:.3g}" for side in surface.vertices.amax(0) - surface.vertices.amin(0))
     closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"

@@ -25,7 +25,7 @@ from avmsf.datasets.numbering import (
 )
 from avmsf.datasets.recordings import build_capture
 from avmsf.errors import CaptureError, DatasetError
-from avmsf.mesh.surface import Surface, read_surface
+from avmsf.mesh.surface import Surface
 
 SAMPLE_RATE_HZ = 48_000.0
 """Of all recordings, Hz; no file tells it."""
@@ -147,7 +147,7 @@ class RealImpact:
         if not path.is_file():
             raise DatasetError.expected("a file", file=path, advice=f"unpack {identifier}.zip again")
         try:
-            return read_surface(path)
+            return Surface.read(path)
         except CaptureError as error:
             raise DatasetError(str(error), **error.attributes) from error
 

@@ -49,12 +49,33 @@ class Surface:
 
     @classmethod
     def read(cls, path: str | Path, *, meters: float = 1.0) -> "Surface":
-        """Read a mesh or a point cloud, see `read_surface`. Raises CaptureError for a file without points."""
-        return read_surface(path, meters=meters)
+        """Read a mesh or a point cloud whose coordinates count `meters` each; vertices keep the file's order.
 
-    def write(self, path: str | Path) -> None:
-        """Write a binary PLY file in meters."""
-        write_surface(self, Path(path))
+        A scene of several parts becomes one surface. `CaptureError` as `load_mesh`, and where it holds no points.
+        """
+        # Imports trimesh, which takes half a second and what reads no mesh does without.
+        from avmsf.mesh.io import load_parts
+
+        path = Path(path)
+        vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+        for part in load_parts(path):
+            points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
+            vertices.append(points)
+            faces.append(np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3) + count)
+            count += len(points)
+        if not count:
+            raise CaptureError.expected("points", 0, got="none", file=path, advice="export the surface again")
+        joined = (np.concatenate(vertices) * meters).astype(np.float32)
+        return cls(torch.from_numpy(joined), torch.from_numpy(np.concatenate(faces)))
+
+    def write(self, path: str | Path, *, kind: SurfaceKind = "ply") -> None:
+        """Write it in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
+        import trimesh
+
+        vertices, faces = self.vertices.numpy(), self.faces.numpy()
+        cloud = not len(faces)
+        shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
+        shape.export(Path(path), file_type=kind)
 
     def digest(self) -> str:
         """Return a digest of the vertices and triangles."""
@@ -63,37 +84,6 @@ class Surface:
     def __repr__(self) -> str:
         size = " x ".join(f"{side:.3g}" for side in (self.vertices.amax(0) - self.vertices.amin(0)).tolist())
         return f"Surface({len(self.vertices)} vertices, {len(self.faces)} triangles, {size} m)"
-
-
-def read_surface(path: str | Path, *, meters: float = 1.0) -> Surface:
-    """Read a mesh or a point cloud whose coordinates count `meters` each; vertices keep the file's order.
-
-    A scene of several parts becomes one surface. `CaptureError` as `load_mesh`, and where it holds no points.
-    """
-    # Imports trimesh, which takes half a second and what reads no mesh does without.
-    from avmsf.mesh.io import load_parts
-
-    path = Path(path)
-    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
-    for part in load_parts(path):
-        points = np.asarray(getattr(part, "vertices", np.zeros((0, 3))), dtype=np.float64)
-        vertices.append(points)
-        faces.append(np.asarray(getattr(part, "faces", np.zeros((0, 3))), dtype=np.int64).reshape(-1, 3) + count)
-        count += len(points)
-    joined = np.concatenate(vertices)
-    if not len(joined):
-        raise CaptureError.expected("points", 0, got="none", file=path, advice="export the surface again")
-    return Surface(torch.from_numpy((joined * meters).astype(np.float32)), torch.from_numpy(np.concatenate(faces)))
-
-
-def write_surface(surface: Surface, path: Path, *, kind: SurfaceKind = "ply") -> None:
-    """Write a surface in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
-    vertices, faces = surface.vertices.numpy(), surface.faces.numpy()
-    cloud = not len(faces)
-    import trimesh
-
-    shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
-    shape.export(path, file_type=kind)
 
 
 def sample_surface(surface: Surface, count: int, *, seed: Seed) -> Float[Tensor, "points 3"]:

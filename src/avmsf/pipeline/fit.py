@@ -29,7 +29,6 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.field.training import Progress
 from avmsf.mesh import Surface
-from avmsf.mesh.surface import read_surface
 from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_once
 from avmsf.modal.extraction.quality import measure_quality
 from avmsf.pipeline.bodies import candidate_bodies, expect_no_recordings, guess_field
@@ -283,7 +282,7 @@ def guess_in_stages(
                 )
                 scene.expect_any()
         else:
-            name, mesh = name or source.resolve().stem, read_surface(source, meters=settings.surface_meters)
+            name, mesh = name or source.resolve().stem, Surface.read(source, meters=settings.surface_meters)
         if scene is not None and scene.source is not None and scene.source.kind in ("photographs", "video"):
             raise SceneError.expected(
                 "a mesh, or photographs with cameras in meters (transforms.json, COLMAP)",

@@ -23,7 +23,7 @@ from avmsf.gaussians.initialize import StartPoints
 from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.gaussians.prune import keep_object
 from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
-from avmsf.mesh.surface import Surface, read_surface
+from avmsf.mesh.surface import Surface
 from avmsf.photographs import read_sparse_points, read_views, write_views
 from avmsf.photographs.cameras import View
 from avmsf.pipeline.cloud_shape import masks_suffice, shape_of_cloud, views_of_cloud
@@ -165,7 +165,7 @@ class SceneStages(Pipeline):
         views, config, encoder = read_views(views_path), self.config.lift, self._encoder
         if cloud is None:
             assert self.source is not None
-            shape: Surface | GaussianCloud = read_surface(self.source.path, meters=self.settings.surface_meters)
+            shape: Surface | GaussianCloud = Surface.read(self.source.path, meters=self.settings.surface_meters)
             points = f"{config.points} points of the mesh"
         else:
             shape = read_splats(cloud)

@@ -20,7 +20,7 @@ from avmsf.field.gains.kernels import Visual
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.mesh.surface import read_surface, surface_points, write_surface
+from avmsf.mesh.surface import surface_points
 from avmsf.photographs import read_views
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
 from avmsf.pipeline.frame_check import expect_contacts_in_views, expect_mesh_in_views, expect_on_object
@@ -167,7 +167,7 @@ def _shape_of_views(
             scene.listener.note(f"no surface is written: {error}")
         else:
             # Gaussians lie up to a wall's thickness below the surface, where a wall's other side may be nearer.
-            seen = read_surface(kept.path) if seen is None else seen
+            seen = Surface.read(kept.path) if seen is None else seen
     if seen is not None and fitted:
         features = moved_onto(features, seen)
     # Structure from motion knows nothing of the frame that the contacts are in.
@@ -225,7 +225,7 @@ def keep_surface(pipeline: Pipeline, make: Callable[[], Surface | ObjectShape], 
     def write(path: Path) -> None:
         shape = make()
         surface = shape if isinstance(shape, Surface) else shape.as_seen()
-        write_whole(path, lambda place: write_surface(surface, place), raising=SceneError)
+        write_whole(path, surface.write, raising=SceneError)
 
     return pipeline.add(Stage(SURFACE, write, recipe=lambda: {"of": digest}))
 

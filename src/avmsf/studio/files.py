@@ -23,7 +23,7 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.field.gains.model import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.ply import holds_gaussians, read_splats
-from avmsf.mesh.surface import Surface, read_surface
+from avmsf.mesh.surface import Surface
 from avmsf.studio.capture import CaptureEditor
 from avmsf.studio.opening import Opened, find_object, find_reconstructed
 from avmsf.studio.session import Revision
@@ -123,7 +123,7 @@ class Showcase:
         """Return points of the object, and normals, for a field without points. Raises StudioError without geometry."""
         path = find_object(self.opened)
         if path is not None and not holds_gaussians(path):
-            return _on_mesh(read_surface(path, meters=self.meters))
+            return _on_mesh(Surface.read(path, meters=self.meters))
         if path is not None:
             points = read_splats(path).centers
         else:
