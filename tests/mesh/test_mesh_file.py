@@ -1,7 +1,5 @@
 """What `load_mesh` returns has indices that exist and finite coordinates; what is beyond its bounds is refused."""
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,7 @@ import trimesh
 from avmsf._utils.text import MAX_TEXT_BYTES
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface
-from avmsf.mesh.io import MAX_GLTF_BYTES
+from avmsf.mesh.io import MAX_GLTF_BYTES, glb_bytes
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from factories.raising import raises
 
@@ -23,10 +21,7 @@ PLY = (
 
 
 def glb(record: dict, binary: bytes = bytes(36)) -> bytes:
-    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, **record}).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    return glb_bytes({"asset": {"version": "2.0"}, "scene": 0, **record}, binary)
 
 
 def triangle(*, nodes: int = 1, count: int = 3, matrix: list[float] | None = None) -> bytes:

@@ -6,10 +6,8 @@ minus the normal times the gain over 2 pi f. The draft leaves the absolute level
 damping for each mode, and no noise: phases, differences of dampings between contacts and the noise are left out.
 """
 
-import json
 import math
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from avmsf.export.geometry import read_vertices
 from avmsf.export.one_phase import approximation_error, shared_dampings, signed_amplitudes
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Axis, Written, check_suffix, generator, no_modes, pack, write_files
+from avmsf.mesh.io import glb_bytes
 from avmsf.mesh.surface import Surface
 
 EXTENSION = "KHR_audio_rigid_bodies"
@@ -59,7 +58,7 @@ def write_gltf(
         raise no_modes(path)
     damping, gains = shared_dampings(sampled), signed_amplitudes(sampled)
     vertices, gaussians = read_vertices(object, sampled, meters=meters)
-    contents = {path: _glb(*_document(sampled, vertices, up, gains, damping))}
+    contents = {path: glb_bytes(*_document(sampled, vertices, up, gains, damping))}
     if gaussians is not None:
         contents[path.with_suffix(".gaussians.ply")] = gaussians.read_bytes()
     sizes = write_files(contents, overwrite=overwrite)
@@ -139,15 +138,6 @@ def _packed(named: Sequence[tuple[str, Tensor]]) -> tuple[list[dict[str, Any]], 
             record |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
         accessors.append(record)
     return views, accessors, content
-
-
-def _glb(document: Mapping[str, Any], content: bytes) -> bytes:
-    """Return the container: a header and two chunks, padded to multiples of four bytes."""
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    content += b"\0" * (-len(content) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(content), b"BIN\0") + content
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def _remarks(sampled: SampledField) -> tuple[str, ...]:

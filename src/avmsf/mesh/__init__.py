@@ -9,7 +9,6 @@ each corner of a face, a normal, a color and a place in a texture.
 - `points`: farthest point sampling, nearest points and k-means. `neighborhoods`: normals and shape descriptors of a
   cloud (spin images, Johnson and Hebert 1999).
 - `textured_mesh`: smooth normals with sharp edges (means over faces weighted by angles, Thürmer and Wüthrich 1998).
-- `texture`: bilinear interpolation in images and their halvings (mipmaps, Williams 1983).
 - `level_set`: marching cubes (Lewiner et al. 2003, by scikit-image), decimation by quadrics (Garland and Heckbert 1997,
   by fast-simplification), and differences of solids (by manifold3d).
 - `closest_point`: the closest point of a surface, exactly, with the triangle and its barycentric coordinates.

@@ -9,6 +9,7 @@ import logging
 import re
 import struct
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,8 @@ def load_mesh(path: Path, *, raising: type[AvmsfError] = CaptureError) -> trimes
         with warnings.catch_warnings():
             # numpy's casts of damaged numbers; the results are checked below.
             warnings.simplefilter("ignore", RuntimeWarning)
-            plain = _plain_mesh(path)
+            rewrite = {".obj": _plain_obj, ".glb": _plain_glb}.get(path.suffix.lower())
+            plain = None if rewrite is None else rewrite(path.read_bytes())
             source = path if plain is None else io.BytesIO(plain)
             resolver = trimesh.resolvers.FilePathResolver(str(path))
             scene = trimesh.load_scene(source, path.suffix.lower()[1:], resolver, process=False)
@@ -167,17 +169,10 @@ def check_area(corners: np.ndarray) -> None:
         raise CaptureError(message, name="area", value=0.0)
 
 
-def _plain_mesh(path: Path) -> bytes | None:
-    """Return the rewritten content of an OBJ or GLB file; None where the file is plain already, or of another kind."""
-    suffix = path.suffix.lower()
-    if suffix == ".obj":
-        content = path.read_bytes()
-        return _plain_obj(content) if _UNUSUAL.search(content) else None
-    return _plain_glb(path.read_bytes()) if suffix == ".glb" else None
-
-
-def _plain_obj(content: bytes) -> bytes:
-    """Return an OBJ file with single spaces, without a byte-order mark, and with indices counted from the first."""
+def _plain_obj(content: bytes) -> bytes | None:
+    """Return an OBJ file with single spaces, without a byte-order mark, indices from the first; None if it is so."""
+    if not _UNUSUAL.search(content):
+        return None
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
     content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     for line in content.splitlines():
@@ -242,7 +237,13 @@ def _plain_glb(content: bytes) -> bytes | None:
     if not chosen:
         return None
     record["buffers"][0]["byteLength"] = len(body)
-    text = json.dumps(record).encode()
+    return glb_bytes(record, body)
+
+
+def glb_bytes(record: Mapping[str, Any], body: bytes) -> bytes:
+    """Return a binary glTF: a header and two chunks, the JSON and the body, padded to multiples of four bytes."""
+    text = json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
+    body += b"\0" * (-len(body) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -45,8 +45,13 @@ def enclose(
     drawn = measure.marching_cubes(values, level, gradient_direction="ascent")  # type: ignore[no-untyped-call]
     vertices, triangles = drawn[:2]
     vertices, triangles = _without_specks(vertices.astype(np.float64), triangles.astype(np.int64))
-    if faces is not None and len(triangles) > faces:
-        vertices, triangles = _coarser(vertices, triangles, faces)
+    while faces is not None and faces < len(triangles):
+        fewer, coarse = _compact(*decimated(vertices, triangles, faces))
+        if _closed(coarse):
+            vertices, triangles = fewer, coarse
+            break
+        # Where it pinches a thin part off, a finer one does not.
+        faces *= 2
     return Surface(torch.from_numpy(lowest + spacing * vertices).float(), torch.from_numpy(triangles))
 
 
@@ -68,19 +73,6 @@ def _compact(
 ) -> tuple[Float64[np.ndarray, "kept 3"], Int[np.ndarray, "remaining 3"]]:
     used, rows = np.unique(triangles, return_inverse=True)
     return vertices[used], rows.reshape(-1, 3)
-
-
-def _coarser(
-    vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"], faces: int
-) -> tuple[Float64[np.ndarray, "fewer 3"], Int[np.ndarray, "coarse 3"]]:
-    wanted = faces
-    while wanted < len(triangles):
-        fewer, coarse = _compact(*decimated(vertices, triangles, wanted))
-        if _closed(coarse):
-            return fewer, coarse
-        # Where it pinches a thin part off, a finer one does not.
-        wanted *= 2
-    return vertices, triangles
 
 
 def decimated(

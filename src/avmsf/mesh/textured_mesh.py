@@ -67,7 +67,12 @@ class TexturedMesh:
         texture. Raises CaptureError for coordinates that are not numbers, for faces that name vertices which are not
         there, and for a mesh without a face that has an area.
         """
-        _check_mesh(vertices, faces)
+        if not len(faces):
+            message = f"expected a mesh with triangles to render, got {len(vertices)} points without any"
+            raise CaptureError(message, name="faces", value=0)
+        check_finite_vertices(vertices.numpy())
+        check_corners(faces.numpy(), len(vertices))
+        check_area(vertices.double()[faces].numpy())
         used, rows = np.unique(vertices.numpy()[faces.numpy().ravel()], axis=0, return_inverse=True)
         welded = rows.reshape(-1, 3)
         textured = bool(textures)
@@ -109,24 +114,22 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
         advice = "export the mesh with its faces, or give the points as the capture's surface"
         raise CaptureError.expected(wanted, 0, got="none", file=path, name="faces", advice=advice)
     lacking = _missing_images(path)
-    painted = [_paint(part, lacking) for part in parts]
-    remarks = dict.fromkeys(paint.remark for paint in painted if paint.remark)
+    colors, coordinates, textures, remarks = zip(*(_paint(part, lacking) for part in parts), strict=True)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]) * meters
     faces = np.concatenate([np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, offsets)])  # noqa: B905
-    counts = [len(part.faces) for part in parts]
     try:
         mesh = TexturedMesh.build(
             torch.from_numpy(vertices),
             torch.from_numpy(faces),
-            colors=torch.from_numpy(np.concatenate([paint.colors for paint in painted])),
-            coordinates=torch.from_numpy(np.concatenate([paint.coordinates for paint in painted])),
-            textures=[torch.from_numpy(paint.texture) for paint in painted],
-            materials=torch.from_numpy(np.repeat(np.arange(len(parts)), counts)),
+            colors=torch.from_numpy(np.concatenate(colors)),
+            coordinates=torch.from_numpy(np.concatenate(coordinates)),
+            textures=[torch.from_numpy(texture) for texture in textures],
+            materials=torch.from_numpy(np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])),
         )
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}", **error.attributes | {"file": path}) from error
-    for remark in remarks:
+    for remark in dict.fromkeys(filter(None, remarks)):
         warnings.warn(remark.about(path), stacklevel=2)
     return mesh
 
@@ -150,52 +153,39 @@ def corner_normals(vertices: Float[np.ndarray, "points 3"], faces: Int[np.ndarra
     return np.where(sharp[..., None], flat[:, None], smooth)
 
 
-@dataclass(frozen=True, eq=False)
-class _Paint:
-    """The colors of one part."""
-
-    colors: np.ndarray
-    coordinates: np.ndarray
-    texture: np.ndarray
-    remark: CaptureWarning | None = None
-
-
 _COLORLESS = CaptureWarning("has neither texture nor colors; it is rendered gray", name="colors")
 
 
-def _paint(part: trimesh.Trimesh, lacking: dict[str, str]) -> _Paint:
-    faces = np.asarray(part.faces)
-    white = np.full((1, 1, 3), 255, dtype=np.uint8)
-    nowhere = np.zeros((len(faces), 3, 2))
-    visual: Any = part.visual
-    if visual.kind == "vertex":
-        return _Paint(np.asarray(visual.vertex_colors)[faces][..., :3] / 255.0, nowhere, white)
-    if visual.kind == "face":
-        own = np.asarray(visual.face_colors)[:, None, :3] / 255.0
-        return _Paint(np.repeat(own, 3, axis=1), nowhere, white)
-    gray = np.full((len(faces), 3, 3), GRAY)
-    if visual.kind != "texture":
-        return _Paint(gray, nowhere, white, _COLORLESS)
-    material = visual.material
+def _paint(
+    part: trimesh.Trimesh, lacking: dict[str, str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, CaptureWarning | None]:
+    """Return the colors and the places in its texture of a part's corners, the texture, and what is to be said."""
+    faces, visual, remark = np.asarray(part.faces), part.visual, None
+    coordinates, texture = np.zeros((len(faces), 3, 2)), np.full((1, 1, 3), 255, dtype=np.uint8)
+    material: Any = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    factor = getattr(material, "baseColorFactor", None)
-    if image is not None and visual.uv is not None:
+    factor, name = getattr(material, "baseColorFactor", None), str(getattr(material, "name", ""))
+    colors = np.full(3, GRAY)
+    if visual.kind == "vertex":
+        colors = np.asarray(visual.vertex_colors)[faces][..., :3] / 255.0
+    elif visual.kind == "face":
+        colors = np.asarray(visual.face_colors)[:, None, :3] / 255.0
+    elif visual.kind == "texture" and image is not None and visual.uv is not None:
         try:
             texture = np.array(image.convert("RGB"))
         except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises for images that are cut or corrupt
             remark = CaptureWarning(f"its texture cannot be read ({error}); it is rendered gray", name="texture")
-            return _Paint(gray, nowhere, white, remark)
-        coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
-        tint = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
-        return _Paint(np.broadcast_to(tint, gray.shape).copy(), coordinates, texture)
-    name = str(getattr(material, "name", ""))
-    if name in lacking:
+        else:
+            coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
+            colors = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
+    elif visual.kind == "texture" and name in lacking:
         message = f"its texture {lacking[name]} is missing; the part is rendered gray"
-        return _Paint(gray, nowhere, white, CaptureWarning(message, name="texture", value=lacking[name]))
-    if factor is None and "kd" not in getattr(material, "kwargs", {}):
-        return _Paint(gray, nowhere, white, _COLORLESS)
-    tint = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0
-    return _Paint(np.broadcast_to(tint, gray.shape).copy(), nowhere, white)
+        remark = CaptureWarning(message, name="texture", value=lacking[name])
+    elif visual.kind == "texture" and (factor is not None or "kd" in getattr(material, "kwargs", {})):
+        colors = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0
+    else:
+        remark = _COLORLESS
+    return np.broadcast_to(colors, (len(faces), 3, 3)), coordinates, texture, remark
 
 
 def _missing_images(path: Path) -> dict[str, str]:
@@ -221,13 +211,3 @@ def _missing_images(path: Path) -> dict[str, str]:
 def _unit(vectors: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)
-
-
-def _check_mesh(vertices: Tensor, faces: Tensor) -> None:
-    if not len(faces):
-        raise CaptureError(
-            f"expected a mesh with triangles to render, got {len(vertices)} points without any", name="faces", value=0
-        )
-    check_finite_vertices(vertices.numpy())
-    check_corners(faces.numpy(), len(vertices))
-    check_area(vertices.double()[faces].numpy())

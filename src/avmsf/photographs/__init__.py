@@ -18,7 +18,8 @@ Where there are no cameras or no photographs:
 - `video`: the sharpest frames of a video (variance of the Laplacian).
 - `sfm`, `sfm_worker`: cameras by incremental structure from motion (Schönberger and Frahm 2016), in a process of its
   own; needs pycolmap (`pip install 'avmsf[sfm]'`).
-- `mesh_views`: views of a textured mesh by ray casting, from the 72 cameras of ObjectFolder's renders.
+- `mesh_views`: views of a textured mesh by ray casting, from the 72 cameras of ObjectFolder's renders; textures are
+  read from mipmaps (Williams 1983).
 
 What cannot be used raises CaptureError with the file, frame or image; what can be, with a loss, warns by
 CaptureWarning.

@@ -5,16 +5,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avmsf.errors import CaptureError
 from avmsf.mesh.io import check_area
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
-from avmsf.mesh.texture import TextureAtlas
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View
 
@@ -111,51 +111,92 @@ class MeshTracer:
 
 
 class _Painter:
-    """A mesh's colors, and the light on it, where rays meet it."""
+    """A mesh's colors, and the light on it, where rays meet it; of the settings of `render_views`."""
 
-    def __init__(self, mesh: TexturedMesh) -> None:
+    def __init__(
+        self, mesh: TexturedMesh, ambient: float, background: tuple[float, float, float], supersample: int
+    ) -> None:
+        self.ambient, self.background, self.supersample = ambient, np.asarray(background), supersample
         self.tracer = MeshTracer(mesh.surface)
         self.normals, self.colors = mesh.normals.numpy(), mesh.colors.numpy()
         self.coordinates, self.materials = mesh.coordinates.numpy(), mesh.materials.numpy()
-        self.atlas = TextureAtlas([texture.numpy() for texture in mesh.textures])
+        self.textures = [_mipmaps(texture.numpy()) for texture in mesh.textures]
+        sizes = np.array([texture.shape[1::-1] for texture in mesh.textures], dtype=np.float64)
         corners = self.tracer.vertices[self.tracer.faces]
-        pixels = self.coordinates * self.atlas.sizes[self.materials][:, None]
+        pixels = self.coordinates * sizes[self.materials][:, None]
         across, down = pixels[:, 1] - pixels[:, 0], pixels[:, 2] - pixels[:, 0]
         texels = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
         doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         self.texels_per_meter = np.sqrt(texels / np.maximum(doubled, 1e-30))
 
-    def view(
-        self, camera: Camera, *, name: str, ambient: float, background: tuple[float, float, float], supersample: int
-    ) -> View:
-        """Render one view as `render_views` does."""
-        fine = camera.resized(camera.width * supersample, camera.height * supersample)
+    def view(self, camera: Camera, name: str) -> View:
+        """Render one view."""
+        fine = camera.resized(camera.width * self.supersample, camera.height * self.supersample)
         count = camera.width * camera.height
         sums = np.zeros((4, count))
         for hits in self.tracer.cast(fine):
-            pixel = hits.rows // supersample * camera.width + hits.columns // supersample
-            for total, weights in zip(sums, [*self._colors(hits, fine, ambient).T, None], strict=True):
+            pixel = hits.rows // self.supersample * camera.width + hits.columns // self.supersample
+            for total, weights in zip(sums, [*self._colors(hits, fine).T, None], strict=True):
                 total += np.bincount(pixel, weights=weights, minlength=count)
-        color, covered = sums[:3].T / supersample**2, sums[3:].T / supersample**2
-        image = np.clip(color + (1 - covered) * np.asarray(background), 0, 1)
+        color, covered = sums[:3].T / self.supersample**2, sums[3:].T / self.supersample**2
+        image = np.clip(color + (1 - covered) * self.background, 0, 1)
         pixels = np.rint(255 * np.hstack([image, covered])).astype(np.uint8).reshape(camera.height, camera.width, 4)
         color, mask = np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
         return View(name, torch.from_numpy(color), camera, torch.from_numpy(mask))
 
-    def _colors(self, hits: _Hits, camera: Camera, ambient: float) -> np.ndarray:
+    def _colors(self, hits: _Hits, camera: Camera) -> np.ndarray:
         """Return the color of each hit, 0 to 1."""
         places = np.einsum("nca,nc->na", self.coordinates[hits.faces], hits.weights)
         # Size of a ray's neighborhood on a face that looks at the camera; one that leans shows more.
         spans = hits.depth / min(camera.focal) * self.texels_per_meter[hits.faces]
-        colors = self.atlas.sample(places, self.materials[hits.faces], spans=spans)
+        colors, materials = np.empty((len(places), 3), dtype=np.float32), self.materials[hits.faces]
+        for material, levels in enumerate(self.textures):
+            chosen = np.flatnonzero(materials == material)
+            # The copy of which one to two texels lie side by side under a ray's neighborhood.
+            level = np.log2(np.maximum(spans[chosen], 1.0)).astype(np.intp).clip(max=len(levels) - 1)
+            for number in np.unique(level):
+                here = chosen[level == number]
+                colors[here] = _bilinear(levels[number], places[here])
+        colors /= np.float32(255)
         colors *= np.einsum("nca,nc->na", self.colors[hits.faces], hits.weights)
-        if ambient < 1:
+        if self.ambient < 1:
             normals = np.einsum("nca,nc->na", self.normals[hits.faces], hits.weights)
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
             # Both sides are lit as the one that is seen.
             facing = np.where((normals * hits.directions).sum(axis=1) > 0, -1, 1)
-            colors *= (ambient + (1 - ambient) * (1 + facing * (normals @ SKY)) / 2)[:, None]
+            colors *= (self.ambient + (1 - self.ambient) * (1 + facing * (normals @ SKY)) / 2)[:, None]
         return colors
+
+
+def _mipmaps(image: UInt8[np.ndarray, "_ _ 3"]) -> list[UInt8[np.ndarray, "_ _ 3"]]:
+    """Return an image and its copies of half, a quarter, ... of its size."""
+    levels = [image]
+    while max(levels[-1].shape[:2]) > 1:
+        height, width = levels[-1].shape[:2]
+        half = (max(width // 2, 1), max(height // 2, 1))
+        levels.append(cv2.resize(levels[-1], half, interpolation=cv2.INTER_AREA))
+    return levels
+
+
+def _bilinear(
+    image: UInt8[np.ndarray, "height width 3"], places: Float[np.ndarray, "samples 2"]
+) -> Float[np.ndarray, "samples 3"]:
+    """Return the colors, 0 to 255, at places u (right) and v (up) of an image that repeats without end."""
+    height, width = image.shape[:2]
+    if (height, width) == (1, 1):
+        return np.broadcast_to(image[0].astype(np.float32), (len(places), 3))
+    # A texel's color belongs to its center, half a texel from its edges; rows run down while v runs up.
+    across, down = places[:, 0] * width - 0.5, (1 - places[:, 1]) * height - 0.5
+    left, top = np.floor(across), np.floor(down)
+    right_part, low_part = (across - left).astype(np.float32), (down - top).astype(np.float32)
+    columns = (left.astype(np.intp) % width, (left.astype(np.intp) + 1) % width)
+    rows = (top.astype(np.intp) % height, (top.astype(np.intp) + 1) % height)
+    color = np.zeros((len(places), 3), dtype=np.float32)
+    flat = image.reshape(-1, 3)
+    for row, down_part in zip(rows, (1 - low_part, low_part), strict=True):
+        for column, across_part in zip(columns, (1 - right_part, right_part), strict=True):
+            color += flat[row * width + column] * (down_part * across_part)[:, None]
+    return color
 
 
 def render_views(
@@ -181,10 +222,9 @@ def render_views(
         raise CaptureError.expected("a supersample of at least 1", supersample, name="supersample")
     if not all(0 <= value <= 1 for value in background):
         raise CaptureError.expected("numbers from 0 to 1", background, name="background")
-    painter, views = _Painter(mesh), []
+    painter, views = _Painter(mesh, ambient, background, supersample), list[View]()
     for number, camera in enumerate(cameras):
-        name = f"view_{number:03d}"
-        views.append(painter.view(camera, name=name, ambient=ambient, background=background, supersample=supersample))
+        views.append(painter.view(camera, f"view_{number:03d}"))
         if progress is not None:
             progress(number + 1, len(cameras))
     return tuple(views)
