@@ -196,12 +196,7 @@ class _Optimization:
         self.step, self.failed = 0, 0
         self.consistent = True
         """False while parameters are being moved: an interruption then leaves a state that nothing can go on from."""
-        settings = {**asdict(config), **asdict(parameters)}
-        # The interval of previews does not change the result.
-        del settings["preview_every"]
-        identity = checkpoint_identity(field, probes, guide.describe(), settings)
-        identity |= {} if score is None else {"network": score.digest}
-        self.checkpoint = Checkpoint(checkpoint, identity, what="the edit", raising=EditError)
+        self.checkpoint = Checkpoint(checkpoint, self._identity(), what="the edit", raising=EditError)
         state = self.checkpoint.read()
         self.scores: dict[int, float] = {} if state is None else state["scores"]
         searching = state is None and parameters.searches
@@ -216,6 +211,19 @@ class _Optimization:
                     value.copy_(state["variables"]["values"][name])
             self.optimizer.load_state_dict(state["variables"]["optimizer"])
             self.step, self.failed = state["step"], state["failed"]
+
+    def _identity(self) -> dict[str, str]:
+        """Return a digest of each thing that decides the result, by what errors call it."""
+        field, settings = self.field, {**asdict(self.config), **asdict(self.parameters)}
+        # The interval of previews does not change the result.
+        del settings["preview_every"]
+        tensors = {f"bank.{name}": each for name, each in vars(field.bank).items()} | vars(self.probes.known)
+        content = content_digest(*tensors, *tensors.values(), field.phase, field.gain_field.points)
+        made_by = [version("avmsf"), source_digest("avmsf.editing.guided")]
+        values = {"field": [field.sample_rate, field.samples, content], "guide": self.guide.describe()}
+        values |= {"settings": settings, "version of avmsf": made_by}
+        identity = {name: key_of({name: each}) for name, each in values.items()}
+        return identity if self.score is None else identity | {"network": self.score.digest}
 
     def _optimizer(self) -> torch.optim.Adam:
         """Return an optimizer of the values; those whose rate is 0 stay where they begin."""
@@ -240,7 +248,9 @@ class _Optimization:
                 if watched and (self.step % every == 0 or self.step == self.config.steps):
                     preview = self._preview(self._normalized_edit().of(self.field))
                     if self.score is not None:
-                        self._add_score(self.score, preview)
+                        # The field before the edit is scored with the first preview.
+                        heard = ({} if self.scores else {0: self._preview(self.field)}) | {self.step: preview}
+                        self.scores |= {step: self.score.of(sound) for step, sound in heard.items() if sound.any()}
                 if progress is not None:
                     factors = edit.pitch_factor, edit.decay_factor
                     progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview))
@@ -256,11 +266,6 @@ class _Optimization:
             record = {"model": self.score.network, "steps": [*self.scores], "scores": [*self.scores.values()]}
             self.settings[CLAP] = record
         return self._normalized_edit().of(self.field, settings=self.settings)
-
-    def _add_score(self, score: PreviewScore, preview: Float[Tensor, " samples"]) -> None:
-        """Score a preview, and the field before the edit with the first one."""
-        before = {} if self.scores else {0: self._preview(self.field)}
-        self.scores |= {step: score.of(sound) for step, sound in {**before, self.step: preview}.items() if sound.any()}
 
     def _take_step(self) -> float:
         """Take one step and return the loss before it."""
@@ -334,18 +339,3 @@ class _Optimization:
         values = {name: value.detach() for name, value in self.values.items()}
         variables = {"values": values, "optimizer": self.optimizer.state_dict()}
         self.checkpoint.save({"variables": variables, "step": self.step, "failed": self.failed, "scores": self.scores})
-
-
-def checkpoint_identity(
-    field: SoundField, contacts: Tensor, guide: dict[str, Any], settings: dict[str, Any]
-) -> dict[str, str]:
-    """Return a digest of each thing that decides an edit's result, by what errors call it.
-
-    `contacts` are places at which the field's gains are looked at; `guide` and `settings` plain values.
-    """
-    tensors = {f"bank.{name}": each for name, each in vars(field.bank).items()} | vars(field.known(contacts))
-    content = content_digest(*tensors, *tensors.values(), field.phase, field.gain_field.points)
-    field_values = [field.sample_rate, field.samples, content]
-    made_by = [version("avmsf"), source_digest("avmsf.editing.guided")]
-    values = {"field": field_values, "guide": guide, "settings": settings, "version of avmsf": made_by}
-    return {name: key_of({name: each}) for name, each in values.items()}

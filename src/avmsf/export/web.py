@@ -103,11 +103,6 @@ def _titled(html: str, bundle: Bundle) -> str:
     return _once(_TITLE, html, lambda found: title, "title")
 
 
-def _bare(source: str) -> str:
-    """Return a module with bare specifiers in its imports: a data: address has no base for relative ones."""
-    return _IMPORTED.sub(r"\1\2avmsf/\3\2", source)
-
-
 def _carrying(words: str, page: Mapping[str, bytes]) -> str:
     """Return the import map with the page's modules and libraries as data: addresses, each once."""
     scripts = {name: each.decode() for name, each in page.items() if name.endswith(".js")}
@@ -118,8 +113,11 @@ def _carrying(words: str, page: Mapping[str, bytes]) -> str:
             imports[specifier] = _data_url(f'export * from "{first[path]}";')
         elif path in scripts:
             first[path], imports[specifier] = specifier, _data_url(scripts[path])
-    own = {name.removeprefix("page/"): each for name, each in scripts.items() if name.count("/") == 1}
-    return json.dumps({"imports": imports | {f"avmsf/{name}": _data_url(_bare(each)) for name, each in own.items()}})
+    for name, each in scripts.items():
+        if name.count("/") == 1:
+            # A data: address has no base for relative imports.
+            imports[f"avmsf/{Path(name).name}"] = _data_url(_IMPORTED.sub(r"\1\2avmsf/\3\2", each))
+    return json.dumps({"imports": imports})
 
 
 def _data_url(source: str) -> str:
