@@ -97,8 +97,9 @@ def test_a_file_may_be_named_itself(tmp_path: Path) -> None:
     write_transforms(tmp_path, frames(ring(3)))
     (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
     assert len(read_views(tmp_path / "transforms_train.json")) == 3
-    with raises(CaptureError, file=tmp_path, value=["transforms_train.json"]):
-        read_views(tmp_path)
+    for name, value in ((".", ["transforms_train.json"]), ("images", []), ("no", None), ("no.json", None)):
+        with raises(CaptureError, file=tmp_path / name, value=value):
+            read_views(tmp_path / name)
 
 
 def test_coefficients_go_where_opencv_has_them(tmp_path: Path) -> None:
@@ -195,13 +196,6 @@ def test_what_is_no_json_object_with_frames_is_named(tmp_path: Path, text, given
         (tmp_path / "transforms.json").write_text(text)
     with raises(CaptureError, file=None if given else "transforms.json", name=name, value=value):
         read_views(tmp_path, **given)
-
-
-def test_folders_without_cameras_say_what_is_missing(tmp_path: Path) -> None:
-    write_image(tmp_path / "images" / "a.png")
-    for path in (tmp_path / "nowhere", tmp_path / "nowhere.json", tmp_path):
-        with raises(CaptureError, file=path):
-            read_views(path)
 
 
 def some_views(*, masked: bool = True) -> tuple[View, ...]:
