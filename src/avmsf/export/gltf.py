@@ -7,8 +7,7 @@ damping for each mode, and no noise: phases, differences of dampings between con
 """
 
 import math
-from collections.abc import Sequence
-from itertools import count
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,13 +78,13 @@ def _document(
     drawn = vertices | {"NORMAL": torch.nn.functional.normalize(vertices["NORMAL"], dim=1)}
     if "COLOR_0" in drawn:
         drawn["COLOR_0"] = _linear(drawn["COLOR_0"])
-    views, accessors, content = _packed([*modal.items(), *drawn.items()])
-    number = count()
+    views, accessors, content = _packed(modal | drawn)
+    number = {name: row for row, name in enumerate(modal | drawn)}
     facts = {"perNewton": sampled.per_newton, "impulse": "1 N s against the normal is an impact of force 1"}
-    model: dict[str, Any] = {"name": sampled.name or "object", **dict(zip(modal, number, strict=False))}
+    model: dict[str, Any] = {"name": sampled.name or "object", **{name: number[name] for name in modal}}
     model["extras"] = {"avmsf": facts}
-    attributes = dict(zip(drawn, number, strict=False))
-    indices = {name: attributes.pop(name) for name in ("indices",) if name in attributes}
+    indices = {name: number[name] for name in drawn if name == "indices"}
+    attributes = {name: number[name] for name in drawn if name != "indices"}
     primitive = {"attributes": attributes, "mode": _TRIANGLES if indices else _POINTS, "material": 0, **indices}
     shade = 1.0 if "COLOR_0" in drawn else float(_linear(torch.tensor(_GRAY)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
@@ -119,14 +118,14 @@ def _modal(
     return arrays | {"shapes": shapes.reshape(-1, 3)}
 
 
-def _packed(named: Sequence[tuple[str, Tensor]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bytes]:
+def _packed(named: Mapping[str, Tensor]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bytes]:
     """Return the buffer views, the accessors and the content of arrays, which become float32 or uint32."""
-    arrays = {str(row): array.numpy() for row, (_, array) in enumerate(named)}
-    arrays = {row: array.astype("<u4" if array.dtype.kind in "iu" else "<f4") for row, array in arrays.items()}
+    arrays = {name: array.numpy() for name, array in named.items()}
+    arrays = {name: array.astype("<u4" if array.dtype.kind in "iu" else "<f4") for name, array in arrays.items()}
     content, places = pack(arrays)
     views, accessors = [], []
-    for row, ((name, _), array) in enumerate(zip(named, arrays.values(), strict=True)):
-        view = {"buffer": 0, "byteOffset": places[str(row)]["offset"], "byteLength": array.nbytes}
+    for row, (name, array) in enumerate(arrays.items()):
+        view = {"buffer": 0, "byteOffset": places[name]["offset"], "byteLength": array.nbytes}
         views.append(view | ({"target": _TARGETS[name]} if name in _TARGETS else {}))
         record: dict[str, Any] = {
             "bufferView": row,

@@ -160,9 +160,10 @@ def _paint(
     part: trimesh.Trimesh, lacking: dict[str, str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, CaptureWarning | None]:
     """Return the colors and the places in its texture of a part's corners, the texture, and what is to be said."""
-    faces, visual, remark = np.asarray(part.faces), part.visual, None
+    visual: Any = part.visual
+    faces, remark = np.asarray(part.faces), None
     coordinates, texture = np.zeros((len(faces), 3, 2)), np.full((1, 1, 3), 255, dtype=np.uint8)
-    material: Any = getattr(visual, "material", None)
+    material = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     factor, name = getattr(material, "baseColorFactor", None), str(getattr(material, "name", ""))
     colors = np.full(3, GRAY)
