@@ -163,7 +163,7 @@ def _paint(
     visual: Any = part.visual
     faces, remark = np.asarray(part.faces), None
     coordinates, texture = np.zeros((len(faces), 3, 2)), np.full((1, 1, 3), 255, dtype=np.uint8)
-    material = getattr(visual, "material", None)
+    material: Any = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     factor, name = getattr(material, "baseColorFactor", None), str(getattr(material, "name", ""))
     colors = np.full(3, GRAY)
