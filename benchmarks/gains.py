@@ -22,7 +22,7 @@ from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.synthesis import synthesize
-from avmsf.pipeline.cloud_shape import shape_of_cloud
+from avmsf.pipeline.scene import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.recipe import ABLATED, SET

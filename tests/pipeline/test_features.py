@@ -25,12 +25,11 @@ from avmsf.gaussians.ply import write_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.photographs.folder import write_frames
-from avmsf.pipeline.cloud_shape import shape_of_cloud
 from avmsf.pipeline.config import CACHE, PRESETS, SURFACE, LiftConfig
 from avmsf.pipeline.features import finish_features
-from avmsf.pipeline.frame_check import expect_contacts_in_views, expect_mesh_in_views
-from avmsf.pipeline.scene import without_far
+from avmsf.pipeline.scene import shape_of_cloud, without_far
 from avmsf.pipeline.shape import OFF_MESH, moved_onto
+from avmsf.pipeline.visual_checks import expect_contacts_in_views, expect_mesh_in_views
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 from factories.ball_views import MIDDLE, RADIUS
 from factories.clouds import cloud, random_cloud

@@ -7,8 +7,8 @@ comes a `SoundField`. Start reading at `fit.fit`, which `avmsf.fit` and `avmsf f
   asked for, a `StageFolder` (`CAPTURE/.avmsf`) keeps each output next to the record of what it was made from.
 - `views`, `scene`: from what shows the object to views with cameras and masks (structure from motion, rendering), to
   Gaussians, and to features on the surface (`features`: lifted, reduced, pooled over symmetries).
-- `shape`, `cloud_shape`: the object's points, symmetries and surface, from its mesh or from views. `frame_check`: that
-  contacts, mesh, masks and Gaussians are of one object in one frame. `visual_checks`: what `avmsf check` says of them.
+- `shape`: the object's points, symmetries and surface, from its mesh or from views. `visual_checks`: whether contacts,
+  mesh, masks and Gaussians are of one object in one frame, and what `avmsf check` says of them.
 - `bodies`: the finite-element models that a surface may enclose, and the field of one of a known material without
   recordings. `fit`: modes and gains.
 - `config`: settings of all stages, and the presets `default` and `paper`.

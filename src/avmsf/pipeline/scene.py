@@ -1,7 +1,7 @@
 """From what a folder shows of the object to features on its surface: views, Gaussians, features, each a stage."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,18 +23,27 @@ from avmsf.gaussians.initialize import StartPoints
 from avmsf.gaussians.ply import read_splats, write_splats
 from avmsf.gaussians.prune import keep_object
 from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
+from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.surface import Surface
 from avmsf.photographs import read_sparse_points, read_views, write_views
 from avmsf.photographs.cameras import View
-from avmsf.pipeline.cloud_shape import masks_suffice, shape_of_cloud, views_of_cloud
+from avmsf.photographs.mesh_views import orbit_cameras
 from avmsf.pipeline.config import SceneConfig
 from avmsf.pipeline.features import choose_encoder, finish_features, lift_features
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder, digest_of
 from avmsf.pipeline.views import MOTION, VIEWS, Source, find_source, find_splats, view_stages
-from avmsf.reconstruction import ObjectShape
+from avmsf.reconstruction import ObjectShape, object_surface
 
 CLOUD, FEATURES = "cloud.ply", "features.safetensors"
 """What the stages call their outputs."""
+_MIN_COUNT = 100
+"""Gaussians; what encloses an object is not known from fewer."""
+_MIN_OPACITY = 0.05
+"""Opacity below which a Gaussian does not show where the object is."""
+_MIN_MASKS = 3
+"""Masks from which outlines are taken; with fewer, pictures of the Gaussians have them."""
+_SIZE = 256
+"""Width and height of such pictures, pixels."""
 
 
 class SceneStages(Pipeline):
@@ -150,9 +159,7 @@ class SceneStages(Pipeline):
         write_splats(cloud, path)
 
     def _picture_gaussians(self, path: Path, given: Path) -> None:
-        cloud = read_splats(given)
-        rasterizer = choose_rasterizer(cloud.centers.device)
-        write_views(views_of_cloud(cloud, rasterizer, size=self.config.views.rendered), path, replace=True)
+        write_views(views_of_cloud(read_splats(given), size=self.config.views.rendered), path, replace=True)
 
     @cached_property
     def _encoder(self) -> Encoder:
@@ -182,17 +189,8 @@ class SceneStages(Pipeline):
         self.listener.step("splat", progress.step, progress.steps, message)
 
     def shape(self) -> ObjectShape:
-        """Return the object's shape, of its views' masks and its Gaussians' depth.
-
-        Where fewer than 3 views have masks, pictures of the Gaussians stand for them.
-        """
-        views, cloud = read_views(self[VIEWS].path), read_splats(self[CLOUD].path)
-        enough = masks_suffice(views)
-        source = f"{len(views)} views" if enough else "images of the Gaussians, as fewer than 3 views have masks,"
-        self.listener.log(f"shape: of {source} and {len(cloud)} Gaussians")
-        shape = shape_of_cloud(cloud, views)
-        self.listener.log(f"shape: {shape.describe()}")
-        return shape
+        """Return the object's shape, of its views' masks and its Gaussians' depth (`shape_of_cloud`)."""
+        return shape_of_cloud(read_splats(self[CLOUD].path), read_views(self[VIEWS].path), log=self.listener.log)
 
 
 def without_far(cloud: GaussianCloud) -> GaussianCloud:
@@ -212,3 +210,45 @@ def without_far(cloud: GaussianCloud) -> GaussianCloud:
 def scaled(cloud: GaussianCloud, factor: float) -> GaussianCloud:
     """Return the Gaussians with all lengths times a factor."""
     return replace(cloud, centers=cloud.centers * factor, log_scales=cloud.log_scales + math.log(factor))
+
+
+def shape_of_cloud(
+    cloud: GaussianCloud,
+    views: Sequence[View] = (),
+    *,
+    cells: int = 128,
+    log: Callable[[str], object] = lambda message: None,
+) -> ObjectShape:
+    """Return the shape of the object that Gaussians show; masks of views say where its outlines are.
+
+    Where fewer than 3 views have masks, pictures of the Gaussians from all sides stand for them. Raises SceneError for
+    fewer than 100 Gaussians that can be seen, for Gaussians in one place, and as `object_surface` does.
+    """
+    visible = cloud.detach().take(cloud.opacities.detach() >= _MIN_OPACITY)
+    advice = "fit the Gaussians again, with more steps or better masks"
+    if len(visible) < _MIN_COUNT:
+        wanted = f"{_MIN_COUNT} Gaussians or more of at least {_MIN_OPACITY}"
+        raise SceneError.expected(wanted, len(visible), name="opacities", advice=advice)
+    if not float((visible.centers.amax(0) - visible.centers.amin(0)).max()) > 0:
+        center = visible.centers[0].tolist()
+        raise SceneError.expected("Gaussians all over an object", center, name="centers", advice=advice)
+    source = f"{len(views)} views"
+    if sum(bool(view.foreground.any()) for view in views) < _MIN_MASKS:
+        source = f"images of the Gaussians, as fewer than {_MIN_MASKS} views have masks,"
+        views = views_of_cloud(visible, size=_SIZE)
+    log(f"shape: of {source} and {len(cloud)} Gaussians")
+    shape = object_surface(views, depth_of_cloud(visible, choose_rasterizer(visible.centers.device)), cells=cells)
+    log(f"shape: {shape.describe()}")
+    return shape
+
+
+def views_of_cloud(cloud: GaussianCloud, *, size: int) -> tuple[View, ...]:
+    """Return the 72 pictures of `orbit_cameras` of Gaussians before white, `size` pixels wide, with masks."""
+    box = Surface(cloud.centers.float(), torch.zeros(0, 3, dtype=torch.int64))
+    rasterizer, views = choose_rasterizer(cloud.centers.device), []
+    for number, camera in enumerate(orbit_cameras(box, size=size)):
+        with torch.no_grad():
+            seen = rasterizer(cloud, camera, background=cloud.centers.new_ones(3))
+        image, mask = ((255 * each.clamp(0, 1)).round().to(torch.uint8) for each in (seen.color, seen.alpha))
+        views.append(View(f"view_{number:03d}", image, camera, mask))
+    return tuple(views)

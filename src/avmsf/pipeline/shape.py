@@ -23,10 +23,10 @@ from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs import read_views
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
-from avmsf.pipeline.frame_check import expect_contacts_in_views, expect_mesh_in_views, expect_on_object
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
 from avmsf.pipeline.views import VIEWS
+from avmsf.pipeline.visual_checks import expect_contacts_in_views, expect_mesh_in_views, expect_on_object
 from avmsf.reconstruction import ObjectShape
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
