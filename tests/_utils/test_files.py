@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -144,22 +145,16 @@ def test_who_waits_gets_the_lock_when_it_is_free(tmp_path: Path) -> None:
 
 
 def test_a_thread_takes_its_lock_again_and_another_one_does_not(tmp_path: Path) -> None:
-    refused: list[FolderInUseError] = []
-
     def intrude() -> None:
-        try:
-            with write_lock(tmp_path, "stages", command="other", wait=0.1):
-                pass
-        except FolderInUseError as error:
-            refused.append(error)
+        with write_lock(tmp_path, "stages", command="other", wait=0.1):
+            pytest.fail("two threads hold the lock")
 
-    with write_lock(tmp_path, "stages", command="me"):
+    with write_lock(tmp_path, "stages", command="me"), ThreadPoolExecutor(1) as other:
         with write_lock(tmp_path, "stages", command="again", wait=0.0):
             pass
-        thread = threading.Thread(target=intrude)
-        thread.start()
-        thread.join()
-    assert [each.value["command"] for each in refused] == ["me"]
+        refused = other.submit(intrude).exception()
+    assert isinstance(refused, FolderInUseError)
+    assert refused.value["command"] == "me"
 
 
 @pytest.mark.parametrize("missing", ["file/inside", "nowhere/inside"])

@@ -1,9 +1,8 @@
 """Stages and the settings that decide them."""
 
 import re
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from functools import partialmethod
 from pathlib import Path
@@ -201,37 +200,13 @@ def test_a_field_does_not_depend_on_why_there_are_no_bodies_and_is_made_again_on
     assert failures == [None]
 
 
-@pytest.fixture(autouse=True)
-def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for no other writer."""
+def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(StageFolder, "lock", partialmethod(StageFolder.lock, wait=0.0))
-
-
-@contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Let another thread make stages in a folder."""
-    begun, done = threading.Event(), threading.Event()
-
-    def hold() -> None:
-        with StageFolder(folder).lock("avmsf fit mug"):
-            begun.set()
-            done.wait()
-
-    thread = threading.Thread(target=hold)
-    thread.start()
-    begun.wait()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-
-
-def test_a_fit_is_refused_before_it_reads_what_another_one_writes(tmp_path: Path) -> None:
-    capture = read_capture(fill_plate(tmp_path / "plate"))
-    with held(tmp_path / "cache"), pytest.raises(FolderInUseError) as refused:
-        fit_in_stages(capture, PipelineConfig("smooth", modes=4), StageFolder(tmp_path / "cache"))
-    assert refused.value.value["command"] == "avmsf fit mug"
+    capture, folder = read_capture(fill_plate(tmp_path / "plate")), StageFolder(tmp_path / "cache")
+    with folder.lock("avmsf fit mug"), ThreadPoolExecutor(1) as other:
+        refused = other.submit(fit_in_stages, capture, PipelineConfig("smooth", modes=4), folder).exception()
+    assert isinstance(refused, FolderInUseError)
+    assert refused.value["command"] == "avmsf fit mug"
     assert sorted(each.name for each in (tmp_path / "cache").iterdir()) == ["stages.lock"]
 
 
@@ -265,12 +240,6 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
     found, paper = FitOptions.parse(["mug", *words]).all_settings, PRESETS["paper"]
     silent = {name: getattr(paper.fit, name) for name in ("width", "hidden", "layers", "warmup_rate")}
     assert replace(found, fit=replace(found.fit, **silent)) == paper
-
-
-def test_a_configuration_is_told_from_another_by_any_of_its_settings() -> None:
-    # The record of an evaluation tells methods apart by it.
-    first, second = (LiftConfig(longest=9, weighting="plain", symmetry=False, angles=5, seed=seed) for seed in (0, 1))
-    assert repr(first) != repr(second)
 
 
 def test_settings_out_of_range_and_another_start_of_sounds_than_the_presets_are_refused() -> None:

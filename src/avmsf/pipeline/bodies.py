@@ -74,13 +74,8 @@ def candidate_bodies(
     except SimulationError as error:
         if wall is None or error.name != "surface":
             raise
-        reasons = "; ".join(error.value) if isinstance(error.value, list) else str(error)
-        wanted = f"a wall thickness in meters that an object of {float(extent.max()):.3g} m can have"
-        advice = "give it in meters, as 0.003 for 3 mm, or leave it out"
-        if not wall:
-            wanted, advice = "a closed mesh for 0, a solid body", "close the mesh, or give the wall thickness in meters"
-        got = f"{wall:g} m ({reasons})"
-        raise SimulationError.expected(f"{wanted}, as body.wall", wall, got=got, name="wall", advice=advice) from error
+        message = f"body.wall = {wall:g}, in meters (0: solid): {error}"
+        raise SimulationError(message, name="wall", value=wall) from error
     return bodies
 
 
