@@ -20,7 +20,7 @@ from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.symmetry.characters import groups_of
-from avmsf.symmetry.symmetries import MirrorSymmetry, Symmetries
+from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.made_fields import BANK, FIELDS, SIDES, SIZE, blows, draw, mixture, places, rewritten, sounding, struck
 from factories.raising import raises
 
@@ -36,8 +36,9 @@ SCALED = {
 def symmetric_and_visual() -> MixtureGains:
     """Return a model of few gains that say nothing, so that no family is left out."""
     (sites, values), origin = struck(5), torch.zeros(3, dtype=torch.float64)
-    planes = tuple(MirrorSymmetry(each, origin, 0.0) for each in torch.eye(3, dtype=torch.float64)[:2])
-    groups = groups_of(Symmetries((), planes, 0.01, 0.38, math.inf))
+    x, y, z = torch.eye(3, dtype=torch.float64)
+    planes, axis = tuple(MirrorSymmetry(each, origin, 0.0) for each in (x, y)), RotationalSymmetry(z, origin, None, 0.0)
+    groups = groups_of(Symmetries((axis,), planes, 0.01, 0.38, math.inf))
     points, noise = places(150, seed=0).float(), torch.view_as_complex(draw(*values.shape, 2, seed=5))
     looks = Visual(sites, SIZE, points, draw(150, 2, seed=7).float())
     return mixture(sites, noise, Symmetric(sites, SIZE, groups, directional=True), looks, directional=True)

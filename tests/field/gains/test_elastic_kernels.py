@@ -1,6 +1,7 @@
 """The elastic family on a plate whose mode shapes are products of cosines: prediction, frequency factors, densities."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import MATERIALS
 from avmsf.field.gains.elastic import (
     EQUAL_PRIOR,
@@ -23,7 +25,7 @@ from avmsf.field.gains.elastic import (
     Elastic,
     frequency_log_prior,
 )
-from avmsf.field.gains.fitting import WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
+from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import log_evidence
 from avmsf.field.gains.model import series_of
@@ -36,6 +38,13 @@ PROFILES = len(PERTURBATIONS) + len(WIDTHS)
 
 def family(count: int = 10) -> Elastic:
     return Elastic(impacts(count, seed=1), SIZE, plate())
+
+
+def weighed(gains: MeasuredGains, sites: Sites, modes: ElasticModes | None = None, units: Sequence[float] = (1.0,)):
+    """Return the family of the plate's modes, or of others, with the factors' probabilities by gains."""
+    body = Elastic(sites, SIZE, modes or plate(), unit_ratios=units)
+    weigh_factors([WeighedFamily.of(each, gains) for each in (*families(sites, elastic=False), body)], gains)
+    return body
 
 
 def test_kernels_are_the_written_ones():
@@ -80,24 +89,17 @@ def test_a_body_is_of_no_weight_for_what_it_does_not_have():
 @pytest.mark.parametrize("factor", [0.3, 0.75, 1.0, 1.2])
 def test_a_factor_on_all_frequencies_is_found(factor):
     sites = impacts(12, seed=1)
-    given = families(sites)
-    gains = measured(sites, factor=factor)
-    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
-    elastic = given[-1]
-    assert isinstance(elastic, Elastic)
+    elastic = weighed(measured(sites, factor=factor), sites)
     assert float(elastic.frequency_weights.sum()) == pytest.approx(1.0)
-    found = elastic.factor
     # The frequencies are exact, and the factors considered 1 % apart.
-    assert abs(math.log(found / factor)) <= 0.01
+    assert abs(math.log(elastic.factor / factor)) <= 0.01
 
 
 @pytest.mark.parametrize("factor", [0.067, 1.8])
 def test_no_factor_is_considered_that_no_material_has(factor):
     """Of the table, with 5 % for frequencies of real bodies and 20 % for the thickness: plastic to ceramic."""
     sites = impacts(12, seed=1)
-    given, gains = families(sites), measured(sites, factor=factor)
-    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
-    (body,) = (each for each in given if isinstance(each, Elastic))
+    body = weighed(measured(sites, factor=factor), sites)
     slowest, *_, fastest = sorted(math.sqrt(each.young / each.density / (7e10 / 2700)) for each in MATERIALS.values())
     assert slowest / 1.05 / 1.2 <= body.factor <= fastest * 1.05 * 1.2
 
@@ -107,9 +109,7 @@ def test_no_factor_is_considered_that_no_material_has(factor):
 def test_the_unit_is_inferred_where_none_is_stated(ratio, unit, factor):
     """A mesh in centimeters, read in meters, has frequencies a hundredth of the object's."""
     sites = impacts(12, seed=1)
-    body, gains = Elastic(sites, SIZE, plate(), unit_ratios=(1.0, 0.3048, 0.0254, 0.01)), measured(sites)
-    gains = replace(gains, frequency=factor / ratio * gains.frequency)
-    weigh_factors([WeighedFamily.of(each, gains) for each in (*families(sites, elastic=False), body)], gains)
+    body = weighed(measured(sites, factor=factor / ratio), sites, units=(1.0, 0.3048, 0.0254, 0.01))
     assert body.unit == unit
     assert body.material_factor == pytest.approx(factor, rel=0.011)
     assert body.factor == pytest.approx(factor / ratio, rel=0.011)
@@ -119,10 +119,8 @@ def test_gains_tell_the_factor_where_frequencies_do_not():
     """Of frequencies in geometric progression, each is another's as well; which shape a mode is says whose."""
     progression = 400.0 * 1.3 ** torch.arange(SHAPES, dtype=torch.float64)
     sites = impacts(12, seed=1)
-    body = Elastic(sites, SIZE, replace(plate(), frequency=progression))
     gains = replace(measured(sites), frequency=1.3 * progression[:5])
-    given = [*families(sites, elastic=False), body]
-    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
+    body = weighed(gains, sites, replace(plate(), frequency=progression))
     assert abs(math.log(body.factor / 1.3)) <= 0.05
 
 
@@ -131,11 +129,7 @@ def test_all_modes_together_tell_how_exact_the_frequencies_are(scatter, expected
     sites = impacts(8, seed=1)
     gains = measured(sites)
     offsets = scatter * torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0], dtype=torch.float64)
-    gains = replace(gains, frequency=gains.frequency * offsets.exp())
-    given = families(sites)
-    weigh_factors([WeighedFamily.of(each, gains) for each in given], gains)
-    elastic = given[-1]
-    assert isinstance(elastic, Elastic)
+    elastic = weighed(replace(gains, frequency=gains.frequency * offsets.exp()), sites)
     weights = elastic.frequency_weights.reshape(len(FACTORS), -1).sum(0)
     assert FREQUENCY_ERRORS[int(weights.argmax())] == expected
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
-from avmsf.field.gains.kernels import KernelFamily, Sites
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.outliers import (
@@ -63,15 +63,10 @@ def _gains(sites: Sites, *, noise: float = 0.02) -> MeasuredGains:
     )
 
 
-def _families(sites: Sites) -> list[KernelFamily]:
-    return [kind(sites, 1.4) for kind in POSITIONAL]
-
-
 def _fit(sites: Sites, measured: MeasuredGains) -> Fit:
     def fit(rows: Int[Tensor, " rows"], noise_shares: tuple[float, ...]) -> MixtureGains:
-        some = MeasuredGains(measured.values[rows], measured.variance, measured.frequency, measured.damping)
-        families, points = _families(sites.take(rows)), sites.points.float()
-        return fit_mixture(families, some, points, directional=True, noise_shares=noise_shares)
+        families, points = [kind(sites.take(rows), 1.4) for kind in POSITIONAL], sites.points.float()
+        return fit_mixture(families, measured.take(rows), points, directional=True, noise_shares=noise_shares)
 
     return fit
 
@@ -173,8 +168,7 @@ def test_noise_accuses_nobody() -> None:
         # Steps of a factor of ten between contacts: some fit badly wherever they are.
         size = 10.0 ** torch.randint(0, 2, (CONTACTS, 1), generator=generator)
         noise = torch.randn(CONTACTS, MODES, dtype=torch.complex128, generator=generator) * size
-        gains = MeasuredGains(noise, measured.variance, measured.frequency, measured.damping)
-        assert assess_contacts(_fit(sites, gains), None, sites, _places(), gains)[0] == []
+        assert _found(sites, replace(measured, values=noise)) == []
 
 
 def test_few_places_accuse_nobody() -> None:
@@ -201,8 +195,8 @@ def test_leaving_wrong_labels_out_predicts_the_others_better_and_right_ones_not(
         measured = _gains(true)
         fit = _fit(labels, measured)
         fewer, whole = fit(rows, NOISE_SHARES), fit(torch.arange(CONTACTS), NOISE_SHARES)
-        kept = replace(measured, values=measured.values[rows])
-        assert predicts_better(fewer.leave_one_out(), whole.leave_one_out()[rows], kept) == better
+        found = predicts_better(fewer.leave_one_out(), whole.leave_one_out()[rows], measured.take(rows))
+        assert found == better
 
 
 @pytest.mark.parametrize(("with_body", "without", "credible"), [(0.8, 0.4, True), (0.6, 0.1, False), (2.0, 1.9, False)])

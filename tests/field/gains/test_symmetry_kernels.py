@@ -33,7 +33,6 @@ CENTER = vector(0.1, -0.2, 0.3)
 X = mirror(vector(1, 0, 0), CENTER)
 Y = mirror(vector(0, 1, 0), CENTER)
 TURN = RotationalSymmetry(vector(0, 0, 1), CENTER, 4, 0.0)
-ROUND = RotationalSymmetry(vector(0, 0, 1), CENTER, None, 0.0)
 
 
 def impacts(count: int, seed: int = 0) -> Sites:
