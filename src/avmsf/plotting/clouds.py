@@ -16,8 +16,8 @@ from avmsf.plotting.style import FIRST, SECOND, scatter_surface, styled, titled_
 from avmsf.symmetry.symmetries import Symmetries
 
 Side: TypeAlias = tuple[float, float]
-"""Azimuth about the direction to the sky, and elevation above the horizon, of an eye far away; degrees."""
-UP = (0.0, 0.0, 1.0)
+"""Azimuth about z, which points to the sky, from x towards y, and elevation above the horizon, of an eye far away;
+degrees."""
 AROUND: tuple[Side, ...] = ((30.0, 25.0), (120.0, 25.0), (210.0, 25.0), (300.0, 25.0))
 """Four sides from a little above, from where an eye looks into what is open above and still sees the sides."""
 ALL_SIDES: tuple[Side, ...] = (
@@ -28,23 +28,11 @@ _ARROW = 28.0
 """Length of the arrows along the axes, points."""
 
 
-def view_from(side: Side, up: Sequence[float] = UP) -> Float[np.ndarray, "3 3"]:
-    """Return rows right, up and towards the eye of a side; azimuth 0 looks from the axis after the one that is up.
-
-    That is from x where z is up, from z where y is. Raises EvaluationError where `up` has no length.
-    """
-    azimuth, elevation = side
-    sky = np.asarray(up, dtype=float)
-    if not np.linalg.norm(sky) > 0.0:
-        raise EvaluationError.expected("a direction of three numbers", list(up), name="up")
-    sky = sky / np.linalg.norm(sky)
-    first = np.roll(np.eye(3)[np.argmax(np.abs(sky))], 1)
-    first = first - (first @ sky) * sky
-    first /= np.linalg.norm(first)
-    angle, height = math.radians(azimuth), math.radians(elevation)
-    level = math.cos(angle) * first + math.sin(angle) * np.cross(sky, first)
-    eye = math.cos(height) * level + math.sin(height) * sky
-    right = np.cross(sky, level)
+def view_from(side: Side) -> Float[np.ndarray, "3 3"]:
+    """Return rows right, up and towards the eye of a side."""
+    angle, height = map(math.radians, side)
+    right = np.array([-math.sin(angle), math.cos(angle), 0.0])
+    eye = np.array([math.cos(height) * math.cos(angle), math.cos(height) * math.sin(angle), math.sin(height)])
     return np.stack([right, np.cross(eye, right), eye])
 
 
@@ -93,12 +81,11 @@ def draw_cloud(
     title: str,
     symmetries: Symmetries | None = None,
     sides: Sequence[Side] = AROUND,
-    up: Sequence[float] = UP,
 ) -> Figure:
     """Draw a cloud from each side in a column, once for every named set of colors (0 to 1) in a row.
 
-    Symmetries get a row of their own: axes as lines with their order, mirror planes as outlines. `up` is the direction
-    that points to the sky. Raises EvaluationError where there is nothing to draw.
+    Symmetries get a row of their own: axes as lines with their order, mirror planes as outlines. Raises EvaluationError
+    where there is nothing to draw.
     """
     rows = dict(colors)
     if symmetries is not None:
@@ -114,7 +101,7 @@ def draw_cloud(
     radius = float(np.linalg.norm(places - middle, axis=1).max())
     for (name, shown), line in zip(rows.items(), grid, strict=True):
         for side, axes in zip(sides, line, strict=True):
-            view = view_from(side, up)
+            view = view_from(side)
             seen = (places - middle) @ view.T
             # What is farther is darker: flat dots alone show no depth.
             shade = 0.72 + 0.28 * (seen[:, 2:] / max(radius, 1e-30) + 1) / 2
