@@ -16,7 +16,7 @@ from torch import Tensor
 from avmsf._utils.files import write_whole
 from avmsf.errors import EvaluationError
 from avmsf.modal.modes import ModalBank
-from avmsf.plotting.clouds import in_front, name_axes, plane_of, view_from
+from avmsf.plotting.clouds import name_axes, plane_of, view_from
 from avmsf.plotting.style import DIVERGING, FIRST, SECOND, scatter_surface, styled, titled_figure
 
 _SIDE = (-60.0, 38.0)
@@ -76,23 +76,19 @@ def draw_gains(
     bank: ModalBank,
     *,
     title: str,
-    contacts: Float[Tensor, "contacts 3"] | None = None,
     most: int = 6,
 ) -> Figure:
     """Draw the signed gains of the modes of most energy on the object's points (object frame), each on its own scale.
 
-    `contacts` are marked by crosses where no point is in front of them. An object that is flat along an axis is drawn
-    in its plane, any other from one side.
+    An object that is flat along an axis is drawn in its plane, any other from one side.
     """
     frequency = bank.frequency
     strongest = torch.argsort(gains.square().mean(0) / bank.damping, descending=True)[:most]
     columns = min(3, len(strongest))
     rows = math.ceil(len(strongest) / columns)
     places, plane = points.double().numpy(), plane_of(points.double().numpy())
-    marks = np.zeros((0, 3)) if contacts is None else contacts.double().numpy()
     view = view_from(_SIDE) if plane is None else plane
-    seen, crosses = places @ view.T, marks @ view.T
-    crosses = crosses if plane is not None else crosses[in_front(seen, crosses)]
+    seen = places @ view.T
     wide, high, _ = np.ptp(seen, axis=0)
     height = float(np.clip(3.2 * high / wide + 0.8, 1.6, 5.0))
     figure = titled_figure(
@@ -103,7 +99,6 @@ def draw_gains(
         scale = {"cmap": DIVERGING, "vmin": -np.abs(values).max(), "vmax": np.abs(values).max()}
         axes = figure.add_subplot(rows, columns, number + 1)
         drawn = scatter_surface(axes, seen, values, inches=3.0, **scale)
-        axes.plot(crosses[:, 0], crosses[:, 1], "kx", markersize=5)
         if plane is None:
             name_axes(axes, view)
         else:
