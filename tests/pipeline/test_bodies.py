@@ -12,6 +12,8 @@ from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FitError, SceneError, SimulationError
 from avmsf.features.feature_field import FeatureField
+from avmsf.fem import body_meshes
+from avmsf.fem.body_meshes import shape_solid
 from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
 from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
@@ -306,6 +308,13 @@ def test_walls_that_cannot_be_had_are_left_out() -> None:
     found = CandidateBodies(Cup(most=0.01, thickness_range=(0.009, 0.018)), count=4, dofs=2000)
     assert [body.thickness for body in found.bodies] == [pytest.approx(0.009)]
     assert found.with_thicknesses(found.bodies[0], [0.011]) == [None]
+
+
+def test_a_wall_thinner_than_tetrahedra_follow_is_refused_before_they_are_made(monkeypatch) -> None:
+    monkeypatch.setattr(body_meshes, "fill", None)
+    with pytest.raises(SimulationError) as error:
+        shape_solid(Cup(), 0.001, 4000, log=lambda words: None)
+    assert (error.value.name, error.value.value) == ("detail", 0.001)
 
 
 @pytest.mark.slow

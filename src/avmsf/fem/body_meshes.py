@@ -19,6 +19,7 @@ from avmsf.fem.elements import SecondOrder
 from avmsf.fem.meshing import CheckedSurface, checked, simplified
 from avmsf.fem.remeshing import remeshed, surface_of
 from avmsf.fem.solid import Solid
+from avmsf.fem.tetrahedra import TOLERANCES as FILLING
 from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import shell, wall_of
 from avmsf.mesh.surface import Surface
@@ -106,6 +107,11 @@ def filled_solid(surface: CheckedSurface, dofs: int, *, wall: float | None = Non
     first = _filling_detail(surface, dofs)
 
     def filled(detail: float) -> Solid:
+        least = FILLING.envelope * detail * surface.mesh.scale
+        if wall is not None and wall < least:
+            # Nothing but crumbs would be left, after some seconds, of sides within reach of each other.
+            advice = "allow more degrees of freedom (--set body.dofs=N)"
+            raise SimulationError.expected(f"a wall of at least {least:.2g} m", wall, name="detail", advice=advice)
         # Quadrics keep the volume. Edges taken out one by one made the wall of a mug 5 % thinner.
         count = round(_TRIANGLES_PER_DOF * dofs * (first / detail) ** 2)
         mesh = simplified(surface.mesh, count, most=TOLERANCES.max_knotted_ratio * count)
