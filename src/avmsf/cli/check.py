@@ -52,9 +52,7 @@ class Options(Common):
         """Whether the folder is a dataset: it holds no recordings itself."""
         return not (self.capture / TABLE).is_file() and not any(self.capture.glob("*.wav"))
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         if self.is_dataset:
             detect_dataset(self.capture)
             if self.write_settings:

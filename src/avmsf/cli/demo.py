@@ -41,9 +41,7 @@ class Options(Common):
     """Folder for all results, new, empty, or of an earlier or interrupted demo, which goes on from where it was."""
     resumes = True
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for a folder that cannot be written or holds files that are not of a demo."""
-        super().check_inputs()
+    def _check(self) -> None:
         if self.folder.is_dir() and any(self.folder.iterdir()) and not (self.folder / BEGUN).is_dir():
             wanted, advice = "a new or empty folder, or an earlier demo's", "choose another"
             raise OutputError.expected(wanted, "one with files", file=self.folder, advice=advice)

@@ -95,9 +95,7 @@ class Options(Configured):
         """Return the path of a part of an unfinished edit: next to its later file."""
         return self.output.with_name(f"{self.output.name}.{ending}")
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for an edit that cannot be done or written, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         settings, usual, guides = self.all_settings, self.usual, self.guides
         if len(guides) > 1:
             wanted, advice = "one of --prompt, --like and --like-material", "use one after the other"

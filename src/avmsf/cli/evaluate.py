@@ -98,9 +98,7 @@ class Options(Configured):
                 print(textwrap.fill(text, 80, break_on_hyphens=False), end="\n\n")
         return super().parse(words)
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         protocol_named(self.protocol)
         for name in words_of(self.methods):
             expect_suited(name, self.protocol)

@@ -129,9 +129,7 @@ class Options(Many):
         """Whether the contacts are given, and used by the format."""
         return "position" in _USED[self.to] and bool(self.position or self.contact_table)
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         if len(self.inputs) > 1:
             return
         given = sum((bool(self.position), self.contact_table is not None, self.contacts is not None))

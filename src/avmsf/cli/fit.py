@@ -149,9 +149,7 @@ class Options(Configured, Many):
         own = self.capture / CACHE if self.capture.is_dir() else self.capture.parent / CACHE / self.capture.stem
         return StageFolder(self.cache or own)
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         if one := len(self.inputs) == 1:
             self._check_capture()
         config = self.all_settings

@@ -50,9 +50,7 @@ class Options(Common):
     surface.png, with cross-sections, if they have a body; spectrograms.png with --capture. Gaussians: cloud.png.
     Features: features.png. Mesh: surface.png."""
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         if self.capture is not None:
             expect_capture(self.capture)
 

@@ -60,9 +60,7 @@ class Options(Common):
     output: PictureFolder = None
     """Folder for a heat map of every impact, NAME.png: most of many recordings' time."""
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         if not self.recordings:
             raise OutputError.expected("one or more after the field, such as HIT.wav", 0, name="recordings")
         if self.true_contact is not None and self.true_contact_table is not None:

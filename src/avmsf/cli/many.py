@@ -14,14 +14,14 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from avmsf._utils.caching import source_digest
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import counted, csv_text
 from avmsf.cli.options import Common, option_of
 from avmsf.cli.output import display, next_step, note, print_json, show, show_plainly, table
-from avmsf.cli.paths import Existing, InputError, New, OutputError, arg, path_mark
+from avmsf.cli.paths import Existing, InputError, New, OutputError, arg
 from avmsf.errors import NO_MEMORY, AvmsfError, lacks_memory
 
 RESULTS = "results.csv"
@@ -39,14 +39,10 @@ class Many(Common, ABC):
     """Of several: a ray cluster with the same paths."""
     inputs: tuple[Path, ...]
     """What has an output each."""
+    output: Path | None
+    """The output of a single input, or the folder of those of several."""
     alone: ClassVar[tuple[str, ...]]
     """Options that only one input can have."""
-
-    @property
-    def written(self) -> Path | None:
-        """The output of a single input, or the folder of those of several."""
-        output: Path | None = vars(self)["output"]
-        return output
 
     @abstractmethod
     def of(self: M, given: Path, output: Path) -> M:
@@ -58,18 +54,16 @@ class Many(Common, ABC):
 
     def read(self) -> Iterator[Path]:
         """Return the files and folders on whose content the output depends."""
-        hints = get_type_hints(type(self), include_extras=True)
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if value and isinstance(path_mark(hints[each.name]), Existing):
-                yield from value if isinstance(value, tuple) else (value,)
+        for _, mark, paths in self.marked_paths():
+            if isinstance(mark, Existing):
+                yield from paths
 
-    def check_inputs(self) -> None:
+    def check_paths(self) -> None:
         """Raise as `Common`, of several inputs for what they share: what is wrong with one of them costs it alone."""
         if not self.inputs:
             raise InputError.expected("1 or more", 0, got="none", name="inputs")
         several = len(self.inputs) > 1
-        super(Many, replace(self, inputs=()) if several else self).check_inputs()
+        super(Many, replace(self, inputs=()) if several else self).check_paths()
         if several:
             self.tasks()
 
@@ -79,7 +73,7 @@ class Many(Common, ABC):
         Raises `OutputError` without a folder for outputs, and `InputError` for two inputs of one name, and for an
         option that only one input can have.
         """
-        folder = self.written
+        folder = self.output
         if folder is None:
             raise OutputError.expected("a folder for what is made of each input", name="--output")
         New().check(folder)
@@ -101,7 +95,7 @@ def run_many(verb: str, options: Many, *, raising: type[AvmsfError]) -> int:
     from avmsf._utils.parallel import run_tasks, workers_at
     from avmsf.pipeline.stages import StageFolder
 
-    folder, tasks = options.written, options.tasks()
+    folder, tasks = options.output, options.tasks()
     assert folder is not None
     shown = display.objects()
     found: dict[str, dict[str, Any]] = {}
@@ -142,18 +136,16 @@ def _make(verb: str, options: Many) -> dict[str, Any]:
     """Return what a verb prints for one input, from the record of its output where that was made of the same."""
     from avmsf.pipeline.stages import Stage, StageFolder, digest_of
 
-    Common.check_inputs(options)
-    hints = get_type_hints(type(options), include_extras=True)
-    ignored = {"output", *(each.name for each in fields(Many))}
-    names = [each.name for each in fields(options) if each.name not in ignored and path_mark(hints[each.name]) is None]
-    given = {name: getattr(options, name) for name in names}
+    options.check_paths()
+    ignored = {each.name for each in fields(Many)} | {name for name, *_ in options.marked_paths()}
+    given = {each.name: getattr(options, each.name) for each in fields(options) if each.name not in ignored}
 
     def recipe() -> dict[str, Any]:
         read = [digest_of(path, hidden=False) for path in options.read()]
         plain = json.loads(json.dumps(given, default=str))
         return {"source": source_digest(f"{__package__}.{verb}"), "options": plain, "read": read}
 
-    output = options.written
+    output = options.output
     assert output is not None
     stage = Stage(output.name, lambda path: _printed(verb, options), recipe=recipe)
     kept = StageFolder(output.parent, "--output").keep(stage)

@@ -38,9 +38,7 @@ class Options(Common):
     plots: PlotsFolder = None
     """Draw the modes to modes.png in this folder."""
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         _ = self.pipeline
         expect_capture(self.capture)
 

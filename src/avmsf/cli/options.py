@@ -3,7 +3,7 @@
 import io
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stderr
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -14,7 +14,7 @@ import tyro
 from avmsf.capture.issues import Issues
 from avmsf.capture.settings import settings_of
 from avmsf.capture.table import present_impacts, read_impacts
-from avmsf.cli.paths import InputError, arg, path_mark
+from avmsf.cli.paths import Existing, InputError, New, arg, path_mark
 from avmsf.cli.settings import Assignments, SettingsTable, as_toml, nested_settings
 
 Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
@@ -54,13 +54,26 @@ class Common:
         return parse_options(cls, cls.__module__.rpartition(".")[2], words)
 
     def check_inputs(self) -> None:
-        """Raise for the first path that cannot be used, see `paths`, and for what a command's own checks find."""
+        """Raise the package's errors for paths and other options that cannot be used, before torch is loaded."""
+        self.check_paths()
+        self._check()
+
+    def check_paths(self) -> None:
+        """Raise for the first path that cannot be used."""
+        for _, mark, paths in self.marked_paths():
+            for path in paths:
+                mark.check(path)
+
+    def marked_paths(self) -> Iterator[tuple[str, Existing | New, tuple[Path, ...]]]:
+        """Yield each option whose values are paths: its name, what they have to be, and the paths that are given."""
         hints = get_type_hints(type(self), include_extras=True)
         for each in fields(self):
             mark, value = path_mark(hints[each.name]), getattr(self, each.name)
-            if mark is not None and value is not None:
-                for path in value if isinstance(value, tuple) else (value,):
-                    mark.check(path)
+            if mark is not None:
+                yield each.name, mark, value if isinstance(value, tuple) else () if value is None else (value,)
+
+    def _check(self) -> None:
+        """Raise for other options that cannot be used."""
 
 
 def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | None = None) -> T:

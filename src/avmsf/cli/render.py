@@ -60,9 +60,7 @@ class Options(Common):
     coding: Coding = "float32"
     """Format of the samples; int16 rejects what would clip."""
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         if bool(self.position) == (self.contact_table is not None):
             wanted = "contacts by it, X Y Z, once or more, or by --contact-table TABLE.csv"
             raise OutputError.expected(wanted, len(self.position), name="--position")

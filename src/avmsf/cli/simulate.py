@@ -71,9 +71,7 @@ class Options(Configured):
             return self.applied(ObjectRecipe())
         return self.applied(EXAMPLE if self.what == "example" else named_recipe(self.what))
 
-    def check_inputs(self) -> None:
-        """Raise `InputError` for a mesh that does not exist, `SimulationError` for options that do not fit."""
-        super().check_inputs()
+    def _check(self) -> None:
         if self.output is None and not self.list:
             raise SimulationError.expected("a folder", name="output", advice="--list names the objects")
         _ = self.all_settings

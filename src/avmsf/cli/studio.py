@@ -47,9 +47,7 @@ class Options(Common):
     preset: Preset = "default"
     """Settings of a reconstruction; paper: as published, takes hours."""
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         expect_modes(self.modes)
         if self.target is None:
             raise StudioError.expected(_SHOWN, name="target")

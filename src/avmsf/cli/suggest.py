@@ -41,9 +41,7 @@ class Options(Common):
     output: PictureFolder = None
     """Folder for suggested.csv, the list of contacts, and suggested.png, the contacts on the object."""
 
-    def check_inputs(self) -> None:
-        """Raise the package's errors for options that cannot be used, before anything is loaded."""
-        super().check_inputs()
+    def _check(self) -> None:
         if self.unseen and self.candidates is not None:
             raise FitError.expected("no --candidates with it", got="both", name="--unseen", advice="leave one out")
         if self.candidates is not None:
