@@ -281,7 +281,7 @@ def test_of_many_a_file_that_the_command_did_not_make_is_not_replaced(captures, 
     record = made.with_name(f"{made.name}.stage.json")
     for _ in range(2):
         tasks = FitOptions.parse(words).tasks()
-        assert [tasks[each.name].overwrite for each in captures[:2]] == [record.exists(), True]
+        assert [tasks[each.name].overwrite for each in captures[:2]] == [record.exists(), False]
         record.touch()
 
 

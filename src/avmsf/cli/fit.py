@@ -14,16 +14,7 @@ from avmsf._utils.text import format_number, listed
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.cli.many import Many, run_many
-from avmsf.cli.options import (
-    Configured,
-    Device,
-    Flag,
-    Int,
-    Name,
-    Number,
-    expect_capture,
-    option_of,
-)
+from avmsf.cli.options import Configured, Device, Flag, Int, Name, Number, expect_capture, option_of
 from avmsf.cli.output import display, doing, next_command, next_step, print_json, print_result, show
 from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.cli.settings import with_settings
@@ -35,7 +26,6 @@ from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset
 if TYPE_CHECKING:
     from avmsf.evaluation.scores import Scores
     from avmsf.field.sound_field import SoundField
-    from avmsf.pipeline.fit import StagedFit
     from avmsf.pipeline.stages import StageFolder
 
 _STAGES = {"field.safetensors": "fit", "points.safetensors": "features"}
@@ -118,8 +108,7 @@ class Options(Configured, Many):
         path = output.with_name(f"{output.name}{_SUFFIXES[self.until][0]}")
         # What has a record is this command's own, and may be made again; a field says itself whose it is.
         recorded = self.until is not None and path.with_name(f"{path.name}.stage.json").exists()
-        own = not path.exists() or recorded
-        overwrite = self.overwrite or own
+        overwrite = self.overwrite or recorded
         return replace(self, inputs=(given,), output=path, cache=cache, plots=plots, overwrite=overwrite)
 
     def cells(self, values: Mapping[str, Any]) -> dict[str, str]:
@@ -135,11 +124,9 @@ class Options(Configured, Many):
     def all_settings(self) -> PipelineConfig:
         """The preset with the settings that are given."""
         seeds = ("fit.seed", "scene.views.seed", "scene.splat.seed", "scene.lift.seed")
-        options = {name: getattr(self, name) for name in ("gain_model", "device")}
+        options = {"gain_model": self.gain_model, "device": self.device, **dict.fromkeys(seeds, self.seed)}
         options["allow_missing_features"] = self.allow_missing_features or None
-        return with_settings(
-            PRESETS[self.preset], self.set, self.config, {**options, **dict.fromkeys(seeds, self.seed)}
-        )
+        return with_settings(PRESETS[self.preset], self.set, self.config, options)
 
     @property
     def stages(self) -> "StageFolder":
@@ -155,14 +142,10 @@ class Options(Configured, Many):
         config = self.all_settings
         if one and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
-            source = self.capture
+            source, guess = self.capture, self.material is not None
             own = settings_of(source).name or (source.resolve().name if source.is_dir() else source.resolve().stem)
-            expect_free(
-                self.output,
-                overwrite=self.overwrite,
-                capture=own if self.until is None else None,
-                guess=self.material is not None,
-            )
+            capture = own if self.until is None else None
+            expect_free(self.output, overwrite=self.overwrite, capture=capture, guess=guess)
         if self.material is not None:
             material_named(self.material, option="--material")
         self._check_unused(config)
@@ -202,49 +185,43 @@ def run(options: Options) -> int:
     from avmsf._utils.device import TRAINABLE, usable_device
 
     usable_device(options.all_settings.device, raising=FitError, kinds=TRAINABLE)
-    settings = settings_of(options.capture).starting(options.all_settings.time_zero)
+    settings, stages = settings_of(options.capture).starting(options.all_settings.time_zero), options.stages
     if options.until is not None:
-        _make_stage(options, settings)
+        _make_stage(options, settings, stages)
     elif options.material is not None:
-        _guess(options, options.material, settings)
+        _guess(options, options.material, settings, stages)
     else:
-        _fit(options, settings)
+        _fit(options, settings, stages)
     return 0
 
 
-def _fit(options: Options, settings: CaptureSettings) -> None:
-    from avmsf._utils.files import copy_whole
+def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> None:
     from avmsf.capture import read_capture
     from avmsf.cli.info import draw_field
     from avmsf.cli.report import compare, features_lines, field_lines, parts_words, score_table
     from avmsf.evaluation.splits import split
     from avmsf.features.store import load_features, read_report
-    from avmsf.field.store import load
     from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.pipeline.fit import fit_in_stages
     from avmsf.pipeline.visual_checks import expect_shape
 
-    capture = read_capture(options.capture, settings)
+    capture, config, features, described = read_capture(options.capture, settings), options.all_settings, None, None
     size = options.train_count if options.train_fraction is None else options.train_fraction
     train, test = (capture.impacts, None) if size is None else split(capture.impacts, size)
     if options.without_shape:
         capture = replace(capture, surface=None, folder=None)
     elif options.features is None:
         expect_shape(capture)
-    features, described = None, None
     if options.features is not None:
         features, described = load_features(options.features), read_report(options.features)
         _note_other_settings(options, described)
-    stages, config = options.stages, options.all_settings
     with stages.lock("avmsf fit"):
         made = fit_in_stages(
             capture, config, stages, train=train, features=features, features_report=described,
             listener=display.listener,
         )  # fmt: skip
-        fitted = load(made.field)
-        if options.output is not None:
-            copy_whole(made.field, options.output)
-    path, aligned = options.output or made.field, AlignmentReport.of(made.modes, train)
+        fitted, path = _written(made.field, options.output)
+    aligned = AlignmentReport.of(made.modes, train)
     lines = [] if aligned is None else aligned.sentences() if display.verbose else aligned.warnings()
     lines += features_lines(made.report) if made.report and display.verbose else []
     scores: dict[str, Scores] = {}
@@ -260,15 +237,29 @@ def _fit(options: Options, settings: CaptureSettings) -> None:
     show("\n".join(lines))
     if options.plots is not None:
         draw_field(fitted, options.plots, recorded=None if test is None else made.modes.aligned(test))
-    values = {
-        "field": str(path),
-        "preset": options.preset,
-        "config": asdict(config.fit),
-        "trained_on": list(train.names),
-        "tested_on": [] if test is None else list(test.names),
-        "scores": {name: each.mean() for name, each in scores.items()},
-    }
-    print_json({**_values(fitted, made), **values})
+    print_json(
+        {
+            "field": str(path),
+            "capture": fitted.origin.capture,
+            "preset": options.preset,
+            "config": asdict(config.fit),
+            "modes": int(fitted.is_mode.sum()),
+            "supporting_poles": int((~fitted.is_mode).sum()),
+            "sample_rate": fitted.sample_rate,
+            "trained_on": list(train.names),
+            "tested_on": [] if test is None else list(test.names),
+            "scores": {name: each.mean() for name, each in scores.items()},
+            "quality": None if fitted.quality is None else fitted.quality.level,
+            "body": None if fitted.body is None else fitted.body.record(),
+            "report": fitted.origin.report,
+            "surface": None if made.surface is None else str(made.surface),
+            "features_report": made.report,
+            "stages": [
+                {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
+                for name, each in made.stages.items()
+            ],
+        }
+    )
     if test is None:
         next_command("avmsf render", path, _RENDER)
     else:
@@ -284,39 +275,27 @@ def _note_other_settings(options: Options, described: Mapping[str, Any]) -> None
         display.listener.note(f"features of other settings than the preset {options.preset}: {', '.join(other)}")
 
 
-def _values(fitted: "SoundField", made: "StagedFit") -> dict[str, Any]:
-    """Return what a field is and which stages made it, as plain values."""
-    return {
-        "capture": fitted.origin.capture,
-        "modes": int(fitted.is_mode.sum()),
-        "supporting_poles": int((~fitted.is_mode).sum()),
-        "report": fitted.origin.report,
-        "body": None if fitted.body is None else fitted.body.record(),
-        "quality": None if fitted.quality is None else fitted.quality.level,
-        "surface": None if made.surface is None else str(made.surface),
-        "features_report": made.report,
-        "stages": [
-            {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
-            for name, each in made.stages.items()
-        ],
-        "sample_rate": fitted.sample_rate,
-    }
-
-
-def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
-    """Compute a field without recordings, and print a summary."""
+def _written(made: Path, output: Path | None) -> "tuple[SoundField, Path]":
+    """Return a field in the cache, and where it is for the user: in a copy, if one is asked for."""
     from avmsf._utils.files import copy_whole
+    from avmsf.field.store import load
+
+    field = load(made)
+    if output is not None:
+        copy_whole(made, output)
+    return field, output or made
+
+
+def _guess(options: Options, material: str, settings: CaptureSettings, stages: "StageFolder") -> None:
+    """Compute a field without recordings, and print a summary."""
     from avmsf.cli.info import draw_field
     from avmsf.cli.report import quality_words
-    from avmsf.field.store import load
     from avmsf.pipeline.fit import guess_in_stages
 
-    stages, config = options.stages, options.all_settings
+    config, listener = options.all_settings, display.listener
     with stages.lock("avmsf fit"):
-        made = guess_in_stages(options.capture, material, config, stages, settings=settings, listener=display.listener)
-        guessed, path = load(made), options.output or made
-        if options.output is not None:
-            copy_whole(made, options.output)
+        made = guess_in_stages(options.capture, material, config, stages, settings=settings, listener=listener)
+        guessed, path = _written(made, options.output)
     values = {"field": str(path), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
     values |= {"sample_rate": guessed.sample_rate, "trained_on": [], "report": guessed.origin.report}
     print_result("\n".join([*quality_words(guessed, path), f"wrote {path}"]), values)
@@ -325,7 +304,7 @@ def _guess(options: Options, material: str, settings: CaptureSettings) -> None:
     next_command("avmsf render", path, _RENDER)
 
 
-def _make_stage(options: Options, settings: CaptureSettings) -> None:
+def _make_stage(options: Options, settings: CaptureSettings, stages: "StageFolder") -> None:
     """Make Gaussians, features or a surface of the folder's views, and print what they are."""
     from avmsf._utils.files import copy_whole, write_whole
     from avmsf.capture.checks import check_one_unit, find_surface
@@ -336,7 +315,7 @@ def _make_stage(options: Options, settings: CaptureSettings) -> None:
     from avmsf.pipeline.scene import CLOUD, SceneStages
     from avmsf.pipeline.shape import keep_surface, object_shape
 
-    folder, stages, words = options.capture, options.stages, "-o field.safetensors"
+    folder, words = options.capture, "-o field.safetensors"
     check_one_unit(folder, settings)
     scene = SceneStages(
         folder, stages, options.all_settings.scene, settings=settings, listener=display.listener, device=options.device

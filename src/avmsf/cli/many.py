@@ -137,7 +137,7 @@ def _make(verb: str, options: Many) -> dict[str, Any]:
     from avmsf.pipeline.stages import Stage, StageFolder, digest_of
 
     options.check_paths()
-    ignored = {each.name for each in fields(Many)} | {name for name, *_ in options.marked_paths()}
+    ignored = {"overwrite", *(each.name for each in fields(Many))} | {name for name, *_ in options.marked_paths()}
     given = {each.name: getattr(options, each.name) for each in fields(options) if each.name not in ignored}
 
     def recipe() -> dict[str, Any]:
