@@ -1,5 +1,6 @@
 """`avmsf check`: what each recording of a capture is worth, what a dataset holds, and what is wrong."""
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,13 +17,22 @@ from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import CaptureError, ExtractionError
 
 if TYPE_CHECKING:
-    from avmsf.capture import CaptureReport, Impacts
+    from avmsf.capture import CaptureReport
     from avmsf.modal.extraction.alignment_report import AlignmentReport
-    from avmsf.modal.extraction.extract import Extraction
 
 UNREADABLE = 2
 _STRONGEST = 32
 """Modes by which recordings of inverted polarity are found."""
+_MEASURED = {
+    "length (s)": ("seconds", 2),
+    "rate (Hz)": ("sample_rate", 0),
+    "peak (dBFS)": ("peak_db", 1),
+    "noise (dB)": ("noise_db", 1),
+    "clipped": ("clipped", 0),
+    "onset (s)": ("onset_seconds", 4),
+    "second impact (s)": ("double_hit_seconds", 3),
+}
+"""Columns of the table, what they are of a recording's report, and decimals."""
 
 
 @dataclass(frozen=True)
@@ -70,27 +80,30 @@ def run(options: Options) -> int:
     from avmsf.capture.issues import shared_problems
     from avmsf.capture.proposals import propose_settings, write_settings
     from avmsf.modal.extraction.alignment_report import AlignmentReport
+    from avmsf.modal.extraction.extract import extract_modes
+    from avmsf.modal.extraction.finders import HighResolution
     from avmsf.pipeline.visual_checks import inputs, misplaced
 
     if options.is_dataset:
         return _check_dataset(options)
     doing(f"reading {options.capture}")
-    visual = inputs(options.capture)
-    outside = [] if visual is None else misplaced(options.capture, visual)
     proposals = propose_settings(options.capture)
     if proposals and options.write_settings:
         path = write_settings(options.capture, proposals)
         show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
+    visual = inputs(options.capture)
     report, impacts = check_and_read(options.capture)
     doing("finding the modes that align the recordings")
-    modes = None if impacts is None else _modes(impacts)
+    modes = None
+    with suppress(ExtractionError):
+        modes = None if impacts is None else extract_modes(impacts, HighResolution(modes=_STRONGEST))
     aligned = None if modes is None or impacts is None else AlignmentReport.of(modes, impacts)
     # The folder's first, then the recordings', common ones once.
     problems = [*report.problems, *shared_problems(report.recordings)]
-    problems += [] if visual is None else [*visual.problems, *visual.unused]
-    problems += map(str, outside)
     lines = [_table(report, str(options.capture), aligned)] if report.recordings else []
-    lines += [] if visual is None else [visual.sentence]
+    if visual is not None:
+        problems += [*visual.problems, *visual.unused, *map(str, misplaced(options.capture, visual))]
+        lines.append(visual.sentence)
     lines += problems
     if not options.write_settings:
         lines += [f"proposed: {each.line} (--write-settings writes it). {each.reason}" for each in proposals]
@@ -121,38 +134,16 @@ def run(options: Options) -> int:
     return 0
 
 
-def _modes(impacts: "Impacts") -> "Extraction | None":
-    """Return the strongest modes; None where there is no mode."""
-    from avmsf.modal.extraction.extract import extract_modes
-    from avmsf.modal.extraction.finders import HighResolution
-
-    try:
-        return extract_modes(impacts, HighResolution(modes=_STRONGEST))
-    except ExtractionError:
-        return None
-
-
 def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None") -> str:
-    delays, left, doubtful = dict[str, float](), list[str](), set[str]()
-    if aligned is not None:
-        delays, left, doubtful = aligned.delays, aligned.not_aligned, aligned.doubtful
-    columns = ["recording", "state", "length (s)", "rate (Hz)", "peak (dBFS)", "noise (dB)"]
-    columns += ["clipped", "onset (s)", "second impact (s)", *(["delay (samples)"] if delays else [])]
-    rows = [
-        (
-            row.file,
-            "error" if not row.readable else "warning" if row.problems or row.file in doubtful else "good",
-            decimals(row.seconds, 2),
-            decimals(row.sample_rate, 0),
-            decimals(row.peak_db, 1),
-            decimals(row.noise_db, 1),
-            decimals(row.clipped, 0),
-            decimals(row.onset_seconds, 4),
-            decimals(row.double_hit_seconds, 3),
-            *([decimals(None if row.file in left else delays.get(row.file), 2)] if delays else []),
-        )
-        for row in report.recordings
-    ]
+    """Return a row for each recording: its state, what was measured, and by how many samples it was moved."""
+    delays = {} if aligned is None else {**aligned.delays, **dict.fromkeys(aligned.not_aligned)}
+    doubtful = set() if aligned is None else aligned.doubtful
+    rows = []
+    for row in report.recordings:
+        state = "error" if not row.readable else "warning" if row.problems or row.file in doubtful else "good"
+        measured = [decimals(getattr(row, name), places) for name, places in _MEASURED.values()]
+        rows.append([row.file, state, *measured, *([decimals(delays.get(row.file), 2)] if delays else [])])
+    columns = ["recording", "state", *_MEASURED, *(["delay (samples)"] if delays else [])]
     return table(title, columns, rows, words=2)
 
 

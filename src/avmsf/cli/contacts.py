@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,26 +46,50 @@ class Contacts:
         return self.option if len(self.names) == 1 else f"{self.option} {row + 1} of {len(self.names)}"
 
 
-def given_contacts(
-    places: _Vectors, table: Path | None, *, unit: Unit, directions: _Vectors = (), option: str = "--position"
+def contacts_on(
+    field: SoundField,
+    places: _Vectors,
+    table: Path | None = None,
+    *,
+    unit: Unit,
+    directions: _Vectors = (),
+    option: str = "--position",
+    recordings: bool = False,
+    advice: str = ", see --unit",
 ) -> Contacts:
-    """Return the contacts that an option gives, numbered, or those of a table. Raises `ArrayError` for no numbers."""
+    """Return the contacts that an option gives, numbered, or those of a table, see `_read_contacts`.
+
+    Notes which are off the surface of a field's object, see `off_surface`. Raises `ArrayError` for no numbers, and
+    `OutputError` for a contact that is not near the object, see `expect_near`, whose message `advice` ends.
+    """
     if table is not None:
-        return read_contacts(table, unit=unit)
-    return Contacts(
-        as_vectors(torch.tensor(places, dtype=torch.float64).reshape(-1, 3), option) * METRES[unit],
-        tuple(f"{number:03d}.wav" for number in range(1, len(places) + 1)),
-        torch.tensor(directions, dtype=torch.float64) if directions else None,
-        option,
-    )
+        contacts = _read_contacts(table, unit=unit, recordings=recordings)
+    else:
+        contacts = Contacts(
+            as_vectors(torch.tensor(places, dtype=torch.float64).reshape(-1, 3), option) * METRES[unit],
+            tuple(f"{number:03d}.wav" for number in range(1, len(places) + 1)),
+            torch.tensor(directions, dtype=torch.float64) if directions else None,
+            option,
+        )
+    try:
+        expect_near(contacts.places, field.gain_field.points, contacts.label)
+    except PositionError as error:
+        row = error.row or 0
+        where: dict[str, Any] = {"name": option, "row": row}
+        if table is not None:
+            where = {"file": table, "name": contacts.names[row], "row": contacts.lines[row]}
+        raise OutputError(f"{error}{advice}", **{**error.attributes, **where}) from error
+    for row, distance in off_surface(contacts.places, field.gain_field):
+        note(f"{contacts.label(row)} is {1e3 * distance:.3g} mm off the object's surface")
+    return contacts
 
 
-def read_contacts(path: Path, *, unit: Unit, recordings: bool = False) -> Contacts:
+def _read_contacts(path: Path, *, unit: Unit, recordings: bool) -> Contacts:
     """Read a table with the columns x, y, z and perhaps file, nx, ny and nz, such as a capture's impacts.csv.
 
-    Sounds are named by the column `file`, else by number. By default they are files to write in an output folder, and
-    columns that are not used are noted. With `recordings` they are files to read, in any folder, and every row must
-    name one. Raises `CaptureError` with the line at fault as `row`, counted from 1 with the header, as in all tables.
+    Sounds are named by the column `file`, else by number. They are files to write in an output folder, and columns that
+    are not used are noted; with `recordings` files to read, in any folder, and every row must name one. Raises
+    `CaptureError` with the line at fault as `row`, counted from 1 with the header, as in all tables.
     """
     file, *axes = REQUIRED
     required = (file, *axes) if recordings else axes
@@ -100,25 +125,6 @@ def rows_of(contacts: Contacts, recording: Path) -> list[int]:
     rows = [row for row, name in enumerate(contacts.names) if PurePosixPath(name).name == sound.name]
     ends = [row for row in rows if str(sound).endswith("/" + contacts.names[row].lstrip("/"))]
     return [max(ends, key=lambda row: len(contacts.names[row]))] if ends else rows
-
-
-def check_given_contacts(contacts: Contacts, field: SoundField, *, advice: str = ", see --unit") -> None:
-    """Raise `OutputError` for a contact that is not on the object, see `expect_near`; `advice` ends its message.
-
-    Note how far the contacts are that are near it and off its surface, see `off_surface`.
-    """
-    try:
-        expect_near(contacts.places, field.gain_field.points, contacts.label)
-    except PositionError as error:
-        row = error.row or 0
-        where = (
-            {"name": contacts.option, "row": row}
-            if contacts.table is None
-            else {"file": contacts.table, "name": contacts.names[row], "row": contacts.lines[row]}
-        )
-        raise OutputError(f"{error}{advice}", **{**error.attributes, **where}) from error
-    for row, distance in off_surface(contacts.places, field.gain_field):
-        note(f"{contacts.label(row)} is {1e3 * distance:.3g} mm off the object's surface")
 
 
 def _wav_name(row: Row, *, anywhere: bool) -> str:

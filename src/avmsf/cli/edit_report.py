@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
-from avmsf.cli.contacts import check_given_contacts, given_contacts
+from avmsf.cli.contacts import contacts_on
 from avmsf.cli.output import decimals, say, table
 from avmsf.cli.render import peak_factor, write_sound
 from avmsf.cli.report import MAX_LISTED_MODES
@@ -83,9 +83,7 @@ def notes_on(edits: list[dict[str, Any]], old: SoundField, new: SoundField, *, s
 def contact_of_sounds(field: SoundField, at: tuple[float, float, float] | None) -> Float64[Tensor, " 3"]:
     """Return the contact of the sounds: the requested one, or the loudest of some."""
     if at is not None:
-        chosen = given_contacts([at], None, unit="m")
-        check_given_contacts(chosen, field, advice=", in meters")
-        return chosen.places[0]
+        return contacts_on(field, [at], unit="m", advice=", in meters").places[0]
     points = field.gain_field.points
     some = points[:: max(1, len(points) // _CANDIDATES)]
     energy = (field.known(some).power * field.audible / field.bank.damping).sum(1)

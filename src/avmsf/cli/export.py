@@ -159,9 +159,7 @@ def run(options: Options) -> int:
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
     field = load(options.field)
-    source, settings = _source(field, options), _settings(field, options)
-    if options.to == "avmsf-demo" and options.object is not None:
-        source, settings["cloud"] = _at_gaussians(field, options.object, options.contacts or FORMATS[options.to].points)
+    source, settings = _for_format(field, options)
     written = write(
         source, options.output, to=options.to, contacts=options.contacts, noise=not options.no_noise,
         overwrite=options.overwrite, **settings,
@@ -199,34 +197,41 @@ def run(options: Options) -> int:
     return 0
 
 
-def _source(field: "SoundField", options: Options) -> "SoundField | SampledField":
-    """Return the field, or what it is at the contacts of the options."""
-    from avmsf.cli.contacts import check_given_contacts, given_contacts
+def _for_format(field: "SoundField", options: Options) -> "tuple[SoundField | SampledField, dict[str, Any]]":
+    """Return the field, or what it is at the contacts that are given, and the settings of the format's writer."""
+    from avmsf.capture.folder import read_capture
+    from avmsf.cli.contacts import contacts_on
+    from avmsf.editing.modal_edit import EDITS
     from avmsf.export.sampled_field import SampledField
+    from avmsf.mesh.surface import Surface
 
-    if not options.contacts_given:
-        return field
-    contacts = given_contacts(options.position, options.contact_table, unit=options.unit)
-    check_given_contacts(contacts, field)
-    return SampledField.of(field, contacts.places, directions=contacts.directions)
-
-
-def _settings(field: "SoundField", options: Options) -> dict[str, Any]:
-    """Return the settings of a format's writer."""
+    source: SoundField | SampledField = field
+    if options.contacts_given:
+        contacts = contacts_on(field, options.position, options.contact_table, unit=options.unit)
+        source = SampledField.of(field, contacts.places, directions=contacts.directions)
+    settings: dict[str, Any] = {}
     match options.to:
         case "web":
-            return _page_settings(field, options)
+            shown, meters = _object(field, options)
+            surface = None if isinstance(shown, Surface) else field.gain_field.surface
+            settings = {"object": shown, "meters": meters, "surface": surface}
+            if options.capture is not None and field.origin.report.get(EDITS):
+                note("the field is edited, so the page has no recordings to compare it with")
+            elif options.capture is not None:
+                settings["strikes"] = read_capture(options.capture).impacts
         case "gltf":
             shown, meters = _object(field, options)
-            return {"object": shown, "meters": meters, "up": options.up}
-        case "faust":
-            return {}
+            settings = {"object": shown, "meters": meters, "up": options.up}
         case "wavs":
-            return _wav_settings(options, field.residual.force or 1.0)
+            settings = _wav_settings(options, field.residual.force or 1.0)
         case "uff":
-            return {"functions": options.functions}
+            settings = {"functions": options.functions}
         case "avmsf-demo":
-            return {"variant": options.variant, "precision": options.precision}
+            settings = {"variant": options.variant, "precision": options.precision}
+            if options.object is not None:
+                limit = options.contacts or FORMATS[options.to].points
+                source, settings["cloud"] = _at_gaussians(field, options.object, limit)
+    return source, settings
 
 
 def _object(field: "SoundField", options: Options) -> "tuple[Path | Surface | None, float]":
@@ -277,24 +282,6 @@ def _reconstructed(options: Options) -> Path | None:
         advice = f"make one by avmsf fit {capture} --until surface, or give --object"
         note(f"{capture} has no surface: only the field's points are shown; {advice}")
     return made
-
-
-def _page_settings(field: "SoundField", options: Options) -> dict[str, Any]:
-    from avmsf.capture.folder import read_capture
-    from avmsf.editing.modal_edit import EDITS
-    from avmsf.mesh.surface import Surface
-
-    source, meters = _object(field, options)
-    recorded = options.capture
-    if recorded is not None and field.origin.report.get(EDITS):
-        note("the field is edited, so the page has no recordings to compare it with")
-        recorded = None
-    return {
-        "object": source,
-        "meters": meters,
-        "surface": None if isinstance(source, Surface) else field.gain_field.surface,
-        "strikes": None if recorded is None else read_capture(recorded).impacts,
-    }
 
 
 def _at_gaussians(field: "SoundField", path: Path, limit: int) -> "tuple[SampledField, GaussianCloud]":

@@ -80,8 +80,12 @@ def _describe_field(options: Options) -> None:
     compared = None
     if options.capture is not None:
         doing("comparing the field with the capture's recordings")
-        compared, what = _held_out(read_capture(options.capture).impacts, field)
-        compared = field.aligned(compared)
+        impacts = read_capture(options.capture).impacts
+        others = [row for row, name in enumerate(impacts.names) if name not in field.origin.trained_on]
+        what = "all of them training recordings"
+        if others:
+            what = "not training recordings" if len(others) < len(impacts) else "none a training recording"
+        compared = field.aligned(impacts.take(others) if others else impacts)
         scores = evaluate(field, compared)
         title = f"{counted(len(compared), 'contact')}, {what}; lower is better"
         lines.append(score_table(title, {"field": scores}))
@@ -94,15 +98,10 @@ def _describe_field(options: Options) -> None:
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
 
 
-def gains_at(field: "SoundField", points: "Float[Tensor, 'points 3']") -> "Float[Tensor, 'points modes']":
-    """Return the gains at many points, without a warning for one that is off the surface."""
-    import torch
-
-    return torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])
-
-
 def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:
     """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
+    import torch
+
     from avmsf.cli.report import levels
     from avmsf.mesh.points import farthest_points
     from avmsf.pipeline.fit import modes_words
@@ -115,7 +114,9 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
     modes = modes_words(len(field.bank), int((~kept).sum()))
     points = field.gain_field.points
     points = points[:: max(1, len(points) // _DRAWN_POINTS)]
-    gains, title = gains_at(field, points)[:, kept], f"gains of the modes of most energy of {name}"
+    # Not `field.gains`, which warns of points off the surface.
+    gains = torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])[:, kept]
+    title = f"gains of the modes of most energy of {name}"
     pictures = {
         "modes": draw_modes(field.bank, levels(field.amplitudes), is_mode=kept, title=f"{modes} of {name}"),
         "gains": draw_gains(points, gains, field.bank.take(kept), title=title),
@@ -139,14 +140,6 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
     for stem, picture in pictures.items():
         save_picture(picture, folder / f"{stem}.png")
         say(f"wrote {folder / stem}.png")
-
-
-def _held_out(impacts: "Impacts", field: "SoundField") -> "tuple[Impacts, str]":
-    known = set(field.origin.trained_on)
-    rows = [row for row, name in enumerate(impacts.names) if name not in known]
-    if not rows:
-        return impacts, "all of them training recordings"
-    return impacts.take(rows), "not training recordings" if len(rows) < len(impacts) else "none a training recording"
 
 
 def describe_shape(

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from statistics import mean, median
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,21 +75,23 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Locate, print and draw; return 2 where a recording could not be located."""
+    from avmsf.cli.contacts import contacts_on
     from avmsf.editing.modal_edit import EDITS
     from avmsf.field.store import load
 
     field = load(options.field)
-    truths = _true_contacts(options, field)
+    truths, table = None, options.true_contact_table
+    if table is not None or options.true_contact is not None:
+        given = [] if options.true_contact is None else [options.true_contact]
+        truths = contacts_on(field, given, table, unit=options.unit, option="--true-contact", recordings=True)
     say("preparing the gains over the surface and their posterior, once a run (seconds to minutes)")
     verdict = field.origin.report.get("guess") if field.quality is None else field.quality.verdict
     if verdict is not None:
         show(verdict)
     taken, found, failures = set[str](), list[dict[str, Any]](), list[dict[str, str]]()
     locate = _locator(options, field)
-    recordings = list(options.recordings)
-    if options.true_contact_table is not None:
-        # What does not count comes last.
-        recordings.sort(key=partial(_is_training, field))
+    # What does not count comes last.
+    recordings = sorted(options.recordings, key=lambda path: table is not None and _is_training(field, path))
     try:
         for path in recordings:
             doing(f"locating the impact of {path}")
@@ -119,7 +121,7 @@ def run(options: Options) -> int:
     results = {"impacts": found, "summary": summary, "failures": failures}
     print_json({"field": str(options.field), "quality": verdict, **results})
     located = [each["position"] is not None for each in found]
-    if any(located) and field.gain_field.contacts is not None and not field.origin.report.get(EDITS):
+    if any(located) and len(field.gain_field.contacts) and not field.origin.report.get(EDITS):
         next_command("avmsf suggest", options.field)
     return UNLOCATED if failures or not all(located) else 0
 
@@ -151,20 +153,6 @@ def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_A
             return [({"recording": str(path), "seconds": None, **not_located(str(error))}, None)]
 
     return answers
-
-
-def _true_contacts(options: Options, field: "SoundField") -> "Contacts | None":
-    """Return the true contacts, if any. Raises OutputError for one far from the object, as in another unit."""
-    from avmsf.cli.contacts import check_given_contacts, given_contacts, read_contacts
-
-    if options.true_contact_table is not None:
-        contacts = read_contacts(options.true_contact_table, unit=options.unit, recordings=True)
-    elif options.true_contact is not None:
-        contacts = given_contacts([options.true_contact], None, unit=options.unit, option="--true-contact")
-    else:
-        return None
-    check_given_contacts(contacts, field)
-    return contacts
 
 
 def _true_contact(contacts: "Contacts", recording: Path) -> "Float64[Tensor, ' 3'] | None":

@@ -77,14 +77,13 @@ class Options(Common):
 
 def run(options: Options) -> int:
     """Render and write."""
-    from avmsf.cli.contacts import check_given_contacts, given_contacts
+    from avmsf.cli.contacts import contacts_on
     from avmsf.field.store import load
     from avmsf.modal.modes import ForcePulse
 
-    contacts = given_contacts(options.position, options.contact_table, unit=options.unit, directions=options.direction)
+    field, positions, table = load(options.field), options.position, options.contact_table
+    contacts = contacts_on(field, positions, table, unit=options.unit, directions=options.direction)
     paths = _paths(options.output, contacts.names)
-    field = load(options.field)
-    check_given_contacts(contacts, field)
     if options.force not in (None, 1) and not field.origin.per_newton:
         note(f"the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
