@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +21,8 @@ from avmsf.cli.paths import OutputError
 from avmsf.cli.report import mode_rows, mode_table
 from avmsf.errors import CaptureError, FitError
 from avmsf.field.store import load, save
-from avmsf.modal.config import PulseShape
 from avmsf.modal.modes import ForcePulse, ModalBank
-from factories.made_fields import directional, positional, saved, sounding
+from factories.made_fields import directional, sounding
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.plate_field import CONTACT_TIME, HIGHEST, RATE
 from factories.raising import raises
@@ -199,25 +199,12 @@ def test_a_refused_fit_leaves_nothing_behind(tmp_path: Path, capsys: Streams, ea
     assert list(output.parent.glob("*")) == []
 
 
-def test_render_is_the_fields_own(field: Path, tmp_path: Path, capsys: Streams) -> None:
-    output = tmp_path / "sounds"
-    words = ["render", field, *AT, "--position", "50e-3", "0.12", "-1e-3", "--output", output, "--force", "2"]
-    told, _ = results_of(capsys, *words)
-    assert told["files"] == [str(output / "001.wav"), str(output / "002.wav")]
-    contacts = torch.tensor([[0.05, 0.06, 0.0], [0.05, 0.12, -1e-3]], dtype=torch.float64)
-    for path, expected in zip(told["files"], load(field).render(contacts, forces=2.0), strict=True):
-        sound, rate = soundfile.read(path, dtype="float32")
-        assert (rate, soundfile.info(path).subtype) == (RATE, "FLOAT")
-        assert np.array_equal(sound, expected.numpy())
-
-
-def test_render_takes_a_table_in_any_unit_and_a_length(field: Path, tmp_path: Path) -> None:
+def test_render_takes_a_table_in_any_unit(field: Path, tmp_path: Path) -> None:
     table = tmp_path / "places.csv"
     table.write_text("File;X;Y;Z;who\nrim/one.wav;50,0;60;0;a\nwall;50;120;0;b\n")
     words = ["render", str(field), "--contact-table", str(table), "--unit", "mm", "--output", str(tmp_path / "out")]
-    assert main([*words, "--seconds", "0.1"]) == 0
-    contacts = torch.tensor([[0.05, 0.06, 0.0], [0.05, 0.12, 0.0]], dtype=torch.float64)
-    expected = load(field).render(contacts, samples=800)
+    assert main(words) == 0
+    expected = load(field).render(torch.tensor([[0.05, 0.06, 0.0], [0.05, 0.12, 0.0]], dtype=torch.float64))
     for row, name in enumerate(("rim/one.wav", "wall.wav")):
         assert np.array_equal(soundfile.read(tmp_path / "out" / name, dtype="float32")[0], expected[row].numpy())
 
@@ -263,77 +250,64 @@ def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-SPOT = ("--position", "0.05", "0.03", "0.002")
-PLACE = torch.tensor([[0.05, 0.03, 0.002]], dtype=torch.float64)
 PLACES = torch.tensor([[0.05, 0.03, 0.002], [0.05, 0.03, 0.002], [-0.04, 0.01, 0.002]], dtype=torch.float64)
 DIRECTIONS = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+SPOT = ("--position", "0.05", "0.03", "0.002")
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    return saved(positional(), tmp_path)
+    """Return the file of a field that knows directions and the average force of its recordings."""
+    field = sounding(directional())
+    save(replace(field, residual=replace(field.residual, force=50.0)), tmp_path / "field.safetensors")
+    return tmp_path / "field.safetensors"
 
 
-def rendered(path: Path, capsys: Streams, *words: str) -> tuple[np.ndarray, dict, list[str]]:
-    """Return the sound, the JSON and the notes of a command."""
-    output = path.with_name("a.wav")
-    told, err = results_of(capsys, "render", path, *SPOT, "--output", output, *words)
-    notes = [line for line in err.splitlines() if line.startswith("note: ")]
-    return soundfile.read(output, dtype="float32")[0], told, notes
+RENDERED: dict[str, dict[str, Any]] = {
+    "": {},
+    "--force 2": {"forces": 2.0},
+    "--no-noise": {"noise": False},
+    "--seconds 0.1": {"samples": 800},
+    "--contact-time 2e-3": {"pulse": ForcePulse(2e-3)},
+    "--contact-time 2e-3 --pulse hertz": {"pulse": ForcePulse(2e-3, "hertz")},
+    "--direction 0 0 1 --direction 0 0 -1": {"directions": [[0, 0, 1], [0, 0, -1]]},
+}
+"""Options, and what `render` of the field is given then."""
 
 
-@pytest.mark.parametrize("words", [(), ("--contact-time", "0.002")])
-def test_without_noise_the_modes_are_rendered(path: Path, capsys: Streams, words: tuple[str, ...]) -> None:
-    noisy, modes = (rendered(path, capsys, *words, *more)[0] for more in ((), ("--no-noise",)))
-    # The sounds are float32, of peaks near 1.
-    assert np.abs(noisy - modes - sounding(positional()).noise().numpy()).max() < 1e-6
-    assert words or np.array_equal(modes, sounding(positional()).render(PLACE, noise=False)[0].numpy())
-
-
-def test_without_a_force_a_sound_is_as_the_recordings_on_average(tmp_path: Path, capsys: Streams) -> None:
-    field = sounding(positional())
-    field = replace(field, residual=replace(field.residual, force=50.0))
-    field.save(tmp_path / "field.safetensors")
-    for words, force in (((), None), (("--force", "3"), 3.0)):
-        sound = rendered(tmp_path / "field.safetensors", capsys, *words)[0]
-        assert np.array_equal(sound, field.render(PLACE, forces=force)[0].numpy())
+@pytest.mark.parametrize("words", RENDERED)
+def test_render_is_the_fields_own(words: str, path: Path, capsys: Streams) -> None:
+    output = path.with_name("sounds")
+    spots = [*SPOT, "--position", "-40e-3", "1e-2", "0.002", "--output", output]
+    told, _ = results_of(capsys, "render", path, *spots, *words.split())
+    assert told["files"] == [str(output / "001.wav"), str(output / "002.wav")]
+    expected = load(path).render(PLACES[1:], **RENDERED[words])
+    for file, sound in zip(told["files"], expected, strict=True):
+        written, rate = soundfile.read(file, dtype="float32")
+        assert (rate, soundfile.info(file).subtype) == (8000, "FLOAT")
+        assert np.array_equal(written, sound.numpy())
 
 
 @pytest.mark.parametrize("level", [-30.0, -10.0, 20.0])
 def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level: float) -> None:
-    loudest = 20 * np.log10(float(sounding(positional()).render(PLACE).abs().max()))
-    sound, told, notes = rendered(path, capsys, "--level-db", str(level - loudest))
+    loudest, output = 20 * np.log10(float(load(path).render(PLACES[:1]).abs().max())), path.with_name("a.wav")
+    told, err = results_of(capsys, "render", path, *SPOT, "--output", output, "--level-db", level - loudest)
     assert told["peak_dbfs"] == pytest.approx(level, abs=1e-3)
-    assert np.abs(sound).max() == pytest.approx(10 ** (level / 20), rel=1e-4)
+    assert np.abs(soundfile.read(output)[0]).max() == pytest.approx(10 ** (level / 20), rel=1e-4)
     # Quiet ones and those that clip are noted, once.
-    advised = [note for note in notes if "--normalize peak" in note]
-    assert len(advised) == (0 if level == -10 else 1)
+    assert err.count("--normalize peak") == (0 if level == -10 else 1)
 
 
-@pytest.mark.parametrize("shape", ["half-sine", "hertz"])
-def test_render_softens_the_modes(path: Path, shape: PulseShape, capsys: Streams) -> None:
-    sound, _, _ = rendered(path, capsys, "--contact-time", "2e-3", "--pulse", shape)
-    expected = sounding(positional()).render(PLACE, pulse=ForcePulse(2e-3, shape))
-    assert np.array_equal(sound, expected[0].numpy())
-
-
-def test_directions_of_a_table_are_rendered(tmp_path: Path) -> None:
+def test_directions_of_a_table_are_rendered(path: Path) -> None:
     rows = [
         f"{number}.wav,{','.join(map(str, place))},{','.join(map(str, way)) if any(way) else ',,'}"
         for number, (place, way) in enumerate(zip(PLACES.tolist(), DIRECTIONS.tolist(), strict=True))
     ]
-    (tmp_path / "impacts.csv").write_text("\n".join(["file,x,y,z,nx,ny,nz", *rows]) + "\n")
-    table = ("--contact-table", str(tmp_path / "impacts.csv"))
-    assert main(["render", str(saved(directional(), tmp_path)), *table, "--output", str(tmp_path / "all")]) == 0
-    expected = sounding(directional()).render(PLACES, directions=DIRECTIONS)
+    table = path.with_name("impacts.csv")
+    table.write_text("\n".join(["file,x,y,z,nx,ny,nz", *rows]) + "\n")
+    assert main(["render", str(path), "--contact-table", str(table), "--output", str(path.with_name("all"))]) == 0
+    expected = load(path).render(PLACES, directions=DIRECTIONS)
     for number, sound in enumerate(expected):
-        found = soundfile.read(tmp_path / "all" / f"{number}.wav", dtype="float32")[0]
+        found = soundfile.read(path.with_name("all") / f"{number}.wav", dtype="float32")[0]
         assert np.array_equal(found, sound.numpy())
     assert not torch.equal(expected[0], expected[1])
-
-
-def test_the_direction_of_a_contact_is_rendered(tmp_path: Path) -> None:
-    words = ["--position", "0.05", "0.03", "0.002", "--direction", "0", "0", "1", "--output", str(tmp_path / "up.wav")]
-    assert main(["render", str(saved(directional(), tmp_path)), *words]) == 0
-    expected = sounding(directional()).render(PLACES[1:2], directions=DIRECTIONS[1:2])[0]
-    assert np.array_equal(soundfile.read(tmp_path / "up.wav", dtype="float32")[0], expected.numpy())

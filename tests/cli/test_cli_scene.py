@@ -16,7 +16,7 @@ from avmsf.features.store import load_features, read_report
 from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
-from avmsf.photographs.folder import write_frames, write_views
+from avmsf.photographs.folder import write_frames
 from avmsf.plotting.surfaces import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, positional_field, sound_field
 from factories.plate_capture import PLATE, TINY, fill_plate
@@ -94,6 +94,12 @@ def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(k
         2: ["views", "cloud", "surface", "modes", "fit"],
     }
     assert len(load_features(tmp_path / "cache" / "points.safetensors").points) > 100
+    # The surface is closed, kept, and what the stage alone gives; a pixel of the pictures is 9 mm.
+    assert main([*words[:4], "--until", "surface", "-o", str(tmp_path / "slab.ply"), *SMALL_SPLAT]) == 0
+    assert (tmp_path / "slab.ply").read_bytes() == Path(values["surface"]).read_bytes()
+    mesh = trimesh.load(tmp_path / "slab.ply")
+    assert mesh.is_watertight
+    assert mesh.extents.tolist() == pytest.approx([PLATE.length, PLATE.width, THICKNESS], abs=0.02)
 
 
 @pytest.mark.parametrize("name", ["cloud", "features"])
@@ -135,17 +141,6 @@ def test_a_mesh_is_written_as_it_is_in_meters(kind: str, tmp_path: Path) -> None
         written, given = Surface.read(tmp_path / f"{name}.{kind}"), slab()
         assert torch.allclose(written.vertices, given.vertices / 1000, atol=1e-8)
         assert torch.equal(written.faces, given.faces)
-
-
-def test_pictures_become_a_closed_surface_that_is_kept(tmp_path: Path) -> None:
-    folder, output = tmp_path / "slab", tmp_path / "slab.ply"
-    write_views(slab_views(), folder)
-    assert main(["fit", str(folder), "--until", "surface", "--output", str(output), *SMALL_SPLAT]) == 0
-    assert output.read_bytes() == (folder / ".avmsf" / "surface.ply").read_bytes()
-    mesh = trimesh.load(output)
-    assert mesh.is_watertight
-    # A pixel of the pictures is 9 mm.
-    assert mesh.extents.tolist() == pytest.approx([PLATE.length, PLATE.width, THICKNESS], abs=0.02)
 
 
 def test_a_surface_is_drawn_with_two_cuts_through_its_middle(tmp_path: Path) -> None:
