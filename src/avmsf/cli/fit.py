@@ -1,7 +1,6 @@
 """`avmsf fit`: a capture folder in, a field file out, or what a stage before it makes; of many, a folder of these."""
 
 import shlex
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property, partial
@@ -15,7 +14,7 @@ from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import Configured, Device, Flag, Int, Name, Number, expect_capture, option_of
-from avmsf.cli.output import display, doing, next_command, next_step, print_json, print_result, show
+from avmsf.cli.output import display, next_command, next_step, print_json, print_result, show
 from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.cli.settings import with_settings
 from avmsf.errors import FitError
@@ -25,6 +24,7 @@ from avmsf.pipeline.config import CACHE, PRESETS, PipelineConfig, Preset
 
 if TYPE_CHECKING:
     from avmsf.evaluation.scores import Scores
+    from avmsf.features.feature_field import FeatureField
     from avmsf.field.sound_field import SoundField
     from avmsf.pipeline.stages import StageFolder
 
@@ -200,36 +200,29 @@ def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> 
     from avmsf.cli.info import draw_field
     from avmsf.cli.report import compare, features_lines, field_lines, parts_words, score_table
     from avmsf.evaluation.splits import split
-    from avmsf.features.store import load_features, read_report
     from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.pipeline.fit import fit_in_stages
     from avmsf.pipeline.visual_checks import expect_shape
 
-    capture, config, features, described = read_capture(options.capture, settings), options.all_settings, None, None
+    capture, config, listener = read_capture(options.capture, settings), options.all_settings, display.listener
     size = options.train_count if options.train_fraction is None else options.train_fraction
     train, test = (capture.impacts, None) if size is None else split(capture.impacts, size)
     if options.without_shape:
         capture = replace(capture, surface=None, folder=None)
     elif options.features is None:
         expect_shape(capture)
-    if options.features is not None:
-        features, described = load_features(options.features), read_report(options.features)
-        _note_other_settings(options, described)
+    features, described = (None, None) if options.features is None else _given_features(options, options.features)
     with stages.lock("avmsf fit"):
         made = fit_in_stages(
-            capture, config, stages, train=train, features=features, features_report=described,
-            listener=display.listener,
-        )  # fmt: skip
+            capture, config, stages, train=train, features=features, features_report=described, listener=listener
+        )
         fitted, path = _written(made.field, options.output)
     aligned = AlignmentReport.of(made.modes, train)
     lines = [] if aligned is None else aligned.sentences() if display.verbose else aligned.warnings()
     lines += features_lines(made.report) if made.report and display.verbose else []
     scores: dict[str, Scores] = {}
     if test is not None:
-        doing("comparing the field with the recordings that it was not fitted to")
-        begun = time.monotonic()
         scores = compare(fitted, train, test, made.modes)
-        display.listener.ready("scores", time.monotonic() - begun)
         lines.append(score_table(f"{parts_words(train, test)}; lower is better", scores))
         lines += [f"not trained on: {listed(test.names, most=8)}"] if display.verbose else []
     lines += field_lines(fitted, path, settings=display.verbose)
@@ -266,13 +259,16 @@ def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> 
         next_step("the same command without --train-fraction and --train-count fits all recordings")
 
 
-def _note_other_settings(options: Options, described: Mapping[str, Any]) -> None:
-    """Say which settings of features in a file are not those of a preset that has its own."""
-    made = described.get("scene", {}).get("lift", {})
-    wanted = asdict(options.all_settings.scene.lift)
+def _given_features(options: Options, path: Path) -> "tuple[FeatureField, dict[str, Any]]":
+    """Return the features of a file, and how they were made; note where not as a preset other than the default does."""
+    from avmsf.features.store import load_features, read_report
+
+    described = read_report(path)
+    made, wanted = described.get("scene", {}).get("lift", {}), asdict(options.all_settings.scene.lift)
     other = [f"{name} {value!r}" for name, value in made.items() if name in wanted and value != wanted[name]]
     if options.preset != "default" and other:
         display.listener.note(f"features of other settings than the preset {options.preset}: {', '.join(other)}")
+    return load_features(path), described
 
 
 def _written(made: Path, output: Path | None) -> "tuple[SoundField, Path]":

@@ -2,6 +2,7 @@
 
 import math
 import shlex
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch import Tensor
 from avmsf._utils.text import counted, format_number
 from avmsf.capture import Impacts
 from avmsf.capture.impacts import places_of
-from avmsf.cli.output import decimals, table
+from avmsf.cli.output import decimals, display, doing, table
 from avmsf.evaluation.scores import Scores, evaluate, score
 from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, WhiteNoise, floor
 from avmsf.evaluation.task import Renderer
@@ -166,6 +167,8 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
     All by recordings aligned like those that the modes were found in. Directions count in a baseline of their own where
     they choose other neighbors.
     """
+    doing("comparing the field with the recordings that it was not fitted to")
+    begun = time.monotonic()
     train, test, count = modes.aligned(train), modes.aligned(test), min(3, len(train))
     nearest = f"mean waveform of {count} nearest"
     renderers: dict[str, Renderer] = {
@@ -179,7 +182,9 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
     scores = {name: evaluate(renderer, test) for name, renderer in renderers.items()}
     if scores[nearest].mean() == scores[f"{nearest}, by direction"].mean():
         del scores[f"{nearest}, by direction"]
-    return scores | {_OWN_GAINS: score(floor(test, modes.bank), test)}
+    scores |= {_OWN_GAINS: score(floor(test, modes.bank), test)}
+    display.listener.ready("scores", time.monotonic() - begun)
+    return scores
 
 
 def parts_words(train: Impacts, test: Impacts) -> str:
