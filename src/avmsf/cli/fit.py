@@ -12,6 +12,7 @@ import tyro
 from avmsf._utils.text import format_number, listed
 from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
+from avmsf.cli.info import describe_shape, draw_field
 from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import Configured, Device, Flag, Int, Name, Number, expect_capture, option_of
 from avmsf.cli.output import display, next_command, next_step, print_json, print_result, show
@@ -197,7 +198,6 @@ def run(options: Options) -> int:
 
 def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> None:
     from avmsf.capture import read_capture
-    from avmsf.cli.info import draw_field
     from avmsf.cli.report import compare, features_lines, field_lines, parts_words, score_table
     from avmsf.evaluation.splits import split
     from avmsf.modal.extraction.alignment_report import AlignmentReport
@@ -284,7 +284,6 @@ def _written(made: Path, output: Path | None) -> "tuple[SoundField, Path]":
 
 def _guess(options: Options, material: str, settings: CaptureSettings, stages: "StageFolder") -> None:
     """Compute a field without recordings, and print a summary."""
-    from avmsf.cli.info import draw_field
     from avmsf.cli.report import quality_words
     from avmsf.pipeline.fit import guess_in_stages
 
@@ -306,7 +305,6 @@ def _make_stage(options: Options, settings: CaptureSettings, stages: "StageFolde
     from avmsf.capture.checks import check_one_unit, find_surface
     from avmsf.capture.proposals import contacts_of
     from avmsf.capture.table import in_folder, read_rows
-    from avmsf.cli.info import describe_shape
     from avmsf.mesh.surface import Surface
     from avmsf.pipeline.scene import CLOUD, SceneStages
     from avmsf.pipeline.shape import keep_surface, object_shape
