@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
 from avmsf.capture.filenames import expect_views, pictures_in
-from avmsf.capture.settings import METRES
 from avmsf.cli import main
 from avmsf.errors import SceneError
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
@@ -261,18 +260,6 @@ def test_gaussians_are_opened_and_another_frame_is_told(tmp_path: Path, case: st
         (folder / "splats.ply").write_bytes(content.replace(b"property float f_dc_", b"property float color"))
     said = said_of(folder)
     assert [words in each and "feet" not in each for each in said] == [True] * bool(words)
-
-
-@pytest.mark.parametrize("unit", ["m", "mm", "in"])
-def test_the_unit_of_contacts_is_found_from_photographs(tmp_path: Path, unit: str) -> None:
-    folder = pictured_slab(tmp_path / "slab")
-    header, *rows = (folder / "impacts.csv").read_text().split()
-    cells = [row.split(",") for row in rows]
-    for row in cells:
-        row[1:4] = [str(float(cell) / METRES[unit]) for cell in row[1:4]]
-    (folder / "impacts.csv").write_text("\n".join([header, *map(",".join, cells)]))
-    (folder / "capture.toml").unlink()
-    assert [f'write unit = "{unit}" in capture.toml' in each for each in said_of(folder)] == [True] * (unit != "m")
 
 
 @pytest.mark.parametrize(

@@ -80,22 +80,14 @@ def gaussians(path: Path) -> GaussianCloud:
     return cloud
 
 
-def test_faust_gets_what_it_compiles_unless_asked_for_more(field_file, tmp_path, capsys, monkeypatch):
-    output = tmp_path / "a.dsp"
-    # 64 points of 5 modes with phases and the noise's 1200 samples are 1840 numbers. Beside the noise 10 would be left
-    # of 1300: it is given up.
-    for most, points, noise in ((1500, 30, True), (1300, 64, False)):
-        monkeypatch.setattr("avmsf.export.faust.MAX_NUMBERS", most)
-        text = export(field_file, "faust", output, "--overwrite").read_text()
-        assert f"points = {points};" in text
-        assert ("noiseDraw" in text) == noise
-        assert ("30" if noise else "noise") in capsys.readouterr().err
-    with raises(AvmsfError, value=1840):
-        export(field_file, "faust", output, "--overwrite", "--contacts", 64)
-    assert "noiseDraw" not in export(field_file, "faust", tmp_path / "b.dsp", "--contacts", 3, "--no-noise").read_text()
-    manifest = json.loads((export(field_file, "web", tmp_path / "c", "--no-noise") / "manifest.json").read_text())
-    where = manifest["tensors"]["noise"]
-    assert not np.fromfile(tmp_path / "c" / "field.bin", "<f4", where["shape"][0], offset=where["offset"]).any()
+def test_without_noise_none_is_written(field_file: Path, tmp_path: Path) -> None:
+    for words, noisy in (([], True), (["--no-noise"], False)):
+        faust = export(field_file, "faust", tmp_path / f"{noisy}.dsp", "--contacts", 3, *words).read_text()
+        assert ("noiseDraw" in faust) == noisy
+        page = export(field_file, "web", tmp_path / f"page {noisy}", *words)
+        where = json.loads((page / "manifest.json").read_text())["tensors"]["noise"]
+        noise = np.fromfile(page / "field.bin", "<f4", where["shape"][0], offset=where["offset"])
+        assert bool(noise.any()) == noisy
 
 
 def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
@@ -110,19 +102,18 @@ def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, t
     assert one == other
 
 
-def test_the_demo_has_the_given_gaussians(field_file: Path, tmp_path: Path) -> None:
-    cloud = gaussians(tmp_path / "plate.ply")
-    demo = export(field_file, "avmsf-demo", tmp_path / "demo", "--object", tmp_path / "plate.ply")
-    assert torch.equal(read_arrays(demo)["means"], cloud.centers)
-    gains = read_arrays(demo / "original")["gains"]
+def test_the_demo_has_the_given_gaussians_or_so_many_of_them(field_file: Path, tmp_path: Path) -> None:
+    cloud, found = gaussians(tmp_path / "plate.ply"), {}
+    for name, words in (("original", ()), ("glass", ("--contacts", 11, "--variant", "glass"))):
+        demo = export(field_file, "avmsf-demo", tmp_path / name, "--object", tmp_path / "plate.ply", *words)
+        found[name] = read_arrays(demo)["means"], read_arrays(demo / name)["gains"]
+    (means, gains), (few, few_gains) = found.values()
+    assert torch.equal(means, cloud.centers)
     torch.testing.assert_close(gains.abs(), SampledField.of(load(field_file), cloud.centers).gains.abs())
-    words = ("--object", tmp_path / "plate.ply", "--contacts", 11, "--variant", "glass")
-    few = export(field_file, "avmsf-demo", tmp_path / "few", *words)
-    assert json.loads((few / "manifest.json").read_text())["variants"] == ["glass"]
-    rows = [int((cloud.centers - point).norm(dim=1).argmin()) for point in read_arrays(few)["means"]]
+    rows = [int((cloud.centers - point).norm(dim=1).argmin()) for point in few]
     assert len(set(rows)) == 11
-    torch.testing.assert_close(read_arrays(few / "glass")["gains"], gains[rows])
-    torch.testing.assert_close(read_splats(few / "scene.ply").harmonics, cloud.harmonics[rows])
+    torch.testing.assert_close(few_gains, gains[rows])
+    torch.testing.assert_close(read_splats(demo / "scene.ply").harmonics, cloud.harmonics[rows])
 
 
 def test_wavs_have_the_layers_asked_for(field_file: Path, tmp_path: Path) -> None:
@@ -191,26 +182,25 @@ WAYS = ((0.6, 0.0, -0.8), (0.0, 0.0, 2.0), (0.0, 0.0, 0.0))
 
 @pytest.mark.parametrize("how", ["options", "table", "directions"])
 def test_a_sample_set_has_the_given_contacts_in_their_order(how: str, tmp_path: Path) -> None:
-    field = saved(directional(), tmp_path)
-    words = [word for place in GIVEN for word in ("--position", *place)]
+    field, places = saved(directional(), tmp_path), torch.tensor(GIVEN, dtype=torch.float64)
+    words: list[object] = [word for place in GIVEN for word in ("--position", *place)]
+    ways = WAYS if how == "directions" else ((0.0, 0.0, 0.0),) * 3
     if how != "options":
-        lines = ["x,y,z,nx,ny,nz"]
-        for place, way in zip(GIVEN, WAYS, strict=True):
-            cells = [*(1e3 * each for each in place), *(way if how == "directions" else ("", "", ""))]
-            lines.append(",".join(map(str, cells)))
+        cells = [way if any(way) else ("", "", "") for way in ways]
+        rows = [[*place, *way] for place, way in zip((1e3 * places).tolist(), cells, strict=True)]
+        lines = ["x,y,z,nx,ny,nz", *(",".join(map(str, row)) for row in rows)]
         (tmp_path / "places.csv").write_text("\n".join(lines) + "\n")
         words = ["--contact-table", tmp_path / "places.csv", "--unit", "mm"]
     folder = export(field, "wavs", tmp_path / "set", *words, "--no-noise")
-    rows, places = table_of(folder / "samples.csv"), torch.tensor(GIVEN, dtype=torch.float64)
-    np.testing.assert_allclose([[float(row[axis]) for axis in "xyz"] for row in rows], GIVEN, atol=1e-9)
+    samples = table_of(folder / "samples.csv")
+    np.testing.assert_allclose([[float(row[axis]) for axis in "xyz"] for row in samples], GIVEN, atol=1e-9)
+    if how == "directions":
+        normals = [[float(row[axis]) for axis in ("nx", "ny", "nz")] for row in samples[:2]]
+        expected = -torch.nn.functional.normalize(torch.tensor(ways[:2], dtype=torch.float64))
+        np.testing.assert_allclose(normals, expected.numpy(), atol=1e-6)
     scale = json.loads((folder / "manifest.json").read_text())["scale"]
-    ways = torch.tensor(WAYS, dtype=torch.float64) if how == "directions" else None
-    straight, expected = (scale * load(field).render(places, each, noise=False) for each in (None, ways))
-    assert (float((expected - straight)[:2].abs().amax()) > 0.01) == (ways is not None)
-    if ways is not None:
-        normals = torch.tensor([[float(row[axis]) for axis in ("nx", "ny", "nz")] for row in rows]).double()
-        torch.testing.assert_close(normals[:2], -torch.nn.functional.normalize(ways[:2]), atol=1e-6, rtol=0.0)
-    for row, sound in zip(rows, expected, strict=True):
+    expected = scale * load(field).render(places, torch.tensor(ways, dtype=torch.float64), noise=False)
+    for row, sound in zip(samples, expected, strict=True):
         written = soundfile.read(folder / row["file"], dtype="float32")[0]
         # Both are float32, of a peak below 1.
         np.testing.assert_allclose(written, sound.numpy(), atol=1e-5)
