@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -223,46 +224,28 @@ def test_the_loudest_place_is_that_of_both_parts_of_the_gains() -> None:
     assert contact_of_sounds(loud, None).tolist() == pytest.approx([0.1, 0.0, 0.0])
 
 
-class Echo:
-    """A model of sound that answers every prompt with the same ring, whatever it is given."""
-
-    name, sample_rate, channels = "echo", RATE, 1
-    device, dtype = torch.device("cpu"), torch.float32
-
-    def __init__(self, answer: torch.Tensor) -> None:
-        self.answer, self.asked = answer, []
-
-    def describe(self) -> dict[str, str]:
-        return {"model": self.name}
-
-    def encode(self, waveforms: torch.Tensor) -> torch.Tensor:
-        return waveforms
-
-    def decode(self, latents: torch.Tensor, *, samples: int) -> torch.Tensor:
-        return latents[..., :samples]
-
-    def embed(self, prompt: str, *, seconds: float) -> str:
-        self.asked.append(prompt)
-        return prompt
-
-    def generate(self, prompt: str, *, seconds: float, seed: int) -> torch.Tensor:
-        return 0.1 * self.answer[: round(seconds * RATE)]
-
-    def denoised(
-        self, latents: torch.Tensor, level: torch.Tensor, conditioning: str, *, guidance: float
-    ) -> torch.Tensor:
-        return self.answer.expand_as(latents)
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Let every model of sound answer all prompts with a ring 2 % higher; return what is asked of it, in order."""
+    answer, asked = adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0], list[object]()
+    echo = SimpleNamespace(
+        name="echo",
+        sample_rate=RATE,
+        channels=1,
+        device=torch.device("cpu"),
+        dtype=torch.float32,
+        describe=lambda: {"model": "echo"},
+        encode=lambda waveforms: waveforms,
+        decode=lambda latents, *, samples: latents[..., :samples],
+        embed=lambda prompt, *, seconds: asked.append(prompt),
+        generate=lambda prompt, *, seconds, seed: 0.1 * answer[: round(seconds * RATE)],
+        denoised=lambda latents, level, conditioning, *, guidance: answer.expand_as(latents),
+    )
+    monkeypatch.setattr(StableAudio, "load", lambda source, **settings: asked.append((source, settings)) or echo)
+    return asked
 
 
-def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = Echo(adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0])
-    loaded = []
-
-    def load_model(source: str, **settings: object) -> Echo:
-        loaded.append((source, settings))
-        return model
-
-    monkeypatch.setattr(StableAudio, "load", load_model)
+def test_towards_words(field: Path, asked: list[object]) -> None:
     words = ["--prompt", "a bell", "--model", "here", *sets("guide.steps=40 guide.contacts_per_step=2")]
     words += sets("prompt.model_seconds=1 parameters=published")
     alone = field.with_name("generated.wav")
@@ -270,9 +253,7 @@ def test_towards_words(field: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert soundfile.info(str(alone)).samplerate == RATE
     (told,) = new.origin.report[EDITS]
     assert (told["parameters"], told["prompt"]) == ("published", "a bell")
-    assert loaded == [("here", {"seconds": 1.0, "device": None})]
-    assert model.asked[0] == "a bell"
-    # The answer is 2 % higher.
+    assert asked[:2] == [("here", {"seconds": 1.0, "device": None}), "a bell"]
     assert 1.005 < float((new.bank.frequency / FREQUENCY).median()) < 1.035
 
 
@@ -335,19 +316,15 @@ def test_an_edit_overwrites_no_file_and_draws_no_contact_off_the_object(field: P
         edited(field, "--pitch", "2", "--plots", str(field.with_name("look")), "--position", "100", "0", "0")
 
 
-PROMPT = "a bell"
-QUICK = ("--prompt", PROMPT, "--model", "here", *sets("guide.steps=5 guide.contacts_per_step=2 guide.preview_every=2"))
+QUICK = ("--prompt", "a bell", "--model", "x", *sets("guide.steps=5 guide.contacts_per_step=2 guide.preview_every=2"))
 
 
 @pytest.fixture
-def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return a command without its output: a field, a model that always answers the same sound, a tiny network."""
+def words(field: Path, asked: list[object]) -> list[str]:
+    """Return a command without its output: a field, a prompt to the model, a tiny network that scores."""
     pytest.importorskip("transformers", reason="needs pip install 'avmsf[eval]'")
-    save_clap(tmp_path / "clap")
-    save(ceramic(), tmp_path / "plate.safetensors")
-    model = Echo(adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0])
-    monkeypatch.setattr(StableAudio, "load", lambda *_, **__: model)
-    return [str(tmp_path / "plate.safetensors"), *QUICK, "--set", f"prompt.clap={tmp_path / 'clap'}"]
+    save_clap(field.with_name("clap"))
+    return [str(field), *QUICK, "--set", f"prompt.clap={field.with_name('clap')}"]
 
 
 def test_the_curve_is_stored_drawn_and_shown(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -361,7 +338,7 @@ def test_the_curve_is_stored_drawn_and_shown(words: list[str], tmp_path: Path, m
     # The first score is of the field as it was, the last one of the edited field, at one of its points.
     for field, score in ((ceramic(), curve["scores"][0]), (new, curve["scores"][-1])):
         points = ceramic().gain_field.points
-        alone = clap.score(field.render(points), PROMPT, sample_rate=RATE).numpy()
+        alone = clap.score(field.render(points), "a bell", sample_rate=RATE).numpy()
         assert np.abs(alone - score).min() < 1e-6
     (axes,) = drawn["clap.png"].axes
     assert np.asarray(axes.lines[0].get_xydata()) == pytest.approx(np.array([curve["steps"], curve["scores"]]).T)
