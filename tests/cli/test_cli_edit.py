@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import main
-from avmsf.cli.edit_report import contact_of_sounds
+from avmsf.cli.edits import contact_of_sounds
 from avmsf.cli.paths import OutputError
 from avmsf.cli.report import field_lines
 from avmsf.editing.material import RATIO_ONLY, change_material, rayleigh_damping
@@ -329,7 +329,7 @@ def words(field: Path, asked: list[object]) -> list[str]:
 
 def test_the_curve_is_stored_drawn_and_shown(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: dict[str, Figure] = {}
-    monkeypatch.setattr("avmsf.cli.edit_report.save_picture", lambda figure, path: drawn.update({path.name: figure}))
+    monkeypatch.setattr("avmsf.cli.edits.save_picture", lambda figure, path: drawn.update({path.name: figure}))
     output, folder = tmp_path / "new.safetensors", tmp_path / "look"
     assert run_verb("edit", *words, "--output", str(output), "--plots", str(folder)) == 0
     new, clap = load(output), Clap.load(tmp_path / "clap")

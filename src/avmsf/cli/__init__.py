@@ -5,7 +5,7 @@ tables for people or with `--json` as one object. Each module of a verb has `Opt
 makes the command line, and `run(options)`, which imports what computes, calls the package and prints: start reading
 with `render`. `options` parses and checks before anything is loaded, `settings` reads `--set` and `--config`, `paths`
 says what files and folders have to be, `many` runs a verb for each of several inputs, `contacts` reads positions,
-`report` and `edit_report` say what fields and edits are, `output` prints.
+`report` says what fields are, `edits` edits them and says how, `output` prints.
 """
 
 import os

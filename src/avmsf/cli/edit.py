@@ -1,22 +1,19 @@
 """`avmsf edit`: a field in, the field of another material, size, pitch or sound out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from avmsf.cli.options import Configured, Flag
-from avmsf.cli.output import doing, next_command, print_json, say, show
+from avmsf.cli.output import next_command, print_json, show
 from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.cli.settings import with_settings
 from avmsf.editing.config import STABLE_AUDIO, EditSettings
 from avmsf.errors import EditError
-from avmsf.fem.material import Material, material_named
-
-if TYPE_CHECKING:
-    from avmsf.field.sound_field import SoundField
+from avmsf.fem.material import material_named
 
 _Pairs = tyro.conf.UseAppendAction[tuple[tuple[float, float], ...]]
 _MaterialName = Annotated[str | None, arg("MATERIAL")]
@@ -131,13 +128,13 @@ class Options(Configured):
 
 def run(options: Options) -> int:
     """Edit, write, and print the result."""
-    from avmsf.cli.edit_report import changes_table, contact_of_sounds, draw, mode_changes, notes_on
+    from avmsf.cli.edits import changes_table, contact_of_sounds, draw, edited, mode_changes, notes_on
     from avmsf.editing.modal_edit import EDITS, silenced
     from avmsf.field.store import load, save
 
     old = load(options.field)
     contact = contact_of_sounds(old, options.position)
-    new = _edited(options, old)
+    new = edited(options, old)
     save(new, options.output)
     for ending in ("checkpoint", "preview.wav") if options.guides else ():
         options.part(ending).unlink(missing_ok=True)
@@ -161,98 +158,3 @@ def run(options: Options) -> int:
     )
     next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
     return 0
-
-
-def _edited(options: Options, field: "SoundField") -> "SoundField":
-    """Return the edited field: material, size and modes by `edit`, then the guided edit."""
-    from avmsf.editing.material import edit, infer_material
-
-    settings = options.all_settings
-    new = None if options.to is None else material_named(options.to)
-    old: Material | None = None
-    target: Material | None = None
-    if options.old is not None:
-        old = material_named(options.old)
-    elif options.changes_material or options.like_material is not None:
-        old, words = infer_material(field, option="--from", new=new)
-        say(words)
-    if options.changes_material:
-        target = new or old
-        if target is not None and (constants := settings.material.constants):
-            target = replace(target, name=f"{target.name} with {', '.join(constants)} changed", **constants)
-    if options.changes_material or options.changes_modes:
-        adjusted = _adjustments(options, field) if options.changes_modes else dict[str, Any]()
-        law = settings.material.law
-        field = edit(field, material=target, old_material=old, size=options.scale, law=law, **adjusted)
-    return _guided(options, field, target or old) if options.guides else field
-
-
-def _adjustments(options: Options, field: "SoundField") -> dict[str, Any]:
-    """Return what `edit` does with each mode by hand; modes are called by their frequencies, Hz."""
-    import torch
-
-    from avmsf.editing.modal_edit import mode_at
-
-    levels = torch.zeros(len(field.bank), dtype=torch.float64)
-    pitch, decay = torch.full_like(levels, options.pitch), torch.full_like(levels, options.decay)
-    for frequency, level in options.mode_db:
-        levels[mode_at(field.bank, frequency, option="--mode-db")] += level
-    for frequency, factor in options.mode_pitch:
-        pitch[mode_at(field.bank, frequency, option="--mode-pitch")] *= factor
-    for frequency, factor in options.mode_decay:
-        decay[mode_at(field.bank, frequency, option="--mode-decay")] *= factor
-    return {"pitch": pitch, "decay": decay, "brightness_db": options.brightness, "gains_db": levels}
-
-
-def _guided(options: Options, field: "SoundField", old: Material | None) -> "SoundField":
-    """Return the field edited towards a prompt, recordings, or the sound of a material in place of `old`."""
-    from avmsf._utils.text import format_number
-    from avmsf.cli.output import display
-    from avmsf.cli.render import peak_factor, write_sound
-    from avmsf.editing.guided import PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
-    from avmsf.editing.reference import Reference
-    from avmsf.evaluation.clap import Clap
-
-    settings, preview, score = options.all_settings, options.part("preview.wav"), None
-    if settings.prompt.clap is not None and options.prompt is not None:
-        score = Clap.load(settings.prompt.clap).of_previews(options.prompt, field.sample_rate)
-    # After CLAP: a wrong name of its network is refused before the large model is loaded.
-    guide: Guide
-    if options.prompt is not None:
-        guide = _prompted(options.prompt, options, field.sample_rate)
-    elif options.like_material is not None:
-        assert old is not None
-        guide = Reference.of_material(field, old, material_named(options.like_material), seed=settings.guide.seed)
-    else:
-        guide = Reference.read(options.like, sample_rate=field.sample_rate)
-
-    def progress(reached: GuidedEditProgress) -> None:
-        message = f"loss {format_number(reached.loss)}, pitch x {format_number(reached.pitch, 4)}"
-        if reached.preview is not None:
-            sound = peak_factor(reached.preview[None]) * reached.preview
-            write_sound(preview, sound, sample_rate=field.sample_rate)
-            say(f"edit: step {reached.step} of {reached.steps}, {message}; preview in {preview}")
-        display.step("edit", reached.step, reached.steps, message)
-
-    return edit_towards(
-        field, guide, config=settings.guide, parameters=PARAMETERIZATIONS[settings.parameters], progress=progress,
-        score=score, checkpoint=options.part("checkpoint"),
-    )  # fmt: skip
-
-
-def _prompted(prompt: str, options: Options, sample_rate: float) -> Any:
-    """Return the guide by a text; write the sound of the text alone where that is asked for."""
-    from avmsf.cli.render import write_sound
-    from avmsf.editing.distillation import DecoderDistillation
-    from avmsf.editing.stable_audio import StableAudio
-
-    settings = options.all_settings.prompt
-    doing(f"loading {options.model}")
-    model = StableAudio.load(options.model, seconds=settings.model_seconds, device=settings.device)
-    if settings.generated is not None:
-        # Seconds of a sound that is generated from a prompt only.
-        seconds = 3.0 if settings.model_seconds is None else settings.model_seconds
-        seed = options.all_settings.guide.seed
-        made = model.generate(prompt, seconds=seconds, seed=seed)
-        write_sound(settings.generated, made, sample_rate=model.sample_rate)
-    return DecoderDistillation(model, prompt, sample_rate=sample_rate, config=settings.distillation)

@@ -1,6 +1,7 @@
-"""What an edit did to a field: a table of its modes, notes, pictures and sounds."""
+"""An edit of a field by the options of `avmsf edit`, and what it did: a table of modes, notes, pictures and sounds."""
 
 import math
+from dataclasses import replace
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,18 @@ from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
 from avmsf.cli.contacts import contacts_on
-from avmsf.cli.output import decimals, say, table
+from avmsf.cli.edit import Options
+from avmsf.cli.output import decimals, display, doing, say, table
 from avmsf.cli.render import peak_factor, write_sound
 from avmsf.cli.report import MAX_LISTED_MODES
-from avmsf.editing.guided import CLAP
-from avmsf.editing.modal_edit import remarks
+from avmsf.editing.distillation import DecoderDistillation
+from avmsf.editing.guided import CLAP, PARAMETERIZATIONS, Guide, GuidedEditProgress, edit_towards
+from avmsf.editing.material import edit, infer_material
+from avmsf.editing.modal_edit import mode_at, remarks
+from avmsf.editing.reference import Reference
+from avmsf.editing.stable_audio import StableAudio
+from avmsf.evaluation.clap import Clap
+from avmsf.fem.material import Material, material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.plotting.edits import draw_clap_curves, draw_edit
 from avmsf.plotting.pictures import save_picture
@@ -27,6 +35,80 @@ _LOUD_NOISE_DB = 6.0
 """Decrease of the modes' level, dB, from which on the noise, whose level stays, may be too loud: half the amplitude."""
 _FieldAt = tuple[SoundField, Float64[Tensor, " 3"]]
 """A field and a contact on it, meters."""
+
+
+def edited(options: Options, field: SoundField) -> SoundField:
+    """Return the edited field: material, size and modes by `edit`, then the guided edit."""
+    settings, old = options.all_settings, None
+    new = None if options.to is None else material_named(options.to)
+    if options.old is not None:
+        old = material_named(options.old)
+    elif options.changes_material or options.like_material is not None:
+        old, words = infer_material(field, option="--from", new=new)
+        say(words)
+    target = new or old if options.changes_material else None
+    if target is not None and (constants := settings.material.constants):
+        target = replace(target, name=f"{target.name} with {', '.join(constants)} changed", **constants)
+    if options.changes_material or options.changes_modes:
+        adjusted = _adjustments(options, field) if options.changes_modes else dict[str, Any]()
+        law = settings.material.law
+        field = edit(field, material=target, old_material=old, size=options.scale, law=law, **adjusted)
+    return _guided(options, field, target or old) if options.guides else field
+
+
+def _adjustments(options: Options, field: SoundField) -> dict[str, Any]:
+    """Return what `edit` does with each mode by hand; modes are called by their frequencies, Hz."""
+    levels = torch.zeros(len(field.bank), dtype=torch.float64)
+    pitch, decay = torch.full_like(levels, options.pitch), torch.full_like(levels, options.decay)
+    for frequency, level in options.mode_db:
+        levels[mode_at(field.bank, frequency, option="--mode-db")] += level
+    for frequency, factor in options.mode_pitch:
+        pitch[mode_at(field.bank, frequency, option="--mode-pitch")] *= factor
+    for frequency, factor in options.mode_decay:
+        decay[mode_at(field.bank, frequency, option="--mode-decay")] *= factor
+    return {"pitch": pitch, "decay": decay, "brightness_db": options.brightness, "gains_db": levels}
+
+
+def _guided(options: Options, field: SoundField, old: Material | None) -> SoundField:
+    """Return the field edited towards a prompt, recordings, or the sound of a material in place of `old`."""
+    settings, preview, score = options.all_settings, options.part("preview.wav"), None
+    if settings.prompt.clap is not None and options.prompt is not None:
+        score = Clap.load(settings.prompt.clap).of_previews(options.prompt, field.sample_rate)
+    # After CLAP: a wrong name of its network is refused before the large model is loaded.
+    guide: Guide
+    if options.prompt is not None:
+        guide = _prompted(options.prompt, options, field.sample_rate)
+    elif options.like_material is not None:
+        assert old is not None
+        guide = Reference.of_material(field, old, material_named(options.like_material), seed=settings.guide.seed)
+    else:
+        guide = Reference.read(options.like, sample_rate=field.sample_rate)
+
+    def progress(reached: GuidedEditProgress) -> None:
+        message = f"loss {format_number(reached.loss)}, pitch x {format_number(reached.pitch, 4)}"
+        if reached.preview is not None:
+            sound = peak_factor(reached.preview[None]) * reached.preview
+            write_sound(preview, sound, sample_rate=field.sample_rate)
+            say(f"edit: step {reached.step} of {reached.steps}, {message}; preview in {preview}")
+        display.step("edit", reached.step, reached.steps, message)
+
+    return edit_towards(
+        field, guide, config=settings.guide, parameters=PARAMETERIZATIONS[settings.parameters], progress=progress,
+        score=score, checkpoint=options.part("checkpoint"),
+    )  # fmt: skip
+
+
+def _prompted(prompt: str, options: Options, sample_rate: float) -> DecoderDistillation:
+    """Return the guide by a text; write the sound of the text alone where that is asked for."""
+    settings = options.all_settings.prompt
+    doing(f"loading {options.model}")
+    model = StableAudio.load(options.model, seconds=settings.model_seconds, device=settings.device)
+    if settings.generated is not None:
+        # Seconds of a sound that is generated from a prompt only.
+        seconds = 3.0 if settings.model_seconds is None else settings.model_seconds
+        made = model.generate(prompt, seconds=seconds, seed=options.all_settings.guide.seed)
+        write_sound(settings.generated, made, sample_rate=model.sample_rate)
+    return DecoderDistillation(model, prompt, sample_rate=sample_rate, config=settings.distillation)
 
 
 def mode_changes(old: SoundField, new: SoundField) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
