@@ -248,6 +248,8 @@ def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert (told["pipeline"]["extraction"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
     for name in ("modes", "gains", "spectrograms"):
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    # It has no body.
+    assert not (output / "surface.png").exists()
 
 
 PLACES = torch.tensor([[0.05, 0.03, 0.002], [0.05, 0.03, 0.002], [-0.04, 0.01, 0.002]], dtype=torch.float64)
