@@ -258,7 +258,6 @@ def test_towards_words(field: Path, asked: list[object]) -> None:
 
 
 WRONG: dict[str, tuple[str | None, object]] = {
-    "": ("options", None),
     "--from wood": ("--from", None),
     "--prompt bell --like like.wav": ("--prompt", ("--prompt", "--like")),
     "--like-material wood --like like.wav": ("--like", ("--like", "--like-material")),

@@ -60,7 +60,6 @@ def test_one_capture_and_one_object_will_do(plates: Path, tmp_path: Path, monkey
 
 
 WRONG = {
-    "farhest plates": ("protocol", "farhest"),
     "farthest plates --methods knn3,fild": ("method", "fild"),
     "farthest plates --objects c": ("object", "c"),
     "predefined plates": ("--test", None),

@@ -231,7 +231,6 @@ TABLES: dict[str, dict[str, Any]] = {
     "file,x,y,z\nhit.wav,120,40,0\n": {"row": 2},
 }
 WRONG: dict[str, dict[str, Any]] = {
-    "": {"name": "recordings", "value": 0},
     "nowhere.wav": {"file": "nowhere.wav"},
     "FOLDER": {"value": "a folder"},
     "HIT --probability 1.5": {"name": "--probability", "value": 1.5},

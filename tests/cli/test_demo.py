@@ -92,8 +92,6 @@ def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path
     blocked.write_text("")
     with raises(OutputError, file=blocked, value="file"):
         run_verb("suggest", str(field), "--output", str(blocked))
-    with raises(FitError, name="--unseen"):
-        run_verb("suggest", str(field), "--unseen", "--candidates", str(tmp_path))
 
 
 NETWORK = ("--gain-model", "network", "--without-shape", *TINY)
