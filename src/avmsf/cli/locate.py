@@ -121,7 +121,7 @@ def run(options: Options) -> int:
     results = {"impacts": found, "summary": summary, "failures": failures}
     print_json({"field": str(options.field), "quality": verdict, **results})
     located = [each["position"] is not None for each in found]
-    if any(located) and len(field.gain_field.contacts) and not field.origin.report.get(EDITS):
+    if any(located) and field.has_posterior and not field.origin.report.get(EDITS):
         next_command("avmsf suggest", options.field)
     return UNLOCATED if failures or not all(located) else 0
 
