@@ -57,24 +57,20 @@ def describe(field: SoundField) -> dict[str, Any]:
     }
 
 
-def _levels_words(levels: Sequence[float] | None) -> str:
-    """Return the range of the levels by which recordings without forces were divided, if they were."""
-    decibels = [20.0 * math.log10(each) for each in levels or ()]
-    if not decibels:
-        return ""
-    return f", over levels found from their gains, {min(decibels):+.1f} to {max(decibels):+.1f} dB; quality is at these"
-
-
 def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list[str]:
     """Return lines on a field in the file `path`: what it is and how good it is; all with `settings`."""
     values = describe(field)
     report = values["report"]
     reason = f" ({report['damping_reason']})" if "damping_reason" in report else ""
     modes = modes_words(len(field.bank), values["supporting_pole_count"])
+    recordings, changes = counted(len(values["trained_on"]), "recording"), report.get("levels")
+    if changes:
+        low, high = (20.0 * math.log10(each) for each in (min(changes), max(changes)))
+        recordings += f", over levels found from their gains, {low:+.1f} to {high:+.1f} dB; quality is at these"
     rows = [
         ("modes", f"{modes}, {report.get('damping', 'shared')} damping{reason}"),
         ("gains", _gains_words(values["gain_field"])),
-        ("fitted to", counted(len(values["trained_on"]), "recording") + _levels_words(report.get("levels"))),
+        ("fitted to", recordings),
     ]
     if settings:
         extent = ", ".join(
@@ -100,7 +96,9 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
     if (shift := report.get("frequency_shift")) is not None:
         rows.append(("shifts", f"frequencies differ between recordings by {100 * shift:.2g} %, fitted in each"))
     rows += [("quality", words) for words in quality_words(field, path)]
-    rows += [("outlier", words) for words in outlier_words(field)]
+    for name, words in report.get("outliers", {}).items():
+        done = "left out of the fit" if name in report.get("excluded", ()) else "used in the fit all the same"
+        rows.append(("outlier", f"{done}: {words}"))
     rows += [("edited", _edit_words(edit)) for edit in report.get("edits", [])]
     if report.get("validated"):
         held = report.get("validation_spectral", {})
@@ -149,16 +147,6 @@ def quality_words(field: SoundField, path: Path) -> list[str]:
         return []
     more = f" More contacts: avmsf suggest {shlex.quote(str(path))}" if field.quality.advice else ""
     return [f"{field.quality}{more}"]
-
-
-def outlier_words(field: SoundField) -> list[str]:
-    """Return a line for each recording that contradicts the others: what was done, and why it may be."""
-    report = field.origin.report
-    lines = []
-    for name, words in report.get("outliers", {}).items():
-        done = "left out of the fit" if name in report.get("excluded", ()) else "used in the fit all the same"
-        lines.append(f"{done}: {words}")
-    return lines
 
 
 def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction) -> dict[str, Scores]:
