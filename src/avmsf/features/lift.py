@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -94,27 +95,21 @@ def lift(
     encoder: Encoder,
     *,
     rasterizer: Rasterizer | None = None,
-    weighting: Weighting = by_presence,
-    inpainted: bool = True,
-    progress: Callable[[int, int, str], None] | None = None,
+    **settings: Any,
 ) -> Lifted:
     """Give every Gaussian the mean of the features at its places in the views that see it.
 
     A view sees a Gaussian whose center lies inside its mask, where it has one, and no deeper than the depth that the
     cloud shows there plus the Gaussian's own standard deviation along the view and two pixels: a surface of Gaussians
-    is as thick as they are. The `rasterizer` is by default the one for the cloud's device. Raises as `lift_points`.
+    is as thick as they are. The `rasterizer` is by default the one for the cloud's device. `settings` are the
+    `weighting`, `inpainted` and `progress` of `lift_points`. Raises as that.
     """
-    rasterizer = choose_rasterizer(cloud.centers.device) if rasterizer is None else rasterizer
-    return lift_points(
-        cloud.centers,
-        views,
-        encoder,
-        depth_map=depth_of_cloud(cloud, rasterizer),
-        reach=lambda camera: _DEPTH_DEVIATIONS * depth_reach(cloud, camera),
-        weighting=weighting,
-        inpainted=inpainted,
-        progress=progress,
-    )
+    depth_map = depth_of_cloud(cloud, rasterizer or choose_rasterizer(cloud.centers.device))
+
+    def reach(camera: Camera) -> Float[Tensor, " points"]:
+        return _DEPTH_DEVIATIONS * depth_reach(cloud, camera)
+
+    return lift_points(cloud.centers, views, encoder, depth_map=depth_map, reach=reach, **settings)
 
 
 def lift_points(
