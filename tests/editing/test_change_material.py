@@ -7,12 +7,8 @@ import pytest
 import torch
 
 from avmsf.editing.material import (
-    ACCELERATION,
-    DISPLACEMENT,
     LAWS,
     MAX_MISMATCH,
-    RATIO_ONLY,
-    VELOCITY,
     change_material,
     edit,
     guess_materials,
@@ -86,13 +82,13 @@ def test_a_plate_of_another_material_and_size_is_the_one_in_closed_form(size):
     undamped = 3000.0
     expected = plate_modes(plate_of(OTHER, size=size), size * CONTACTS, highest=undamped * faster)
     # A plate's gains are pseudo-velocities, see `oracles.plate`.
-    found = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=VELOCITY)
+    found = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law="velocity")
     torch.testing.assert_close(found.bank.frequency, expected.frequency, rtol=1e-13, atol=0)
     torch.testing.assert_close(found.bank.damping, expected.damping, rtol=1e-13, atol=0)
     gains = gains_of(found, size * CONTACTS)[0]
     torch.testing.assert_close(gains, expected.gains, rtol=0, atol=SMALL_FLOAT * float(expected.gains.abs().max()))
     # Displacements are those over the damped angular frequency, accelerations are times it.
-    for law, power in ((DISPLACEMENT, 1.0), (ACCELERATION, -1.0)):
+    for law, power in (("displacement", 1.0), ("acceleration", -1.0)):
         other = change_material(plate_field(steel, highest=undamped), steel, OTHER, size=size, law=law)
         start = plate_modes(plate_of(steel), CONTACTS, highest=undamped).frequency
         ratio = gains_of(other, size * CONTACTS)[0] / gains
@@ -101,7 +97,7 @@ def test_a_plate_of_another_material_and_size_is_the_one_in_closed_form(size):
 
 def test_the_law_of_the_paper_divides_gains_by_the_change_of_the_frequency():
     field = plate_field(CERAMIC)
-    found = change_material(field, CERAMIC, WOOD, size=2.0, law=RATIO_ONLY)
+    found = change_material(field, CERAMIC, WOOD, size=2.0, law="ratio-only")
     change = gains_of(found, 2.0 * CONTACTS) / gains_of(field, CONTACTS)
     expected = field.bank.frequency / found.bank.frequency
     torch.testing.assert_close(change, expected.expand_as(change), rtol=1e-6, atol=0)

@@ -205,7 +205,7 @@ def write(path: Path, sound: torch.Tensor, *, rate: float = RATE, before: int = 
 
 def struck(**change: float) -> FieldAtContacts:
     field = ringing_field(**change)
-    return FieldAtContacts.at(field, field.gain_field.points, samples=field.samples)
+    return FieldAtContacts(field, field.known(field.gain_field.points), field.samples)
 
 
 def test_a_recording_begins_at_its_onset_at_the_fields_rate(tmp_path):

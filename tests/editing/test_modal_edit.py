@@ -177,7 +177,7 @@ def test_what_is_optimized_is_what_the_edited_field_renders(pitch):
     # At 2.5 times the pitch two modes lie above half the rate, and are silent in both.
     field, edit = plate_field("elastic"), made_edit(pitch=pitch)
     contacts = places(4, seed=6)
-    sounds = FieldAtContacts.at(field, contacts, samples=field.samples).sounds(edit)
+    sounds = FieldAtContacts(field, field.known(contacts), field.samples).sounds(edit)
     rendered = edit.of(field).render(contacts)
     torch.testing.assert_close(sounds, rendered, rtol=0, atol=2e-6 * float(rendered.abs().max()))
 

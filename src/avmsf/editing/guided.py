@@ -333,7 +333,7 @@ class _Optimization:
     def _at(self, contacts: Float[Tensor, "contacts 3"]) -> FieldAtContacts:
         seconds = self.config.seconds
         samples = self.field.samples if seconds is None else round(seconds * self.field.sample_rate)
-        return FieldAtContacts.at(self.field, contacts, samples=max(1, samples))
+        return FieldAtContacts(self.field, self.field.known(contacts), max(1, samples))
 
     def _save(self) -> None:
         values = {name: value.detach() for name, value in self.values.items()}

@@ -36,16 +36,17 @@ class GainLaw:
     """Power of the frequencies."""
 
 
-DISPLACEMENT = GainLaw("displacement", mass=1.0, frequency=1.0)
-"""The full law, for gains that are displacements: a' = a (r' / r)^(-1) s^(-3) f / f'."""
-VELOCITY = GainLaw("velocity", mass=1.0, frequency=0.0)
-"""The full law for gains that are velocities, as a laser vibrometer's are."""
-ACCELERATION = GainLaw("acceleration", mass=1.0, frequency=-1.0)
-"""The full law for gains that are accelerations, which what a microphone close by hears goes with."""
-RATIO_ONLY = GainLaw("ratio-only", mass=0.0, frequency=1.0)
-"""The paper's law, a' = a f / f', which leaves mass and size out."""
-LAWS = {law.name: law for law in (DISPLACEMENT, VELOCITY, ACCELERATION, RATIO_ONLY)}
-"""All of them, by name."""
+LAWS = {
+    law.name: law
+    for law in (
+        GainLaw("displacement", mass=1.0, frequency=1.0),
+        GainLaw("velocity", mass=1.0, frequency=0.0),
+        GainLaw("acceleration", mass=1.0, frequency=-1.0),
+        GainLaw("ratio-only", mass=0.0, frequency=1.0),
+    )
+}
+"""By name: gains that are displacements, velocities, as a laser vibrometer's are, or accelerations, which what a
+microphone close by hears goes with; and the paper's law, a' = a f / f', which leaves mass and size out."""
 
 
 def change_material(
@@ -54,7 +55,7 @@ def change_material(
     new: Material | str,
     *,
     size: float = 1.0,
-    law: GainLaw | str = DISPLACEMENT,
+    law: GainLaw | str = "displacement",
 ) -> SoundField:
     """Return the field of an object of the same shape, `size` times as large, in a new material.
 
@@ -249,7 +250,7 @@ def edit(
     material: Material | str | None = None,
     old_material: Material | str | None = None,
     size: float = 1.0,
-    law: GainLaw | str = DISPLACEMENT,
+    law: GainLaw | str = "displacement",
     pitch: Slider = 1.0,
     decay: Slider = 1.0,
     brightness_db: float = 0.0,

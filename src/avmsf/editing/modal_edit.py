@@ -251,14 +251,9 @@ class FieldAtContacts:
 
     field: SoundField
     known: Gains
-    """Of the field itself at the contacts."""
+    """Of the field itself at the contacts, for impacts along the inward normals: `SoundField.known`."""
     samples: int
     """Length of the sounds."""
-
-    @classmethod
-    def at(cls, field: SoundField, contacts: Float[Tensor, "contacts 3"], *, samples: int) -> "FieldAtContacts":
-        """Evaluate a field at contacts (object frame, meters) for impacts along the inward normals."""
-        return cls(field, field.known(contacts), samples)
 
     def first(self, count: int) -> "FieldAtContacts":
         """Return the field at the first `count` of the contacts."""
