@@ -189,7 +189,7 @@ def _record(field: SoundField) -> dict[str, Any]:
         "gains": {"kind": field.gain_field.kind, **field.gain_field.record()},
         "alignment": None
         if alignment is None
-        else {"modes": len(alignment.phases.bank), "names": alignment.names, "keys": alignment.keys},
+        else {"modes": len(alignment.bank), "names": alignment.names, "keys": alignment.keys},
         "config": without_defaults(asdict(field.origin.config), ADDED_SETTINGS) | REMOVED_SETTINGS,
         "origin": origin | {"settings": asdict(field.origin.settings)},
     }

@@ -98,7 +98,9 @@ class ForcePulse:
         if count == 1:
             return torch.ones(1, dtype=torch.float64)
         ends = np.minimum(np.arange(count + 1) / (self.contact_time * sample_rate), 1.0)
-        return torch.from_numpy(np.diff(_impulse_until(ends, _EXPONENTS[self.shape])))
+        # The integral of sin(pi t)^exponent from 0 to each time, over that from 0 to 1.
+        rising = betainc((_EXPONENTS[self.shape] + 1) / 2, 0.5, np.sin(np.pi * ends) ** 2) / 2
+        return torch.from_numpy(np.diff(np.where(ends <= 0.5, rising, 1.0 - rising)))
 
     def soften(
         self, sounds: Float[Tensor, "contacts samples"], *, sample_rate: float
@@ -113,9 +115,3 @@ class ForcePulse:
         length = sounds.shape[1] + len(pulse) - 1
         spectrum = torch.fft.rfft(sounds.double(), n=length) * torch.fft.rfft(pulse, n=length)
         return torch.fft.irfft(spectrum, n=length)[:, : sounds.shape[1]].to(sounds.dtype)
-
-
-def _impulse_until(time: Float64[np.ndarray, " times"], exponent: float) -> Float64[np.ndarray, " times"]:
-    """Return the integral of sin(pi t)^exponent from 0 to each time, over that from 0 to 1."""
-    rising = betainc((exponent + 1) / 2, 0.5, np.sin(np.pi * time) ** 2) / 2
-    return np.where(time <= 0.5, rising, 1.0 - rising)

@@ -101,7 +101,7 @@ def test_a_recording_with_phases_of_its_own_is_named_and_moved_as_most_are() -> 
     found = align(damped(gains(10, 6), starts, phase=phase, noise_db=-50.0))
     kept = found.agreement > 0.5
     assert kept.tolist() == [row != 4 for row in range(10)]
-    assert abs(found.delays[4] - found.phases.start) < found.phases.jitter
+    assert abs(found.delays[4] - found.start) < found.jitter
     assert error(found.delays[kept], starts[kept]) < 0.05
 
 

@@ -38,7 +38,7 @@ def selection(sounds: Tensor, *, noise: float = 1e-3) -> Selection:
 
 def select(sounds: Tensor, found: ModalBank, *, noise: float = 1e-3) -> ModalBank:
     chosen = selection(sounds, noise=noise)
-    return chosen.select(bank_of([], []), chosen.candidates(found), range_db=60.0)
+    return chosen.select(bank_of([], []), found, chosen.measure(found), range_db=60.0)
 
 
 def with_others(frequency: list[float], damping: list[float]) -> ModalBank:
@@ -132,11 +132,11 @@ def explained(sounds: Tensor, bank: ModalBank) -> float:
 def test_what_the_chosen_explain_one_after_another_is_what_they_explain_together(known: list[int]):
     sounds = record(TRUTH, noise=1e-3)
     bank = bank_of([299.0, 300.0, 700.0, 703.0, 704.0, 1500.0, 2900.0], [4.0, 5.0, 6.0, 7.0, 9.0, 30.0, 80.0])
-    both = selection(sounds).candidates(bank)
+    measured = selection(sounds).measure(bank)
     given = torch.zeros(len(bank), dtype=torch.bool)
     given[known] = True
     inner = gram(poles_of(bank, RATE), SAMPLES, power=0)
-    energy = choose(inner, both.products, both.noise, given, significance=6.0, reach=1e-6)
+    energy = choose(inner, *measured, given, significance=6.0, reach=1e-6)
     assert (energy[given] == 0).all()
     alone = bank.take(given)
     taken = (energy > 0) | given

@@ -25,6 +25,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Complex128, Float64
 from torch import Tensor
@@ -68,25 +69,6 @@ _CONVERGED_SAMPLES = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Phases:
-    """The phases that modes have at the common start, with what aligning another recording by them needs."""
-
-    __repr__ = short_repr
-
-    bank: ModalBank
-    doubled: Complex128[Tensor, " modes"]
-    """Sum over recordings of the concentration times exp(2 i phase)."""
-    power: Float64[Tensor, " modes"]
-    """Mean over recordings of the squared amplitude, each recording scaled to unit energy in the modes."""
-    spread: Float64[Tensor, " modes"]
-    """Variance across the phase over the geometric mean of `power` and the amplitude's own square."""
-    jitter: float
-    """Median distance of the delays from `start`, samples."""
-    start: float
-    """Delay of a usual recording, their median."""
-
-
-@dataclass(frozen=True, eq=False)
 class Alignment:
     """How recordings were aligned with one another."""
 
@@ -101,9 +83,20 @@ class Alignment:
     """Coherence of the phases as read, from 0 to 1 (`coherence`)."""
     coherence_after: float
     """The same after alignment."""
-    phases: Phases
     keys: tuple[str, ...]
     """What the recordings are recognized by (`recording_keys`)."""
+    bank: ModalBank
+    """Modes by whose phases they were aligned; with the next three others are aligned as they are."""
+    doubled: Complex128[Tensor, " modes"]
+    """Sum over recordings of the concentration times exp(2 i phase), at the common start."""
+    power: Float64[Tensor, " modes"]
+    """Mean over recordings of the squared amplitude, each recording scaled to unit energy in the modes."""
+    spread: Float64[Tensor, " modes"]
+    """Variance across the phase over the geometric mean of `power` and the amplitude's own square."""
+    jitter: float
+    """Median distance of the delays from `start`, samples."""
+    start: float
+    """Delay of a usual recording, their median."""
 
     def apply(self, impacts: Impacts) -> Impacts:
         """Return recordings cut anew at the common start: known ones by their delays, others by their phases.
@@ -120,36 +113,43 @@ class Alignment:
         others = torch.tensor([row for row, key in enumerate(keys) if key not in known], dtype=torch.long)
         if len(others) and bool((self.delays != 0).any()):
             new, reach = impacts.take(others.tolist()), float(impacts.before.shape[1])
-            delays[others] = _delays_alone(new, self.phases, usual=self.phases.start, reach=reach)
+            delays[others] = self._delays_alone(new, usual=self.start, reach=reach)
             # Once more, from sounds that start where the first estimate says.
-            moved = new.delayed(delays[others])
-            delays[others] += _delays_alone(moved, self.phases, usual=0.0, reach=reach)
+            delays[others] += self._delays_alone(new.delayed(delays[others]), usual=0.0, reach=reach)
         return impacts.delayed(delays)
+
+    def _delays_alone(self, impacts: Impacts, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
+        """Return the delays by which recordings agree with the phases; `usual` for one that surely does not."""
+        background = background_power(impacts.sounds, self.bank, impacts.sample_rate)
+        measured = MeasuredPhases(impacts, self.bank, reach=reach, background=background, power=self.power)
+        prior = DelayPrior(torch.tensor([usual], dtype=torch.float64), self.jitter)
+        delays, odds, _ = measured.search(self.spread, self.doubled.expand(len(impacts), -1), prior)
+        return prior.median(delays, odds.sigmoid())
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what a file holds besides the names and keys, by name; of the agreement whether it is likely."""
-        phases = self.phases
-        numbers = [self.coherence_before, self.coherence_after, phases.jitter, phases.start]
+        numbers = [self.coherence_before, self.coherence_after, self.jitter, self.start]
         return {
             "delays": self.delays,
             "agrees": self.agreement > 0.5,
             "numbers": torch.tensor(numbers, dtype=torch.float64),
-            "frequency": phases.bank.frequency,
-            "damping": phases.bank.damping,
-            "doubled": torch.view_as_real(phases.doubled),
-            "power": phases.power,
-            "spread": phases.spread,
+            **vars(self.bank),
+            "doubled": torch.view_as_real(self.doubled),
+            "power": self.power,
+            "spread": self.spread,
         }
 
     @classmethod
     def skeleton(cls, recordings: int, modes: int) -> dict[str, Tensor]:
         """Return tensors on the device `meta`, of the names, shapes and types that `tensors` has for these sizes."""
-        sizes = {"delays": (recordings,), "agrees": (recordings,), "numbers": (4,), "doubled": (modes, 2)}
-        sizes |= dict.fromkeys(("frequency", "damping", "power", "spread"), (modes,))
-        kinds = {"agrees": torch.bool}
-        return {
-            name: torch.empty(size, dtype=kinds.get(name, torch.float64), device="meta") for name, size in sizes.items()
+        each, mode = (torch.empty(size, dtype=torch.float64, device="meta") for size in (recordings, modes))
+        empty = {
+            "delays": each,
+            "agrees": each.bool(),
+            "numbers": each.new_empty(4),
+            "doubled": mode.new_empty(modes, 2),
         }
+        return empty | dict.fromkeys(("frequency", "damping", "power", "spread"), mode)
 
     @classmethod
     def restore(cls, tensors: Mapping[str, Tensor], names: Sequence[str], keys: Sequence[str]) -> "Alignment":
@@ -157,8 +157,8 @@ class Alignment:
         before, after, jitter, start = tensors["numbers"].tolist()
         bank = ModalBank(tensors["frequency"], tensors["damping"])
         doubled = torch.view_as_complex(tensors["doubled"].contiguous())
-        phases = Phases(bank, doubled, tensors["power"], tensors["spread"], jitter, start)
-        return cls(tuple(names), tensors["delays"], tensors["agrees"].double(), before, after, phases, tuple(keys))
+        known = tuple(names), tensors["delays"], tensors["agrees"].double(), before, after, tuple(keys)
+        return cls(*known, bank, doubled, tensors["power"], tensors["spread"], jitter, start)
 
 
 def align(impacts: Impacts) -> Alignment | None:
@@ -175,23 +175,22 @@ def align(impacts: Impacts) -> Alignment | None:
     background = background_power(impacts.sounds, bank, impacts.sample_rate)
     measured = MeasuredPhases(impacts, bank, reach=reach, background=background)
     before = after = coherence(measured.amplitude, bank.damping)
-    delays, agreement, phases = _estimate(measured, exact=0.0 if has_lead else _STILL_LOG_ODDS)
+    fit, agreement = _estimate(measured, exact=0.0 if has_lead else _STILL_LOG_ODDS)
+    delays, offset = fit.delays, 0.0
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
         for reached, vague in ((reach, _USUAL_RECORDINGS), (_LAST_REACH_SAMPLES, 0.0)):
             measured = MeasuredPhases(impacts.delayed(delays), bank, reach=reached, background=background)
-            further, agreement, phases = _estimate(measured, earlier=delays, vague=vague)
-            delays = delays + further
-        # The phases are those at the recordings' common start, which moves with the offset.
+            fit, agreement = _estimate(measured, earlier=delays, vague=vague)
+            delays = delays + fit.delays
         offset = _common_onset(impacts, delays, agreement) if has_lead else -float(delays.min())
         delays = delays + offset
-        phases = replace(
-            phases,
-            start=_weighted_median(delays, agreement),
-            doubled=phases.doubled * torch.exp(1j * offset * measured.turn),
-        )
-        after = coherence(measured.delayed_amplitude(further + offset), bank.damping)
-    return Alignment(impacts.names, delays, agreement, before, after, phases, recording_keys(impacts))
+        after = coherence(measured.delayed_amplitude(fit.delays + offset), bank.damping)
+    # The phases are those at the recordings' common start, which moves with the offset.
+    doubled = (agreement[:, None] * fit.turned).sum(0) * torch.exp(1j * offset * measured.turn)
+    known = impacts.names, delays, agreement, before, after, recording_keys(impacts)
+    start = float(np.quantile(delays.numpy(), 0.5, weights=agreement.numpy(), method="inverted_cdf"))
+    return Alignment(*known, bank, doubled, measured.power, fit.spread, fit.prior.scale, start)
 
 
 def strongest_modes(impacts: Impacts) -> ModalBank:
@@ -219,12 +218,6 @@ def coherence(amplitude: Complex128[Tensor, "contacts modes"], damping: Float64[
     return float(summed / energy.sum().clamp_min(torch.finfo(torch.float64).tiny))
 
 
-def _weighted_median(values: Float64[Tensor, " contacts"], weights: Float64[Tensor, " contacts"]) -> float:
-    order = torch.argsort(values)
-    total = weights[order].cumsum(0)
-    return float(values[order][int(torch.searchsorted(total, total[-1] / 2))])
-
-
 def _common_onset(
     impacts: Impacts, delays: Float64[Tensor, " contacts"], agreement: Float64[Tensor, " contacts"]
 ) -> float:
@@ -242,15 +235,6 @@ def _common_onset(
     # Noise within 10 dB of the sounds hides all but their loudest.
     threshold = min(max(0.01 * highest, 10 * float(mean[: _ONSET_FRACTIONS * lead // 2].median())), highest)
     return float((mean >= threshold).nonzero()[0, 0]) / _ONSET_FRACTIONS - lead
-
-
-def _delays_alone(impacts: Impacts, phases: Phases, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
-    """Return the delays by which recordings agree with known phases; `usual` for one that surely does not."""
-    background = background_power(impacts.sounds, phases.bank, impacts.sample_rate)
-    measured = MeasuredPhases(impacts, phases.bank, reach=reach, background=background, power=phases.power)
-    prior = DelayPrior(torch.tensor([usual], dtype=torch.float64), phases.jitter)
-    delays, odds, _ = measured.search(phases.spread, phases.doubled.expand(len(impacts), -1), prior)
-    return prior.median(delays, odds.sigmoid())
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,8 +256,8 @@ def _estimate(
     earlier: Float64[Tensor, " contacts"] | None = None,
     vague: float = _USUAL_RECORDINGS,
     exact: float = 0.0,
-) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"], Phases]:
-    """Return the delays' medians, the probabilities that recordings agree, and the phases at the delayed starts.
+) -> tuple[_Fit, Float64[Tensor, " contacts"]]:
+    """Return a fit with the delays' medians, and the probabilities that recordings agree.
 
     `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all are
     zero where that is likelier, with `exact` added to its log odds a recording. `vague` as in `MeasuredPhases.spread`.
@@ -282,7 +266,7 @@ def _estimate(
         prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _MAX_JITTER_SAMPLES)
         energy = measured.squares / measured.bank.damping
         broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_MAX_REFERENCES]
-        fits: list[_Fit] = []
+        fits = list[_Fit]()
         for reference in broadest.tolist():
             fits.append(_climb(measured, prior, reference=reference, known=fits))
         still = _unmoved(measured)
@@ -296,9 +280,7 @@ def _estimate(
     for _ in range(_MAX_ROUNDS):
         share = (agreement.sum() + 1) / (len(odds) + 2)
         agreement = (odds + share.logit()).sigmoid()
-    doubled = (agreement[:, None] * fit.turned).sum(0)
-    delays = fit.prior.median(fit.delays, agreement)
-    return delays, agreement, Phases(measured.bank, doubled, measured.power, fit.spread, fit.prior.scale, 0.0)
+    return replace(fit, delays=fit.prior.median(fit.delays, agreement)), agreement
 
 
 def _climb(

@@ -25,7 +25,7 @@ from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.alignment import Alignment, align, recording_keys
 from avmsf.modal.extraction.esprit import SHORTEST
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_frequency
-from avmsf.modal.extraction.frequency_shifts import FrequencyShifts
+from avmsf.modal.extraction.frequency_shifts import FrequencyShifts, modal_sounds
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
@@ -123,7 +123,7 @@ def extract_sounds(
         modes = synthesize(gains, bank.frequency, bank.damping, samples=samples, sample_rate=sample_rate)
     else:
         bank, gains = shifts.bank, shifts.gains(sounds, sample_rate=sample_rate)
-        modes = shifts.modal_sounds(gains, samples=samples, sample_rate=sample_rate)
+        modes = modal_sounds(shifts.poles, gains, samples, sample_rate)
     return Extraction(bank, gains, estimate_residual(sounds, modes, bins=noise_bins(samples)), shifts=shifts)
 
 

@@ -98,10 +98,10 @@ class HighResolution(ModeFinder):
 
     def _select(self, selection: Selection, found: ModalBank, lowest: float) -> ModalBank:
         """Return those of `found` that the sounds need, refined."""
-        weighed, bank, rate = selection.candidates(found), _EMPTY, selection.sample_rate
+        measured, bank, rate = selection.measure(found), _EMPTY, selection.sample_rate
         rounds = [*torch.arange(20.0, self.range_db, 20.0).tolist(), self.range_db, self.range_db]
         for turn, range_db in enumerate(rounds, 1):
-            bank = selection.prune(selection.select(bank, weighed, range_db=range_db), range_db=range_db)
+            bank = selection.prune(selection.select(bank, found, measured, range_db=range_db), range_db=range_db)
             iterations = 20 if turn == len(rounds) else 6
             bank = refine(selection.sounds, bank, sample_rate=rate, iterations=iterations)
             bank = selection.prune(bank.take(bank.frequency >= lowest), range_db=range_db)

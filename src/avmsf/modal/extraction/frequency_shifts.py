@@ -20,6 +20,7 @@ import math
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Complex, Complex128, Float, Float64, Int64
 from scipy.stats import f as f_distribution
@@ -94,20 +95,13 @@ class FrequencyShifts:
         ]
         return torch.complex(*torch.cat(found).to(sounds.dtype).chunk(2, dim=1))
 
-    def modal_sounds(
-        self, gains: Complex[Tensor, "contacts modes"], *, samples: int, sample_rate: float
-    ) -> Float[Tensor, "contacts samples"]:
-        """Return the modes of each recording at its own poles."""
-        return _rung(self.poles, gains, samples, sample_rate)
-
     def removed(
         self, sounds: Float[Tensor, "contacts samples"], gains: Complex[Tensor, "contacts modes"], *, sample_rate: float
     ) -> Float[Tensor, "contacts samples"]:
         """Return the sounds as they would be if each mode had its mean pole in all of them."""
         samples = sounds.shape[1]
-        own = self.modal_sounds(gains, samples=samples, sample_rate=sample_rate)
         common = synthesize(gains, self.bank.frequency, self.bank.damping, samples=samples, sample_rate=sample_rate)
-        return sounds + (common - own).to(sounds.dtype)
+        return sounds + (common - modal_sounds(self.poles, gains, samples, sample_rate)).to(sounds.dtype)
 
 
 def find_shifts(
@@ -174,7 +168,7 @@ class _Search:
         self.sounds, self.rate, self.samples = sounds, sample_rate, sounds.shape[1]
         poles = torch.complex(-bank.damping, 2 * math.pi * bank.frequency)
         gains = fit_gains(sounds, bank, sample_rate=sample_rate)
-        self.left = sounds - _rung(poles, gains, self.samples, sample_rate)
+        self.left = sounds - modal_sounds(poles, gains, self.samples, sample_rate)
         """What the bands' modes, as they are known so far, leave of the sounds."""
         energy = (gains.abs().square() / bank.damping).sum(0)
         groups = sorted(_groups(bank), key=lambda rows: -float(energy[rows].sum()))
@@ -195,11 +189,11 @@ class _Search:
             if float((-common.real / common.imag).max()) > _TOLERANCES.pitched / 2:
                 settled += float(before.energy)
                 continue
-            sounds = self.left + _rung(before.poles, before.gains, self.samples, self.rate)
+            sounds = self.left + modal_sounds(before.poles, before.gains, self.samples, self.rate)
             band = _Band.of(sounds, common, self.rate).without_mirrored(before.poles, before.gains)
             mean, poles, variance = band.own_poles(common, shift, drift)
             self.known[row] = found = _Found(mean, poles, band.gains(poles), variance, before.energy)
-            self.left = sounds - _rung(poles, found.gains, self.samples, self.rate)
+            self.left = sounds - modal_sounds(poles, found.gains, self.samples, self.rate)
             settled += float(found.energy) * (found.poles.ndim == 1)
             if settled >= half:
                 return None
@@ -399,13 +393,12 @@ def _groups(bank: ModalBank) -> list[list[int]]:
     return groups
 
 
-def _rung(
+def modal_sounds(
     poles: Complex128[Tensor, "*#contacts modes"], gains: Complex[Tensor, "contacts modes"], samples: int, rate: float
 ) -> Float[Tensor, "contacts samples"]:
+    """Return the sum of modes of the given poles -d + 2 pi i f, 1/s, common ones or each recording's own."""
     return synthesize(gains, poles.imag / (2 * math.pi), -poles.real, samples=samples, sample_rate=rate)
 
 
 def _median(values: Float64[Tensor, " values"], weights: Float64[Tensor, " values"]) -> Float64[Tensor, ""]:
-    order = torch.argsort(values)
-    share = weights[order].cumsum(0) / weights.sum()
-    return values[order][torch.searchsorted(share, 0.5).clamp_max(len(values) - 1)]
+    return values.new_tensor(np.quantile(values.numpy(), 0.5, weights=weights.numpy(), method="inverted_cdf"))

@@ -177,13 +177,14 @@ class MeasuredPhases:
         toward, level = pull * torch.exp(1j * (2 * self.phase - doubled.angle())), log_i0(pull)
         candidates = self._candidates(toward, prior)
         turned = toward[:, None] * torch.exp(1j * self.turn * candidates[:, :, None])
-        robust = _agreement(turned, level[:, None]) + prior.log_density(candidates.T).T
+        robust = _log_odds(_inlier_odds(turned, level[:, None])) + prior.log_density(candidates.T).T
         delays = candidates.gather(1, robust.argmax(1, keepdim=True))[:, 0]
 
         def derivatives() -> tuple[Tensor, Tensor, Tensor]:
             turned = toward * torch.exp(1j * self.turn * delays[:, None])
-            likely = turned * _inlier_probability(turned, level)
-            return turned, -(self.turn * likely.imag).sum(1), (self.turn.square() * likely.real).sum(1)
+            odds = _inlier_odds(turned, level)
+            likely = turned * (odds / (odds + _OUTLIER_SHARE))
+            return odds, -(self.turn * likely.imag).sum(1), (self.turn.square() * likely.real).sum(1)
 
         for _ in range(_MAX_NEWTON_STEPS):
             _, slope, bend = derivatives()
@@ -191,8 +192,8 @@ class MeasuredPhases:
             delays = delays + step
             if float(step.abs().max()) < _CONVERGED_SAMPLES:
                 break
-        turned, _, bend = derivatives()
-        return delays, _agreement(turned, level) + occam_factor(prior, delays, bend)
+        odds, _, bend = derivatives()
+        return delays, _log_odds(odds) + occam_factor(prior, delays, bend)
 
     def _candidates(
         self, toward: Complex128[Tensor, "contacts modes"], prior: DelayPrior
@@ -207,23 +208,19 @@ class MeasuredPhases:
         return self.grid[torch.topk(peaks, min(_MAX_CANDIDATES, len(self.grid)), dim=1).indices]
 
 
-def _agreement(
+def _inlier_odds(
     toward: Complex128[Tensor, "*delays modes"], level: Float64[Tensor, "*#delays modes"]
-) -> Float64[Tensor, "*delays"]:
-    """Return the log odds that phases lie about the others' mean, against anywhere.
+) -> Float64[Tensor, "*delays modes"]:
+    """Return the density of phases that lie about the others' mean, over that of phases anywhere, times their share.
 
-    `toward` is the concentration times exp(2 i error), `level` the concentration's `log_i0`. A part `_OUTLIER_SHARE` of
-    the phases lies anywhere in any case.
+    `toward` is the concentration times exp(2 i error), `level` the concentration's `log_i0`.
     """
-    return torch.log(_OUTLIER_SHARE + (1 - _OUTLIER_SHARE) * (toward.real - level).exp()).sum(-1)
+    return (1 - _OUTLIER_SHARE) * (toward.real - level).exp()
 
 
-def _inlier_probability(
-    toward: Complex128[Tensor, "contacts modes"], level: Float64[Tensor, "contacts modes"]
-) -> Float64[Tensor, "contacts modes"]:
-    """Return the probability of each phase to be none of those that lie anywhere."""
-    about = (1 - _OUTLIER_SHARE) * (toward.real - level).exp()
-    return about / (about + _OUTLIER_SHARE)
+def _log_odds(inlier_odds: Float64[Tensor, "*delays modes"]) -> Float64[Tensor, "*delays"]:
+    """Return the log odds that all phases lie about the others' mean, but for the usual outliers, against anywhere."""
+    return torch.log(_OUTLIER_SHARE + inlier_odds).sum(-1)
 
 
 def occam_factor(

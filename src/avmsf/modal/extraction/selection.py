@@ -62,27 +62,8 @@ def chance_ratio(contacts: int, *, trials: int) -> float:
     return float(gammainccinv(contacts, 0.1 / trials)) / contacts
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """What may be modes, with what judging them needs."""
-
-    bank: ModalBank
-    products: Float64[Tensor, "contacts 2 candidates"]
-    """Inner products of the sounds with the sines and the cosines."""
-    noise: Float64[Tensor, "contacts candidates"]
-    """Power of the noise where each of them lies."""
-
-    def take(self, rows: Tensor) -> "Candidates":
-        """Return the candidates of these rows or of this mask."""
-        return Candidates(self.bank.take(rows), self.products[:, :, rows], self.noise[:, rows])
-
-    def join(self, other: "Candidates") -> "Candidates":
-        """Return these and then the others."""
-        return Candidates(
-            self.bank.join(other.bank),
-            torch.cat([self.products, other.products], dim=2),
-            torch.cat([self.noise, other.noise], dim=1),
-        )
+Measured = tuple[Float64[Tensor, "contacts 2 candidates"], Float64[Tensor, "contacts candidates"]]
+"""Inner products of sounds with sines and cosines, and the noise's power where each of them lies."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,41 +79,42 @@ class Selection:
     count: int
     """Maximum number of modes."""
 
-    def candidates(self, bank: ModalBank) -> Candidates:
-        """Return the modes of `bank` as candidates in the sounds."""
+    def measure(self, bank: ModalBank) -> Measured:
+        """Return what the sounds and their noise have to do with the modes of `bank`."""
         products, _ = project(self.sounds, poles_of(bank, self.sample_rate))
-        noise = noise_at(self.noise, bank, self.sample_rate)
-        return Candidates(bank, products.reshape(len(self.sounds), 2, len(bank)), noise)
+        return products.reshape(len(self.sounds), 2, len(bank)), noise_at(self.noise, bank, self.sample_rate)
 
-    def select(self, known: ModalBank, found: Candidates, *, range_db: float) -> ModalBank:
+    def select(self, known: ModalBank, found: ModalBank, measured: Measured, *, range_db: float) -> ModalBank:
         """Return `known` and up to `count` of `found`: those that explain most of what is left, next to each other.
 
+        `measured` is that of `found`.
         A candidate counts only when what it explains is significant, and within `range_db` of the strongest of its
         neighborhood.
         """
-        if len(found.bank) == 0:
+        if len(found) == 0:
             return known
         samples, reach = self.sounds.shape[1], 10 ** (-range_db / 10)
-        explained = _explained(own_gram(poles_of(found.bank, self.sample_rate), samples), found.products)
-        energy, ratio = explained.sum(1), (explained / found.noise.T).mean(1) / 2
+        explained = _explained(own_gram(poles_of(found, self.sample_rate), samples), measured[0])
+        energy, ratio = explained.sum(1), (explained / measured[1].T).mean(1) / 2
         # Few lie high enough for the first, coarse rounds; with all of them each would take as long as the last.
-        both = self.candidates(known).join(found.take((ratio > self.significance) & (energy >= energy.amax() * reach)))
-        order = torch.argsort(both.bank.frequency)
+        kept = (ratio > self.significance) & (energy >= energy.amax() * reach)
+        both = known.join(found.take(kept))
+        order = torch.argsort(both.frequency)
+        products, noise = (
+            torch.cat([of_known, of_found[..., kept]], dim=-1)[..., order]
+            for of_known, of_found in zip(self.measure(known), measured, strict=True)
+        )
         both, given = both.take(order), order < len(known)
-        energy = torch.zeros(len(both.bank), dtype=torch.float64)
-        first = 0
-        while True:
-            rows = torch.arange(first, min(len(both.bank), first + _CHUNK))
-            part = both.take(rows)
-            inner = gram(poles_of(part.bank, self.sample_rate), samples, power=0)
-            gained = choose(inner, part.products, part.noise, given[rows], significance=self.significance, reach=reach)
+        energy = torch.zeros(len(both), dtype=torch.float64)
+        for first in range(0, max(1, len(both) - _SHARED), _CHUNK - _SHARED):
+            rows = torch.arange(first, min(len(both), first + _CHUNK))
+            inner = gram(poles_of(both.take(rows), self.sample_rate), samples, power=0)
+            part = products[..., rows], noise[:, rows], given[rows]
+            gained = choose(inner, *part, significance=self.significance, reach=reach)
             energy[rows] = torch.maximum(energy[rows], gained)
-            if first + _CHUNK >= len(both.bank):
-                break
-            first += _CHUNK - _SHARED
         energy[given] = torch.inf
         most = min(self.count + len(known), int((energy > 0).sum()))
-        return both.bank.take(torch.argsort(energy, descending=True)[:most].sort().values)
+        return both.take(torch.argsort(energy, descending=True)[:most].sort().values)
 
     def prune(self, bank: ModalBank, *, range_db: float) -> ModalBank:
         """Return `bank` without the modes whose absence the others make up for, the `count` most needed at most.
