@@ -10,8 +10,7 @@ from scipy.integrate import quad
 from torch import Tensor
 
 from avmsf.errors import ArrayError, SimulationError
-from avmsf.modal.cosine_distance import LARGEST_DELAY, cosine_distance
-from avmsf.modal.modes import ForcePulse
+from avmsf.modal.modes import LARGEST_DELAY, ForcePulse, cosine_distance
 from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft
 from avmsf.modal.synthesis import synthesize
 from factories.raising import raises
