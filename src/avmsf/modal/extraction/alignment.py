@@ -27,13 +27,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Complex128, Float64
+from jaxtyping import Complex128
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.extraction.phase_likelihood import FIRST_SPREAD, DelayPrior, MeasuredPhases, occam_factor
+from avmsf.modal.extraction.phase_likelihood import (
+    FIRST_SPREAD,
+    DelayPrior,
+    MeasuredPhases,
+    PerContact,
+    PerMode,
+    Phasors,
+    occam_factor,
+)
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import background_power
 
@@ -75,9 +83,9 @@ class Alignment:
     __repr__ = short_repr
 
     names: tuple[str, ...]
-    delays: Float64[Tensor, " contacts"]
+    delays: PerContact
     """Samples by which each sound starts later in its file than it was read."""
-    agreement: Float64[Tensor, " contacts"]
+    agreement: PerContact
     """Probability that a recording's phases agree with the others' at some delay, rather than with none."""
     coherence_before: float
     """Coherence of the phases as read, from 0 to 1 (`coherence`)."""
@@ -89,9 +97,9 @@ class Alignment:
     """Modes by whose phases they were aligned; with the next three others are aligned as they are."""
     doubled: Complex128[Tensor, " modes"]
     """Sum over recordings of the concentration times exp(2 i phase), at the common start."""
-    power: Float64[Tensor, " modes"]
+    power: PerMode
     """Mean over recordings of the squared amplitude, each recording scaled to unit energy in the modes."""
-    spread: Float64[Tensor, " modes"]
+    spread: PerMode
     """Variance across the phase over the geometric mean of `power` and the amplitude's own square."""
     jitter: float
     """Median distance of the delays from `start`, samples."""
@@ -118,7 +126,7 @@ class Alignment:
             delays[others] += self._delays_alone(new.delayed(delays[others]), usual=0.0, reach=reach)
         return impacts.delayed(delays)
 
-    def _delays_alone(self, impacts: Impacts, *, usual: float, reach: float) -> Float64[Tensor, " contacts"]:
+    def _delays_alone(self, impacts: Impacts, *, usual: float, reach: float) -> PerContact:
         """Return the delays by which recordings agree with the phases; `usual` for one that surely does not."""
         background = background_power(impacts.sounds, self.bank, impacts.sample_rate)
         measured = MeasuredPhases(impacts, self.bank, reach=reach, background=background, power=self.power)
@@ -207,7 +215,7 @@ def recording_keys(impacts: Impacts) -> tuple[str, ...]:
     return tuple(hashlib.sha256(name.encode() + sound.tobytes()).hexdigest() for name, sound in rows)
 
 
-def coherence(amplitude: Complex128[Tensor, "contacts modes"], damping: Float64[Tensor, " modes"]) -> float:
+def coherence(amplitude: Phasors, damping: PerMode) -> float:
     """Return how well each mode's phases agree, modulo pi, over recordings: 1 where each mode has one, near 0 for none.
 
     The length of the sum over recordings of exp(2 i phase), added up over modes, with the weights |amplitude|^2 /
@@ -218,9 +226,7 @@ def coherence(amplitude: Complex128[Tensor, "contacts modes"], damping: Float64[
     return float(summed / energy.sum().clamp_min(torch.finfo(torch.float64).tiny))
 
 
-def _common_onset(
-    impacts: Impacts, delays: Float64[Tensor, " contacts"], agreement: Float64[Tensor, " contacts"]
-) -> float:
+def _common_onset(impacts: Impacts, delays: PerContact, agreement: PerContact) -> float:
     """Return how much later than their common start aligned recordings leave the noise, all together, samples."""
     assert impacts.before is not None
     assert impacts.after is not None
@@ -241,22 +247,18 @@ def _common_onset(
 class _Fit:
     """Delays and what they make of the modes' phases."""
 
-    delays: Float64[Tensor, " contacts"]
-    turned: Complex128[Tensor, "contacts modes"]
+    delays: PerContact
+    turned: Phasors
     """Concentrations of the doubled phases times exp(2 i phase), as delayed."""
-    spread: Float64[Tensor, " modes"]
+    spread: PerMode
     prior: DelayPrior
     log_posterior: float
     """Up to a constant."""
 
 
 def _estimate(
-    measured: MeasuredPhases,
-    *,
-    earlier: Float64[Tensor, " contacts"] | None = None,
-    vague: float = _USUAL_RECORDINGS,
-    exact: float = 0.0,
-) -> tuple[_Fit, Float64[Tensor, " contacts"]]:
+    measured: MeasuredPhases, *, earlier: PerContact | None = None, vague: float = _USUAL_RECORDINGS, exact: float = 0.0
+) -> tuple[_Fit, PerContact]:
     """Return a fit with the delays' medians, and the probabilities that recordings agree.
 
     `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all are

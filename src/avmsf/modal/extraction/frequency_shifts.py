@@ -31,6 +31,15 @@ from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import background_power
 from avmsf.modal.synthesis import synthesize
 
+Sounds = Float[Tensor, "contacts samples"]
+PerContact = Float64[Tensor, " contacts"]
+PerMode = Float64[Tensor, " modes"]
+CommonPoles = Complex128[Tensor, " modes"]
+PerPole = Complex128[Tensor, "contacts modes"]
+"""Poles of each recording's own, or what belongs to them."""
+Poles = Complex128[Tensor, "*contacts modes"]
+"""Common poles, or each recording's own."""
+
 
 @dataclass(frozen=True)
 class Tolerances:
@@ -76,7 +85,7 @@ class FrequencyShifts:
 
     bank: ModalBank
     """The modes' mean poles."""
-    poles: Complex128[Tensor, "contacts modes"]
+    poles: PerPole
     """-d + 2 pi i f, 1/s."""
     relative: float
     """Standard deviation of the relative shifts of frequency, median over modes by energy."""
@@ -85,9 +94,7 @@ class FrequencyShifts:
         """Return those of some of the recordings."""
         return FrequencyShifts(self.bank, self.poles[rows], self.relative)
 
-    def gains(
-        self, sounds: Float[Tensor, "contacts samples"], *, sample_rate: float
-    ) -> Complex[Tensor, "contacts modes"]:
+    def gains(self, sounds: Sounds, *, sample_rate: float) -> Complex[Tensor, "contacts modes"]:
         """Return the gains that fit each sound best at its own poles."""
         found = [
             NormalEquations.of(sound[None], torch.exp(poles / sample_rate)).solve()
@@ -95,18 +102,14 @@ class FrequencyShifts:
         ]
         return torch.complex(*torch.cat(found).to(sounds.dtype).chunk(2, dim=1))
 
-    def removed(
-        self, sounds: Float[Tensor, "contacts samples"], gains: Complex[Tensor, "contacts modes"], *, sample_rate: float
-    ) -> Float[Tensor, "contacts samples"]:
+    def removed(self, sounds: Sounds, gains: Complex[Tensor, "contacts modes"], *, sample_rate: float) -> Sounds:
         """Return the sounds as they would be if each mode had its mean pole in all of them."""
         samples = sounds.shape[1]
         common = synthesize(gains, self.bank.frequency, self.bank.damping, samples=samples, sample_rate=sample_rate)
         return sounds + (common - modal_sounds(self.poles, gains, samples, sample_rate)).to(sounds.dtype)
 
 
-def find_shifts(
-    sounds: Float[Tensor, "contacts samples"], bank: ModalBank, *, sample_rate: float, significance: float
-) -> FrequencyShifts | None:
+def find_shifts(sounds: Sounds, bank: ModalBank, *, sample_rate: float, significance: float) -> FrequencyShifts | None:
     """Return the poles of each recording's own, of modes that several poles of `bank` may be one of.
 
     Without those that explain less than `significance` times the energy that they would of noise, mean over the
@@ -143,10 +146,10 @@ def find_shifts(
 class _Found:
     """What a band holds."""
 
-    mean: Complex128[Tensor, " modes"]
-    poles: Complex128[Tensor, "*contacts modes"]
-    gains: Complex128[Tensor, "contacts modes"]
-    variance: Float64[Tensor, " modes"]
+    mean: CommonPoles
+    poles: Poles
+    gains: PerPole
+    variance: PerMode
     """Of the relative shifts beside the drift."""
     energy: Float64[Tensor, ""]
     """Of all of its modes in all recordings, up to a factor that is the same for all bands."""
@@ -178,7 +181,7 @@ class _Search:
             for rows, common in zip(groups, self.common, strict=True)
         ]
 
-    def bands(self, shift: float, drift: Float64[Tensor, " contacts"]) -> list[_Found] | None:
+    def bands(self, shift: float, drift: PerContact) -> list[_Found] | None:
         """Return what each band holds, with a prior of the shifts: standard deviation and center, relative.
 
         None as soon as half of the energy is in modes of common poles.
@@ -210,9 +213,7 @@ class _Band:
     rate: float
 
     @classmethod
-    def of(
-        cls, sounds: Float64[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], rate: float
-    ) -> "_Band":
+    def of(cls, sounds: Float64[Tensor, "contacts samples"], poles: CommonPoles, rate: float) -> "_Band":
         """Return the band around some poles."""
         slowest, widest = float(-poles.real.max()), float(-poles.real.min()) / math.pi
         samples = min(sounds.shape[1], math.ceil(_TOLERANCES.nepers * rate / slowest))
@@ -227,23 +228,21 @@ class _Band:
         spectra = torch.fft.rfft(sounds[:, :samples])[:, first : last + 1]
         return cls(spectra, torch.arange(first, last + 1, dtype=torch.float64), samples, rate)
 
-    def without_mirrored(
-        self, poles: Complex128[Tensor, "*contacts modes"], gains: Complex128[Tensor, "contacts modes"]
-    ) -> "_Band":
+    def without_mirrored(self, poles: Poles, gains: PerPole) -> "_Band":
         """Return the band without what the modes' spectra at negative frequencies, -c* D(s*) / 2i, reach into it."""
         atoms = self._atoms(poles.conj().expand(len(self.spectra), -1))[0]
         mirrored = (atoms @ (0.5j * gains.conj())[..., None])[..., 0]
         return replace(self, spectra=self.spectra - mirrored)
 
-    def gains(self, poles: Complex128[Tensor, "*contacts modes"]) -> Complex128[Tensor, "contacts modes"]:
+    def gains(self, poles: Poles) -> PerPole:
         """Return gains c of Im(c exp(s t)), which has the spectrum c D(s) / 2i beside the mirrored one."""
         atoms = self._atoms(poles.expand(len(self.spectra), -1))[0]
         # By singular values: the default driver starts its pivots from what memory holds, which changes its rounding.
         return 2j * torch.linalg.lstsq(atoms, self.spectra[..., None], driver="gelsd").solution[..., 0]
 
     def own_poles(
-        self, common: Complex128[Tensor, " poles"], shift: float, drift: Float64[Tensor, " contacts"]
-    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "*contacts modes"], Float64[Tensor, " modes"]]:
+        self, common: Complex128[Tensor, " poles"], shift: float, drift: PerContact
+    ) -> tuple[CommonPoles, Poles, PerMode]:
         """Return the mean poles of the modes in the band, each recording's own, or the common ones for both, and the
         variance of the relative shifts.
         """
@@ -257,21 +256,19 @@ class _Band:
                 best, found = criterion, (mean, poles, variance)
         return found
 
-    def _criterion(self, left: Float64[Tensor, " contacts"], parameters: float | int) -> float:
+    def _criterion(self, left: PerContact, parameters: float | int) -> float:
         """Return the Bayesian information criterion of a band of which this energy is left, real parameters counted."""
         data = 2 * self.spectra.numel()
         energy = max(float(left.sum()), torch.finfo(torch.float64).tiny)
         return data * math.log(energy / data) + parameters * math.log(data)
 
-    def _start(self, common: Complex128[Tensor, " poles"], modes: int) -> Complex128[Tensor, "contacts modes"]:
+    def _start(self, common: Complex128[Tensor, " poles"], modes: int) -> PerPole:
         """Return for each recording the given number of the common poles that explain it best."""
         sets = torch.stack([common[list(rows)] for rows in combinations(range(len(common)), modes)])
         left = torch.stack([self._left(each.expand(len(self.spectra), -1)) for each in sets])
         return sets[left.argmin(0)]
 
-    def _fit(
-        self, poles: Complex128[Tensor, "contacts modes"], shift: float, drift: Float64[Tensor, " contacts"]
-    ) -> tuple[Complex128[Tensor, " modes"], Complex128[Tensor, "contacts modes"], Float64[Tensor, " modes"], float]:
+    def _fit(self, poles: PerPole, shift: float, drift: PerContact) -> tuple[CommonPoles, PerPole, PerMode, float]:
         """Return the mean poles, those of most posterior probability, the variance of their relative shifts, and their
         number of free parameters.
 
@@ -316,7 +313,7 @@ class _Band:
         return mean, poles, found.clamp_min(0.0), 2 * float(determined.sum())
 
     def _atoms(
-        self, poles: Complex128[Tensor, "contacts modes"]
+        self, poles: PerPole
     ) -> tuple[Complex128[Tensor, "contacts bins modes"], Complex128[Tensor, "contacts bins modes"]]:
         """Return D(s, k) and its derivative by s."""
         step = torch.exp(poles / self.rate)[:, None, :]
@@ -328,7 +325,7 @@ class _Band:
         return atoms, (atoms * turned - self.samples * last) / (rest * self.rate)
 
     def _linear(
-        self, poles: Complex128[Tensor, "contacts modes"]
+        self, poles: PerPole
     ) -> tuple[Complex128[Tensor, "contacts bins modes"], Complex128[Tensor, "contacts bins"]]:
         """Return how the spectra's best fit moves with each pole, beyond what gains can follow, and what it leaves."""
         atoms, slopes = self._atoms(poles)
@@ -338,7 +335,7 @@ class _Band:
         moved = slopes * gains.mT
         return moved - basis @ (basis.mH @ moved), self.spectra - (basis @ along)[..., 0]
 
-    def _left(self, poles: Complex128[Tensor, "contacts modes"]) -> Float64[Tensor, " contacts"]:
+    def _left(self, poles: PerPole) -> PerContact:
         """Return the energy that modes of these poles leave of each spectrum."""
         basis = torch.linalg.qr(self._atoms(poles)[0])[0]
         explained = (basis.mH @ self.spectra[..., None])[..., 0]
@@ -346,11 +343,8 @@ class _Band:
 
 
 def _mean_pole(
-    poles: Complex128[Tensor, "contacts modes"],
-    information: Float64[Tensor, "contacts modes"],
-    variance: Float64[Tensor, " modes"],
-    drift: Float64[Tensor, " contacts"],
-) -> Complex128[Tensor, " modes"]:
+    poles: PerPole, information: Float64[Tensor, "contacts modes"], variance: PerMode, drift: PerContact
+) -> CommonPoles:
     """Return the mean of the recordings' poles without their drift, each weighted by its precision about the mean."""
     weight = 1.0 / (1.0 / information.clamp_min(torch.finfo(torch.float64).tiny) + variance)
     settled = torch.complex(poles.real, poles.imag / (1.0 + drift[:, None]))
@@ -359,7 +353,7 @@ def _mean_pole(
 
 def _needed(
     sounds: Float64[Tensor, "contacts samples"],
-    poles: Complex128[Tensor, "contacts modes"],
+    poles: PerPole,
     noise: Float64[Tensor, "contacts modes"],
     significance: float,
     rate: float,
@@ -395,7 +389,7 @@ def _groups(bank: ModalBank) -> list[list[int]]:
 
 def modal_sounds(
     poles: Complex128[Tensor, "*#contacts modes"], gains: Complex[Tensor, "contacts modes"], samples: int, rate: float
-) -> Float[Tensor, "contacts samples"]:
+) -> Sounds:
     """Return the sum of modes of the given poles -d + 2 pi i f, 1/s, common ones or each recording's own."""
     return synthesize(gains, poles.imag / (2 * math.pi), -poles.real, samples=samples, sample_rate=rate)
 

@@ -35,6 +35,12 @@ _MEDIAN_OF_SQUARE = 0.455
 """Median of the square of a standard normal number."""
 
 
+PerContact = Float64[Tensor, " contacts"]
+PerMode = Float64[Tensor, " modes"]
+Weights = Float64[Tensor, "contacts modes"]
+Phasors = Complex128[Tensor, "contacts modes"]
+
+
 @dataclass(frozen=True, eq=False)
 class DelayPrior:
     """Delays have Cauchy distributions about these middles."""
@@ -48,14 +54,12 @@ class DelayPrior:
         """Return the logarithm of the density, per sample."""
         return -torch.log1p(((delays - self.middle) / self.scale).square()) - math.log(math.pi * self.scale)
 
-    def slope(self, delays: Float64[Tensor, " contacts"]) -> Float64[Tensor, " contacts"]:
+    def slope(self, delays: PerContact) -> PerContact:
         """Return the derivative of the log density."""
         away = delays - self.middle
         return -2 * away / (self.scale**2 + away.square())
 
-    def median(
-        self, delays: Float64[Tensor, " contacts"], probability: Float64[Tensor, " contacts"]
-    ) -> Float64[Tensor, " contacts"]:
+    def median(self, delays: PerContact, probability: PerContact) -> PerContact:
         """Return the median of what are these delays with a probability, and else distributed as here."""
         away = delays - self.middle
         # The quantile of a Cauchy distribution; its tangent has a pole where the probability is a half.
@@ -68,13 +72,7 @@ class MeasuredPhases:
     """The modes' amplitudes in each recording, and what a delay makes of their phases."""
 
     def __init__(
-        self,
-        impacts: Impacts,
-        bank: ModalBank,
-        *,
-        reach: float,
-        background: Float64[Tensor, "contacts modes"],
-        power: Float64[Tensor, " modes"] | None = None,
+        self, impacts: Impacts, bank: ModalBank, *, reach: float, background: Weights, power: PerMode | None = None
     ) -> None:
         """Measure them, to be aligned by delays of at most `reach` samples.
 
@@ -108,26 +106,24 @@ class MeasuredPhases:
     def __len__(self) -> int:
         return len(self.amplitude)
 
-    def variance(self, spread: Float64[Tensor, "*#contacts modes"]) -> Float64[Tensor, "contacts modes"]:
+    def variance(self, spread: Float64[Tensor, "*#contacts modes"]) -> Weights:
         """Return the variance across the phase."""
         shared = spread * torch.sqrt(self.squares * self.power)
         return (self.noise + shared + _RELATIVE_ERROR**2 * self.squares).clamp_min(torch.finfo(torch.float64).tiny)
 
-    def concentration(self, spread: Float64[Tensor, "*#contacts modes"]) -> Float64[Tensor, "contacts modes"]:
+    def concentration(self, spread: Float64[Tensor, "*#contacts modes"]) -> Weights:
         """Return the concentrations of the doubled phases."""
         return self.squares / (4 * self.variance(spread))
 
-    def delayed_amplitude(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
+    def delayed_amplitude(self, delays: PerContact) -> Phasors:
         """Return the amplitudes with each recording starting later by its delay, samples."""
         return self.amplitude * torch.exp(self.exponent * delays[:, None])
 
-    def doubled(self, delays: Float64[Tensor, " contacts"]) -> Complex128[Tensor, "contacts modes"]:
+    def doubled(self, delays: PerContact) -> Phasors:
         """Return exp(2 i phase) with each recording starting later by its delay."""
         return torch.exp(1j * (2 * self.phase + self.turn * delays[:, None]))
 
-    def spread(
-        self, weights: Float64[Tensor, "contacts modes"], delays: Float64[Tensor, " contacts"], *, vague: float
-    ) -> Float64[Tensor, " modes"]:
+    def spread(self, weights: Weights, delays: PerContact, *, vague: float) -> PerMode:
         """Return the spread of each mode's amplitudes about its mean phase, by the median over recordings.
 
         Averaged with the usual one, which counts as `vague` recordings.
@@ -140,18 +136,13 @@ class MeasuredPhases:
         return (len(self) * found + vague * _USUAL_SPREAD) / (len(self) + vague)
 
     def log_likelihood(
-        self,
-        weights: Float64[Tensor, "contacts modes"],
-        spread: Float64[Tensor, "*#contacts modes"],
-        doubled: Complex128[Tensor, " modes"],
+        self, weights: Weights, spread: Float64[Tensor, "*#contacts modes"], doubled: Complex128[Tensor, " modes"]
     ) -> float:
         """Return the log likelihood of the amplitudes' parts across their phases, all mean phases alike."""
         normal = -0.5 * torch.log(self.variance(spread)) - weights
         return float(normal.sum() + log_i0(doubled.abs()).sum())
 
-    def search(
-        self, spread: Float64[Tensor, " modes"], doubled: Complex128[Tensor, "contacts modes"], prior: DelayPrior
-    ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"], Float64[Tensor, "contacts modes"]]:
+    def search(self, spread: PerMode, doubled: Phasors, prior: DelayPrior) -> tuple[PerContact, PerContact, Weights]:
         """Return each recording's likeliest delay, the log odds that its phases agree with `doubled`, and its spread.
 
         `doubled` is the sum of the others' weights times exp(2 i phase), for each recording. The odds compare phases
@@ -164,12 +155,7 @@ class MeasuredPhases:
         best = odds.argmax(0)
         return delays.gather(0, best[None])[0], odds.logsumexp(0), spreads[best]
 
-    def _search(
-        self,
-        weights: Float64[Tensor, "contacts modes"],
-        doubled: Complex128[Tensor, "contacts modes"],
-        prior: DelayPrior,
-    ) -> tuple[Float64[Tensor, " contacts"], Float64[Tensor, " contacts"]]:
+    def _search(self, weights: Weights, doubled: Phasors, prior: DelayPrior) -> tuple[PerContact, PerContact]:
         strength = doubled.abs()
         # The others' mean phase is not known exactly: two von Mises laws in a row have about the product of the means'
         # lengths.
@@ -195,9 +181,7 @@ class MeasuredPhases:
         odds, _, bend = derivatives()
         return delays, _log_odds(odds) + occam_factor(prior, delays, bend)
 
-    def _candidates(
-        self, toward: Complex128[Tensor, "contacts modes"], prior: DelayPrior
-    ) -> Float64[Tensor, "contacts candidates"]:
+    def _candidates(self, toward: Phasors, prior: DelayPrior) -> Float64[Tensor, "contacts candidates"]:
         """Return delays of the grid at which the product of the densities is highest, in single precision."""
         away = (self.grid - prior.middle[:, None]).float() / prior.scale
         parts = torch.cat([toward.real, toward.imag], dim=1).float()
@@ -223,9 +207,7 @@ def _log_odds(inlier_odds: Float64[Tensor, "*delays modes"]) -> Float64[Tensor, 
     return torch.log(_OUTLIER_SHARE + inlier_odds).sum(-1)
 
 
-def occam_factor(
-    prior: DelayPrior, delays: Float64[Tensor, " contacts"], bend: Float64[Tensor, " contacts"]
-) -> Float64[Tensor, " contacts"]:
+def occam_factor(prior: DelayPrior, delays: PerContact, bend: PerContact) -> PerContact:
     """Return what not knowing the delays costs: their prior density times the width of their posterior (Laplace).
 
     `bend` is the second derivative of the log likelihood, negated. Nothing is won by delays that are not known at all.
