@@ -24,7 +24,7 @@ from jaxtyping import Complex64, Complex128, Float32, Float64, Int64
 from torch import Tensor
 
 from avmsf.errors import LocationError
-from avmsf.modal.cosine_distance import delayed_back
+from avmsf.modal.modes import delayed_back
 
 RELATIVE_ERRORS = (0.8, 0.15, 0.03)
 """Relative errors r of the gains for which the likelihood of every point is computed."""

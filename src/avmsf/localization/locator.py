@@ -27,8 +27,7 @@ from avmsf.localization.prediction import (
     smoothing_matrix,
 )
 from avmsf.localization.preprocess import check_sound, location_errors
-from avmsf.modal.cosine_distance import cosine_distance
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, cosine_distance
 
 _MAX_CACHED_LENGTHS = 8
 """Lengths of sounds whose equations are kept."""

@@ -34,10 +34,9 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.modal.config import scaled_fft_size
-from avmsf.modal.cosine_distance import cosine_distance
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, cosine_distance
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise
 from avmsf.modal.spectra import magnitude_stft
 from avmsf.modal.synthesis import synthesize
