@@ -281,17 +281,18 @@ class CandidateBodies:
             coarse = make() if self.shape is not None else self._attempt("retrying with more tetrahedra", make)
             if coarse is not None:
                 return CandidateBody(thickness, coarse, fine=False, closed=closed)
-        modes = self.modes(thickness, closed=closed)
         # The thickness of a shape's wall is found with such elements, and makes up for their stiffness.
         if self.dofs > COARSE_DOFS and (self.shape is None or thickness is None):
-            modes = self._converged(thickness, modes)
-        return CandidateBody(thickness, modes, closed=closed)
+            return CandidateBody(thickness, self._converged(thickness), closed=closed)
+        return CandidateBody(thickness, self.modes(thickness, closed=closed), closed=closed)
 
-    def _converged(self, thickness: float | None, modes: ElasticModes) -> ElasticModes:
+    def _converged(self, thickness: float | None) -> ElasticModes:
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
         name, make = body_name(thickness), partial(self.modes, thickness, dofs=COARSE_DOFS, perturbed=False)
-        coarse = self._attempt(f"{name}: mesh convergence not checked", make)
-        if coarse is None or (error := _frequency_error(coarse, modes)) <= MAX_FREQUENCY_ERROR:
+        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(1) as pool:
+            check = pool.submit(self._attempt, f"{name}: mesh convergence not checked", make)
+            modes = self.modes(thickness)
+        if (coarse := check.result()) is None or (error := _frequency_error(coarse, modes)) <= MAX_FREQUENCY_ERROR:
             return modes
         finer = self._attempt(f"{name}: no finer mesh", partial(self.modes, thickness, dofs=2 * self.dofs))
         if finer is not None:

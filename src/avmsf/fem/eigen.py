@@ -9,6 +9,7 @@ their kinetic energy is a rigid motion's.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import scipy.linalg
@@ -106,7 +107,15 @@ def factorize(
         raise SimulationError.expected(
             "an invertible matrix", got=str(error), name="stiffness", advice=advice
         ) from error
-    return lambda forces: factored.solve(np.asfortranarray(forces))
+
+    def solve(forces: np.ndarray) -> np.ndarray:
+        # Two halves side by side, which is the same on any number of processors: it releases the interpreter's lock.
+        first, second = np.array_split(np.asfortranarray(forces), 2, axis=1)
+        with ThreadPoolExecutor(1) as pool:
+            solved = pool.submit(factored.solve, second)
+            return np.concatenate([factored.solve(first), solved.result()], axis=1)
+
+    return solve
 
 
 def _largest_responses(
