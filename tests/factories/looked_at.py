@@ -20,6 +20,10 @@ def surface_of(mesh: trimesh.Trimesh) -> Surface:
     return Surface(torch.from_numpy(np.asarray(mesh.vertices)).float(), torch.from_numpy(np.asarray(mesh.faces)).long())
 
 
+def sphere(radius: float = 0.05, subdivisions: int = 3) -> Surface:
+    return surface_of(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
+
+
 def mesh_of(surface: Surface) -> trimesh.Trimesh:
     return trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
 

@@ -1,6 +1,7 @@
 """Finite elements against beams, plates, a second implementation, and the laws that every elastic body obeys."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -140,16 +141,15 @@ def test_rigid_motions_cost_no_force_and_weigh_the_body(bracket):
     assert np.abs(forces @ motions).max() < 1e-9 * abs(forces).max() * np.abs(motions).max()
     heavy = scipy.sparse.kron(weights, np.eye(3))
     np.testing.assert_allclose(motions.T @ heavy @ motions, np.eye(6), atol=1e-10)
-    # They are all: the seventh eigenvalue is that of a vibration.
-    values = np.sort(scipy.linalg.eigvalsh(forces.toarray(), heavy.toarray()))
-    assert abs(values[5]) < 1e-8 * values[6]
     assert weights.sum() == pytest.approx(7850.0 * 0.07 * 0.05 * 0.011, rel=1e-12)
 
 
 def test_modes_are_those_of_the_whole_spectrum(bracket, modes):
     _, forces, weights = matrices(bracket, STEEL)
-    values = scipy.linalg.eigvalsh(forces.toarray(), np.kron(weights.toarray(), np.eye(3)))
-    expected = np.sqrt(np.sort(values)[6:14]) / (2 * math.pi)
+    values = np.sort(scipy.linalg.eigvalsh(forces.toarray(), np.kron(weights.toarray(), np.eye(3))))
+    # But for the motions of a rigid body.
+    assert abs(values[5]) < 1e-8 * values[6]
+    expected = np.sqrt(values[6:14]) / (2 * math.pi)
     np.testing.assert_allclose(modes.frequency.numpy(), expected, rtol=1e-9)
 
 
@@ -227,25 +227,17 @@ def body() -> IsotropicModes:
     return isotropic_modes(solid(), count=8)
 
 
-def direct(material: Material) -> ElasticModes:
-    return elastic_modes(solid(), material, count=8)
-
-
-def test_frequencies_are_those_of_direct_solves_at_any_material():
-    for density, young, poisson in ((1234.0, 5e9, 0.02), (1234.0, 5e9, 0.19), (2.0, 1e7, 0.3), (2.0, 4e7, 0.45)):
-        material = Material("some", density, young, poisson, 0.0, 0.0)
-        torch.testing.assert_close(body().modes(material).frequency, direct(material).frequency, rtol=3e-4, atol=0.0)
-
-
-def test_shapes_are_those_of_direct_solves():
-    for material in (STEEL, WOOD):
-        found, known = body().modes(material), direct(material)
-        both = (found.shapes * known.shapes).sum(dim=(0, 2))
-        alike = both.abs() / (found.shapes.square().sum(dim=(0, 2)) * known.shapes.square().sum(dim=(0, 2))).sqrt()
-        assert float(alike.min()) > 0.999
-        size = found.shapes.square().sum(dim=(0, 2)) / known.shapes.square().sum(dim=(0, 2))
-        torch.testing.assert_close(size, torch.ones_like(size), rtol=2e-3, atol=0.0)
-        assert found.mass == pytest.approx(known.mass, rel=1e-12)
+@pytest.mark.parametrize("poisson", [0.02, 0.19, 0.29, 0.45])
+def test_isotropic_modes_are_those_of_direct_solves(poisson: float):
+    material = replace(WOOD, poisson=poisson)
+    found, known = body().modes(material), elastic_modes(solid(), material, count=8)
+    torch.testing.assert_close(found.frequency, known.frequency, rtol=3e-4, atol=0.0)
+    both = (found.shapes * known.shapes).sum(dim=(0, 2))
+    alike = both.abs() / (found.shapes.square().sum(dim=(0, 2)) * known.shapes.square().sum(dim=(0, 2))).sqrt()
+    assert float(alike.min()) > 0.999
+    size = found.shapes.square().sum(dim=(0, 2)) / known.shapes.square().sum(dim=(0, 2))
+    torch.testing.assert_close(size, torch.ones_like(size), rtol=2e-3, atol=0.0)
+    assert found.mass == pytest.approx(known.mass, rel=1e-12)
 
 
 def test_the_gradient_by_poissons_ratio_is_that_of_differences():

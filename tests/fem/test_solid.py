@@ -17,13 +17,9 @@ from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import shell
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.surface import Surface
-from factories.looked_at import mesh_of, surface_of
+from factories.looked_at import mesh_of, sphere, surface_of
 from factories.raising import raises
 from oracles.block import block
-
-
-def ball(radius: float = 0.05, subdivisions: int = 3) -> Surface:
-    return surface_of(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
 
 
 def half(surface: Surface) -> Surface:
@@ -79,7 +75,7 @@ def test_closest_points_are_those_of_trimesh():
 
 
 def test_a_coarser_skin_keeps_its_volume_and_stays_closed():
-    mesh = weld(ball())
+    mesh = weld(sphere())
     coarse = remeshed(mesh, 0.02)
     assert len(coarse.faces) < 0.3 * len(mesh.faces)
     assert len(boundary_edges(coarse)) == 0
@@ -120,7 +116,7 @@ def test_a_coarser_ring_stays_a_ring():
 
 
 def test_an_open_bowl_gets_a_wall():
-    sheet = half(ball())
+    sheet = half(sphere())
     solid = shell(sheet, thickness=0.003, detail=0.06)
     # Inwards of 5 cm, so between the spheres of 4.7 and 5; facets lie a little inside both.
     assert solid.volume == pytest.approx(2 / 3 * math.pi * (0.05**3 - 0.047**3), rel=0.08)
@@ -132,7 +128,7 @@ def test_an_open_bowl_gets_a_wall():
 
 
 def test_a_hollow_ball_has_two_surfaces():
-    solid = shell(ball(), thickness=0.004, detail=0.06)
+    solid = shell(sphere(), thickness=0.004, detail=0.06)
     assert solid.volume == pytest.approx(4 / 3 * math.pi * (0.05**3 - 0.046**3), rel=0.08)
     # Two closed surfaces of Euler characteristic 2.
     assert skin_of(solid).is_watertight
@@ -162,7 +158,7 @@ def test_a_skin_that_runs_through_itself_is_filled_once():
 
 
 def test_triangles_that_face_different_ways_are_filled_all_the_same():
-    solid = fill(mixed(ball()), detail=0.1)
+    solid = fill(mixed(sphere()), detail=0.1)
     assert solid.volume == pytest.approx(4 / 3 * math.pi * 0.05**3, rel=0.06)
 
 
@@ -181,15 +177,15 @@ NAN = pytest.approx(math.nan, nan_ok=True)
         (lambda: Solid.build(torch.full((4, 3), math.nan).double(), CELL), "cells", NAN),
         (lambda: Solid.build(torch.eye(4, 3).double()[[0, 1, 2, 2]], CELL), "cells", 0.0),
         # Too thick for the surface.
-        (lambda: shell(ball(), thickness=0.02), "thickness", 0.02),
-        (lambda: shell(half(ball()), thickness=0.06), "thickness", 0.06),
+        (lambda: shell(sphere(), thickness=0.02), "thickness", 0.02),
+        (lambda: shell(half(sphere()), thickness=0.06), "thickness", 0.06),
         (lambda: shell(Surface(torch.rand(9, 3), TRIANGLE[:0]), thickness=0.001), "faces", 0),
         (lambda: shell(Surface(torch.zeros(3, 3), TRIANGLE), thickness=0.001), "areas", 0.0),
-        (lambda: shell(mixed(ball()), thickness=0.001), "normals", pytest.approx(0.5, abs=0.3)),
-        (lambda: fill(half(ball()), detail=0.2), "holes", pytest.approx(1 / 3, abs=0.09)),
+        (lambda: shell(mixed(sphere()), thickness=0.001), "normals", pytest.approx(0.5, abs=0.3)),
+        (lambda: fill(half(sphere()), detail=0.2), "holes", pytest.approx(1 / 3, abs=0.09)),
         (lambda: fill(Surface(0.1 * torch.eye(3), TRIANGLE), detail=0.2), "volume", 0),
-        (lambda: fill(apart(ball(subdivisions=1)), detail=0.2), "parts", 2),
-        (lambda: fill(ball(subdivisions=1), timeout=0.01), "timeout", 0.01),
+        (lambda: fill(apart(sphere(subdivisions=1)), detail=0.2), "parts", 2),
+        (lambda: fill(sphere(subdivisions=1), timeout=0.01), "timeout", 0.01),
     ],
 )
 def test_what_is_no_body_is_refused(call, name, value):
@@ -199,12 +195,12 @@ def test_what_is_no_body_is_refused(call, name, value):
 
 def test_a_mesh_has_the_same_tetrahedra_each_time_and_a_damaged_copy_is_made_again(monkeypatch, tmp_path):
     monkeypatch.setenv("AVMSF_CACHE", str(tmp_path))
-    first, second = fill(ball(subdivisions=2), detail=0.2), fill(ball(subdivisions=2), detail=0.2)
+    first, second = fill(sphere(subdivisions=2), detail=0.2), fill(sphere(subdivisions=2), detail=0.2)
     assert torch.equal(first.points, second.points)
     assert torch.equal(first.cells, second.cells)
     (stored,) = (tmp_path / "tetrahedra").iterdir()
     stored.write_bytes(stored.read_bytes()[:100])
-    assert fill(ball(subdivisions=2), detail=0.2).volume == pytest.approx(first.volume, rel=0.05)
+    assert fill(sphere(subdivisions=2), detail=0.2).volume == pytest.approx(first.volume, rel=0.05)
 
 
 def test_a_crash_of_pytetwild_is_reported(monkeypatch, tmp_path):
@@ -212,4 +208,4 @@ def test_a_crash_of_pytetwild_is_reported(monkeypatch, tmp_path):
     crashing.write_text("import os; os.abort()")
     monkeypatch.setattr(tetrahedra, "WORKER", crashing)
     with raises(SimulationError, name="pytetwild", value=-6):
-        fill(ball(subdivisions=1))
+        fill(sphere(subdivisions=1))

@@ -18,7 +18,7 @@ from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import DISCREPANCY, MATERIALS, NOMINAL, factor_range
 from avmsf.fem.thickness import search_thickness
 from avmsf.mesh.surface import Surface
-from factories.looked_at import surface_of
+from factories.looked_at import sphere, surface_of
 from factories.made_dome import bodies
 from factories.made_sheet import sheet_over
 from factories.raising import raises
@@ -35,10 +35,6 @@ def computed(surface: Surface, **settings: object) -> CandidateBodies:
     bodies = CandidateBodies(surface, **settings)  # type: ignore[arg-type]
     assert bodies.bodies
     return bodies
-
-
-def ball(radius: float = 0.05) -> Surface:
-    return surface_of(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
 
 def test_a_sheet_with_a_wall_vibrates_as_the_plate_it_is():
@@ -73,7 +69,7 @@ def test_walls_of_a_sheet_are_tried_coarsely_and_the_chosen_one_made_fine(monkey
 
 @pytest.mark.slow
 def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path: Path):
-    inwards = Surface(ball().vertices, ball().faces.flip(1))
+    inwards = Surface(sphere().vertices, sphere().faces.flip(1))
     found = computed(inwards, thicknesses=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]
     # Lamb: the torsional oscillation of degree 2, whose wave number times radius is 2.501, belongs to five modes.
     shear = math.sqrt(NOMINAL.young / (2 * (1 + NOMINAL.poisson)) / NOMINAL.density)
@@ -128,7 +124,7 @@ APART = [trimesh.creation.box(bounds=[(x, 0.0, 0.0), (x + 0.1, 0.1, 0.1)]) for x
     [
         (lambda: surface_of(trimesh.util.concatenate(APART)), [None, 0.001], ["solid body", "wall of 1 mm"]),
         (sheet, [0.2], ["wall of 200 mm"]),
-        (ball, [0.04], ["wall of 40 mm"]),
+        (sphere, [0.04], ["wall of 40 mm"]),
     ],
 )
 def test_surfaces_of_no_body_are_refused_with_all_reasons(make, thicknesses, refused):
@@ -139,7 +135,7 @@ def test_surfaces_of_no_body_are_refused_with_all_reasons(make, thicknesses, ref
 
 def test_points_alone_have_no_body():
     with raises(SimulationError, name="faces", value=0):
-        computed(Surface(ball().vertices, torch.zeros((0, 3), dtype=torch.int64)))
+        computed(Surface(sphere().vertices, torch.zeros((0, 3), dtype=torch.int64)))
 
 
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
