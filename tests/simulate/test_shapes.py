@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from avmsf.errors import SimulationError
 from avmsf.fem.solid import Solid
+from avmsf.simulate.imperfections import vary_thickness
 from avmsf.simulate.shapes import KINDS, Shape, make_shape
 from avmsf.simulate.shapes.revolution import Profile, Turned
-from avmsf.simulate.thickness_variation import vary_thickness
 from factories.looked_at import mesh_of
 from factories.raising import raises
 

@@ -43,7 +43,7 @@ from avmsf.mesh.surface import Surface
 
 Given = TypeVar("Given")
 Made = TypeVar("Made")
-Wall = tuple[float | None, bool]
+Hypothesis = tuple[float | None, bool]
 """Thickness, meters, None for a solid body; and whether it goes all round its cavity."""
 Supports = Literal["auto", "free", "try"]
 """Whether bodies are held: where the free one predicts little, never, or always tried."""
@@ -143,10 +143,10 @@ class CandidateBodies:
     def bodies(self) -> tuple[CandidateBody, ...]:
         """The free bodies that can be had, at least one: the solid one first, then walls from thin to thick."""
         thicknesses = self._guesses() if self._thicknesses is None else self._thicknesses
-        wanted: list[Wall] = [(each, False) for each in dict.fromkeys(thicknesses)]
-        refused: dict[Wall, SimulationError] = {}
+        wanted: list[Hypothesis] = [(each, False) for each in dict.fromkeys(thicknesses)]
+        refused: dict[Hypothesis, SimulationError] = {}
 
-        def attempt(make: Callable[..., Made], wall: Wall, **settings: bool) -> Made | None:
+        def attempt(make: Callable[..., Made], wall: Hypothesis, **settings: bool) -> Made | None:
             try:
                 return make(*wall, **settings)
             except SimulationError as error:
@@ -372,7 +372,7 @@ def _frequency_error(coarse: ElasticModes, fine: ElasticModes) -> float:
     return change / max((len(fine.nodes) / len(coarse.nodes)) ** 1.5 - 1.0, 1.0)
 
 
-def _grouped(refused: Mapping[Wall, SimulationError]) -> list[str]:
+def _grouped(refused: Mapping[Hypothesis, SimulationError]) -> list[str]:
     """Return each reason once, after the names of all that it holds for."""
     names: dict[str, list[str]] = {}
     for (thickness, closed), error in refused.items():

@@ -8,9 +8,9 @@ Core types: `ObjectRecipe`, `Imperfections`, `Hammer`, `Shape`, `SoundingBody`, 
 
 - `shapes` makes closed surfaces, tetrahedra, colors and known symmetries by rule: surfaces of revolution, sheets, rods
   swept along a curve and lumps, of prisms that are cut into tetrahedra.
-- `bodies` and `thickness_variation` make the elastic body: walls, stiffness and density vary smoothly over it, and it
-  stands on soft springs.
-- `imperfections` has those fields, and damping that couples modes; each thing has random numbers of its own.
+- `bodies` makes the elastic body of a recipe, which stands on soft springs.
+- `imperfections` lets walls, stiffness and density vary smoothly over it, damping couple modes, and recordings start
+  late or early; each thing has random numbers of its own.
 - `strikes` draws contacts that a hammer reaches (rays, farthest points); `hammer` has the force of Hertz's contact or a
   half-sine, and its Laplace transform.
 - `simulation` adds up damped modes, each sample at its exact time, and room noise of a 1/f spectrum.

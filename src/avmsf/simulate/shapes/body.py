@@ -64,7 +64,7 @@ class SolidBuilder:
         below, above = middle - offsets, middle + offsets
         lower = Patch(self, self.place(below), below, triangles, order)
         upper = Patch(self, self.place(above), above, triangles, order)
-        lower.grow(above[:0, None], end=upper)
+        lower.grow(above[None][:0], end=upper)
         return replace(lower, triangles=triangles[:, ::-1]), upper
 
     def place(self, places: Float64[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
