@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.export.geometry import read_vertices
@@ -74,7 +74,10 @@ def _document(
 ) -> tuple[dict[str, Any], bytes]:
     """Return the JSON and the binary chunk, whose arrays are in the order of the accessors' numbers."""
     order = torch.argsort(sampled.power.sum(0) / damping, descending=True, stable=True)
-    modal = _modal(sampled, order, gains, damping)
+    frequency = sampled.frequency[order]
+    shapes = -sampled.normals.double()[None] * (gains.double()[:, order] / (2 * math.pi * frequency)).T[:, :, None]
+    modal = {"frequencies": frequency, "decayRates": damping[order], "positions": sampled.points}
+    modal["shapes"] = shapes.reshape(-1, 3)
     drawn = vertices | {"NORMAL": torch.nn.functional.normalize(vertices["NORMAL"], dim=1)}
     if "COLOR_0" in drawn:
         drawn["COLOR_0"] = _linear(drawn["COLOR_0"])
@@ -103,19 +106,6 @@ def _document(
         "buffers": [{"byteLength": len(content)}],
     }
     return document, content
-
-
-def _modal(
-    sampled: SampledField,
-    order: Int[Tensor, " modes"],
-    gains: Float[Tensor, "points modes"],
-    damping: Float[Tensor, " modes"],
-) -> dict[str, Tensor]:
-    """Return the arrays of the draft's modal model."""
-    frequency = sampled.frequency[order]
-    shapes = -sampled.normals.double()[None] * (gains.double()[:, order] / (2 * math.pi * frequency)).T[:, :, None]
-    arrays = {"frequencies": frequency, "decayRates": damping[order], "positions": sampled.points}
-    return arrays | {"shapes": shapes.reshape(-1, 3)}
 
 
 def _packed(named: Mapping[str, Tensor]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bytes]:

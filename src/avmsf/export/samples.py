@@ -1,8 +1,9 @@
 """A grid of impacts as wav files, with a table of them and an SFZ instrument, for samplers."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -93,30 +94,30 @@ def write_grid(
     # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
     edges = np.linspace(1, HIGHEST_NOTE + 1, len(ordered) + 1).round().astype(int)
     amplitudes = np.stack([sounds.double().square().mean(1).sqrt().numpy() for _, sounds in rendered])
-    files, records, curves = dict[str, bytes](), list[dict[str, object]](), list[str]()
+    files, records = dict[str, bytes](), list[tuple[object, ...]]()
+    groups = {(low, high - 1): [f"<group> lovel={low} hivel={high - 1}"] for low, high in pairwise(edges.tolist())}
     for place, row in enumerate(rows.tolist()):
-        curves += _curves(amplitudes[:, place], edges)
+        note, curves = LOWEST_NOTE + place, _curves(amplitudes[:, place], edges)
         where = [f"{value:.9g}" for value in (*field.points[row].tolist(), *field.normals[row].tolist())]
-        for number, (layer, sounds) in enumerate(rendered):
+        for number, ((layer, sounds), velocities, curve) in enumerate(zip(rendered, groups, curves, strict=True), 1):
             sound = scale * sounds[place]
             loudest = float(sound.abs().max())
-            name = f"{SOUNDS}/{place + 1:03d}-{number + 1}.wav"
+            name = f"{SOUNDS}/{place + 1:03d}-{number}.wav"
             files[name] = _wav(sound, rate)
             level = f"{20 * math.log10(loudest):.2f}" if loudest > 0 else "-inf"
-            range_ = (int(edges[number]), int(edges[number + 1]) - 1)
-            how = (f"{layer.force:g}", f"{layer.contact_time:g}", LOWEST_NOTE + place, *range_)
-            record = (name, *where, *how, f"{samples / rate:.6g}", level, row)
-            records.append(dict(zip(COLUMNS, record, strict=True)))
-    files[TABLE] = csv_text([COLUMNS, *(record.values() for record in records)]).encode()
-    files[INSTRUMENT] = _instrument(field.name, records, curves).encode()
+            how = (f"{layer.force:g}", f"{layer.contact_time:g}", note, *velocities)
+            records.append((name, *where, *how, f"{samples / rate:.6g}", level, row))
+            groups[velocities].append(f"<region> sample={name} key={note} {curve}")
+    files[TABLE] = csv_text([COLUMNS, *records]).encode()
+    head = [f"// {field.name or 'object'}, as exported by avmsf", "<global> loop_mode=one_shot amp_veltrack=100"]
+    files[INSTRUMENT] = "\n".join([*head, *chain.from_iterable(groups.values()), ""]).encode()
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in ordered]
-    sizes = write_folder(Path(folder), files, manifest, overwrite=overwrite)
     remarks.append(f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB")
     if ordered != list(layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)
         remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
-    return Written(sizes, tuple(remarks))
+    return Written(write_folder(Path(folder), files, manifest, overwrite=overwrite), tuple(remarks))
 
 
 def _check(
@@ -174,17 +175,3 @@ def _curves(amplitude: Float64[np.ndarray, " layers"], edges: Int[np.ndarray, " 
         gains = level / max(amplitude[number], np.finfo(float).tiny)
         curves.append(" ".join(f"amp_velcurve_{each}={gain:.6g}" for each, gain in zip(velocity, gains, strict=True)))
     return curves
-
-
-def _instrument(name: str, records: Sequence[Mapping[str, object]], curves: Sequence[str]) -> str:
-    """Return an SFZ instrument that plays each contact at its note and each layer at its velocities by its curve."""
-    lines = [f"// {name or 'object'}, as exported by avmsf", "<global> loop_mode=one_shot amp_veltrack=100"]
-    ranges = dict.fromkeys((record["velocity_low"], record["velocity_high"]) for record in records)
-    for low, high in ranges:
-        lines.append(f"<group> lovel={low} hivel={high}")
-        lines += [
-            f"<region> sample={record['file']} key={record['midi_note']} {curve}"
-            for record, curve in zip(records, curves, strict=True)
-            if record["velocity_low"] == low
-        ]
-    return "\n".join(lines) + "\n"
