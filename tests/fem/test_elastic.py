@@ -18,6 +18,8 @@ from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.isotropic import IsotropicModes, isotropic_modes
 from avmsf.fem.material import GLASS, STEEL, WOOD, Material
 from avmsf.fem.solid import Solid
+from avmsf.fem.walls import shell
+from factories.looked_at import sphere
 from factories.raising import raises
 from oracles.block import block
 
@@ -102,6 +104,16 @@ def test_thin_curved_walls_do_not_lock():
     # Linear elements of the finer mesh are half as high again.
     coarse, fine = (float(elastic_modes(curved(sides), GLASS, count=4).frequency[0]) for sides in (5, 9))
     assert coarse == pytest.approx(fine, rel=0.03)
+
+
+def test_the_few_lowest_modes_of_a_thin_ball_are_found_though_they_are_close_together():
+    radius, thickness = 0.05, 0.001
+    found = elastic_modes(shell(sphere(radius), thickness=thickness, detail=0.08), GLASS, count=5).frequency
+    # Lamb's membrane: its five modes of degree 2; facets and bending make them 5 % higher.
+    linear, constant = 7.0 + 3.0 * GLASS.poisson, 4.0 * (1.0 - GLASS.poisson**2)
+    square = 0.5 * (linear - math.sqrt(linear**2 - 4.0 * constant)) * GLASS.young / GLASS.density
+    expected = math.sqrt(square) / (2 * math.pi * (radius - 0.5 * thickness))
+    assert found.tolist() == pytest.approx([expected] * 5, rel=0.07)
 
 
 def test_matrices_are_those_of_another_implementation(bracket):
