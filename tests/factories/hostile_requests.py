@@ -68,7 +68,7 @@ class Fuzzer:
             yield Request("POST", "edit", self._edit())
             yield Request("POST", choose(("locate", "capture/check")), self._recording())
             names = ("x", "y", "z", "nx", "ny", "nz", "newtons")
-            query = "&".join(f"{name}={choose(_NUMBERS)}" for name in names)
+            query = "&".join(f"{name}={choose(('0.01', '-0.02', '0', choose(_NUMBERS)))}" for name in names)
             yield Request("POST", f"capture/strikes?{quote(query, safe='=&')}", self._recording())
             yield Request("PUT", "capture/strikes/a.wav", self._recording())
             words = choose(({"base": self.base}, {"base": self.base, "name": choose(_NAMES)}))

@@ -66,7 +66,8 @@ def test_the_page_gets_the_field_that_is_open(plate: Served) -> None:
     assert {"locate", "edit", "save"} <= set(manifest["live"]["abilities"])
     assert "capture" not in manifest["live"]["abilities"]
     field = plate_field("elastic")
-    assert np.array_equal(tensor(plate, manifest, "frequency"), field.bank.frequency.numpy())
+    for name in ("frequency", "damping"):
+        assert np.array_equal(tensor(plate, manifest, name), getattr(field.bank, name).numpy())
     points, sine, cosine = (tensor(plate, manifest, name) for name in ("points", "sine", "cosine"))
     gains = field.known(torch.from_numpy(points.copy())).mean.numpy()
     np.testing.assert_allclose(sine + 1j * cosine, gains, rtol=0, atol=1e-5 * np.abs(gains).max())
