@@ -30,7 +30,7 @@ SETTINGS = (
     'name = "ball"\nunit = "m"\nseconds = 0.1\nplayback_speed = 1.0\nnormalize = "auto"\nhighpass = 20.0\n'
     "align = true\nregularization = 1e-4\nresponse_channel = 1\n"
 )
-SURFACES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+SURFACES = (".ply", ".obj", ".glb", ".stl", ".off")
 
 
 def write_seeds(folder: Path) -> None:
@@ -39,10 +39,10 @@ def write_seeds(folder: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
     colored = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=np.full((len(ball.vertices), 4), 200, np.uint8))
     for suffix in SURFACES:
-        # The buffers of a glTF are files of their own otherwise.
-        options: dict[str, Any] = {"embed_buffers": True} if suffix == ".gltf" else {}
-        colored.export(folder / f"surface{suffix}", **options)
+        colored.export(folder / f"surface{suffix}")
     colored.export(folder / "surface_text.ply", encoding="ascii")
+    embedded: Any = colored.export(file_type="gltf", embed_buffers=True)
+    (folder / "surface.gltf").write_bytes(embedded["model.gltf"])
     _write_views(folder)
     write_splats(random_cloud(40, degree=1), folder / "splats.ply")
     for name, gains in (("attention", attention()), ("mixture", elastic())):

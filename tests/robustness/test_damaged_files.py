@@ -15,9 +15,10 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("family", files.FAMILIES)
-def test_damage_is_refused_or_harmless(tmp_path: Path, seeds: Path, family: str) -> None:
-    inputs = files.damaged_inputs(seeds, tmp_path / "input", count=4, seed=1, families=(family,))
+def test_damage_is_refused_or_harmless(tmp_path: Path, seeds: Path, family: str, count: int) -> None:
+    inputs = files.damaged_inputs(seeds, tmp_path / "input", count=count, seed=1, families=(family,))
     results = {name: files.outcome_of(read) for _, name, read in inputs}
-    assert len(results) == 4
+    assert len(results) == count
     assert not {name: said for name, (result, said) in results.items() if result not in ("read", "refused")}
