@@ -16,7 +16,7 @@ from avmsf.capture.table import read_cells
 from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_meshes import HollowShape
-from avmsf.fem.candidate_bodies import CandidateBodies, CandidateBody
+from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material, material_named
@@ -103,9 +103,9 @@ def guess_field(
     """
     material = material_named(material) if isinstance(material, str) else material
     body, settings = body or BodyConfig(), settings or CaptureSettings()
-    seen = surface if isinstance(surface, Surface) else surface.as_seen()
-    _expect_meters(seen)
-    found = _body(surface, material, body, count=modes, cache=cache, log=log)
+    seen = _as_seen(surface, body.wall)
+    free = replace(body, wall=body.wall or 0.0, shapes=modes, supports="free")
+    found = candidate_bodies(surface, free, material=material, cache=cache, log=log).bodies[0]
     vibration = damped(
         found.elastic.frequency,
         torch.diag(rayleigh(found.elastic.frequency, material)),
@@ -150,31 +150,20 @@ def expect_no_recordings(folder: Path) -> None:
         )
 
 
-def _expect_meters(surface: Surface) -> None:
-    extent = float((surface.vertices.amax(0) - surface.vertices.amin(0)).max())
+def _as_seen(surface: Surface | HollowShape, wall: float | None) -> Surface:
+    """Return what is seen. Raises FitError where it is no object in meters, or does not say how thick its wall is."""
+    seen = surface if isinstance(surface, Surface) else surface.as_seen()
+    extent = float((seen.vertices.amax(0) - seen.vertices.amin(0)).max())
     if not NARROWEST <= extent <= WIDEST:
         wanted, advice = f"a size of {NARROWEST:g} to {WIDEST:g} m", "state the mesh's unit in capture.toml"
         raise FitError.expected(wanted, extent, got=f"{extent:.3g} m", name="surface_unit", advice=advice)
-
-
-def _body(
-    surface: Surface | HollowShape,
-    material: Material,
-    config: BodyConfig,
-    *,
-    count: int,
-    cache: Path | None,
-    log: Callable[[str], None] | None,
-) -> CandidateBody:
-    """Return the free body of the stated wall, by default the solid one."""
     between = None if isinstance(surface, Surface) else surface.thickness_range
-    if between is not None and config.wall is None:
+    if between is not None and wall is None:
         low, high = (1000 * each for each in between)
         advice = f"give it by --set body.wall=METERS (0: solid; by the views {low:.2g} to {high:.2g} mm)"
         wanted = "the wall thickness, which sets the frequencies"
         raise FitError.expected(wanted, between, got="none", name="wall", advice=advice)
-    free = replace(config, wall=config.wall or 0.0, shapes=count, supports="free")
-    return candidate_bodies(surface, free, material=material, cache=cache, log=log).bodies[0]
+    return seen
 
 
 def _pulse(elastic: ElasticModes, poles: Complex128[Tensor, " modes"]) -> Float64[Tensor, " modes"]:

@@ -99,51 +99,51 @@ def shape_of(
     Raises SceneError for views, and CaptureError for contacts, that do not fit each other.
     """
     if isinstance(pipeline, SceneStages):
-        given = None if features is None else (features, report)
-        return _shape_of_views(capture, config, pipeline, given)
-    log = pipeline.listener.note
-    if config.scene != PRESETS["default"].scene and is_mesh(capture.surface):
+        return _shape_of_views(capture, config, pipeline, features, report)
+    log, found, impacts, seed = pipeline.listener.note, capture.surface, capture.impacts, config.fit.seed
+    if config.scene != PRESETS["default"].scene and is_mesh(found):
         log("the object's shape is its mesh: settings of views, Gaussians and features are not used")
-    points = _points_of(capture, config, features, log)
-    surface, digest = object_shape(capture.surface, None)
-    if config.gain_model != NETWORK and is_mesh(capture.surface):
-        keep_surface(pipeline, surface, digest)
-    known = capture.surface is not None or features is not None
-    return FitShape(points, points, lambda: _symmetries(capture, config), surface, digest, report, known)
-
-
-def _points_of(
-    capture: Capture, config: PipelineConfig, features: FeatureField | None, log: Callable[[str], None]
-) -> FeatureField:
-    """Return the object's points: the described ones, else of its surface, else those that fill the contacts' box."""
-    if features is not None:
-        expect_on_object(capture.impacts.contacts, features.points, names=capture.impacts.names)
-        return features
-    if config.gain_model == NETWORK:
+    if features is None and config.gain_model == NETWORK:
         if not config.allow_missing_features:
             advice = "name a file by --features, or fit without visual features by --allow-missing-features"
             wanted = "visual features, of what the folder shows or of a file"
             raise FitError.expected(wanted, got="none", name="features", advice=advice)
         log("without visual features: the network reads positions alone")
-    if capture.surface is None:
-        log(_no_shape(config))
-        return FeatureField.from_contacts(capture.impacts.contacts)
-    expect_on_object(capture.impacts.contacts, surface_points(capture.surface), names=capture.impacts.names)
-    return FeatureField.from_mesh(capture.surface, seed=config.fit.seed)
+    if features is not None:
+        points = features
+        expect_on_object(impacts.contacts, features.points, names=impacts.names)
+    elif found is not None:
+        expect_on_object(impacts.contacts, surface_points(found), names=impacts.names)
+        points = FeatureField.from_mesh(found, seed=seed)
+    else:
+        lacks = " and no elastic mode shapes" if config.gain_model == AUTO else ""
+        log(
+            f"nothing shows the object's shape: points that fill the bounding box of its contacts are used{lacks}. Add "
+            "a mesh (surface.obj), photographs, a video or Gaussians"
+        )
+        points = FeatureField.from_contacts(impacts.contacts)
 
+    def symmetries() -> Symmetries | None:
+        generator = torch.Generator().manual_seed(seed)
+        if found is None:
+            return None
+        return find_symmetries(FeatureField.from_mesh(found, seed=generator).points, seed=generator)
 
-def _symmetries(capture: Capture, config: PipelineConfig) -> Symmetries | None:
-    if capture.surface is None:
-        return None
-    generator = torch.Generator().manual_seed(config.fit.seed)
-    points = FeatureField.from_mesh(capture.surface, seed=generator).points
-    return find_symmetries(points, seed=generator)
+    surface, digest = object_shape(found, None)
+    if config.gain_model != NETWORK and is_mesh(found):
+        keep_surface(pipeline, surface, digest)
+    known = found is not None or features is not None
+    return FitShape(points, points, symmetries, surface, digest, report, known)
 
 
 def _shape_of_views(
-    capture: Capture, config: PipelineConfig, scene: SceneStages, given: tuple[FeatureField, Mapping[str, Any]] | None
+    capture: Capture,
+    config: PipelineConfig,
+    scene: SceneStages,
+    given: FeatureField | None,
+    report: Mapping[str, Any],
 ) -> FitShape:
-    """Return the shape that views show; `given` are features with their report, in place of those of the views."""
+    """Return the shape that views show; `given` features with their report are in place of those of the views."""
     impacts, settings = capture.impacts, capture.settings
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
@@ -154,7 +154,9 @@ def _shape_of_views(
     if scene.splats is not None:
         points = read_splats(scene[CLOUD].path).centers
         expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians")
-    features, report = given or (load_features(scene.features.path), read_report(scene.features.path))
+    features = given
+    if features is None:
+        features, report = load_features(scene.features.path), read_report(scene.features.path)
     surface, digest = object_shape(capture.surface, scene)
     # The paper's network reads the Gaussians' own centers.
     centers = config.gain_model == NETWORK and config.scene.lift.onto == "gaussians"
@@ -233,12 +235,3 @@ def keep_surface(pipeline: Pipeline, make: Callable[[], Surface | ObjectShape], 
 def is_mesh(surface: Surface | None) -> bool:
     """Return whether there is a surface with triangles."""
     return surface is not None and len(surface.faces) > 0
-
-
-def _no_shape(config: PipelineConfig) -> str:
-    """Return the note on a capture without a shape, which says also what its gain model has to do without."""
-    lacks = " and no elastic mode shapes" if config.gain_model == AUTO else ""
-    return (
-        f"nothing shows the object's shape: points that fill the bounding box of its contacts are used{lacks}. Add a "
-        "mesh (surface.obj), photographs, a video or Gaussians"
-    )

@@ -107,9 +107,16 @@ def view_stages(source: Source, config: ViewsConfig, *, settings: CaptureSetting
 
     def make_views(path: Path, motion: Path | None = None) -> None:
         if source.kind == "mesh":
-            views = _rendered(source.path, config, settings=settings, log=log)
+            mesh = read_textured_mesh(source.path, meters=settings.surface_meters)
+            cameras = orbit_cameras(mesh.surface, size=config.rendered)
+            log(f"views: rendering {len(cameras)} of {source.path.name}")
+            views = render_views(mesh, cameras)
         else:
-            views = _photographed(motion or source.path, config, meters=settings.views_meters, log=log)
+            views = read_views(motion or source.path, longest=config.longest, meters=settings.views_meters)
+            bare = sum(view.mask is None for view in views)
+            if config.masks and bare:
+                log(f"views: {len(views)}, finding the object in {bare} without a mask")
+                views = find_foreground(views)
         write_views(spread_views(views, config.count), path, replace=True)
 
     def recipe() -> dict[str, Any]:
@@ -140,19 +147,3 @@ def spread_views(views: Sequence[View], count: int) -> Sequence[View]:
         return views
     positions = torch.stack([view.camera.position for view in views])
     return [views[row] for row in sorted(farthest_points(positions, count).tolist())]
-
-
-def _photographed(folder: Path, config: ViewsConfig, *, meters: float, log: Log) -> tuple[View, ...]:
-    views = read_views(folder, longest=config.longest, meters=meters)
-    bare = sum(view.mask is None for view in views)
-    if config.masks and bare:
-        log(f"views: {len(views)}, finding the object in {bare} without a mask")
-        views = find_foreground(views)
-    return views
-
-
-def _rendered(path: Path, config: ViewsConfig, *, settings: CaptureSettings, log: Log) -> tuple[View, ...]:
-    mesh = read_textured_mesh(path, meters=settings.surface_meters)
-    cameras = orbit_cameras(mesh.surface, size=config.rendered)
-    log(f"views: rendering {len(cameras)} of {path.name}")
-    return render_views(mesh, cameras)
