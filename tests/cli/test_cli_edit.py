@@ -24,8 +24,7 @@ from avmsf.errors import AvmsfError
 from avmsf.evaluation.clap import Clap
 from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.field.gains.kernels import Sites
-from avmsf.field.header import SUPPORTING
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
 from factories.made_clap import save_clap

@@ -20,8 +20,7 @@ from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
 from avmsf.field.gains.kernels import Smooth
-from avmsf.field.header import SUPPORTING
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.located_plate import mixture_of

@@ -20,8 +20,7 @@ from avmsf.export.sampled_field import SampledField, outward_normals
 from avmsf.export.web import write_webpage
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import ScaledGains
-from avmsf.field.header import SUPPORTING
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh.surface import Surface
 from avmsf.modal.modes import ForcePulse, ModalBank

@@ -14,10 +14,10 @@ from avmsf.editing.material import change_material, infer_material
 from avmsf.editing.modal_edit import EDITS, adjust_modes
 from avmsf.errors import FieldFileError
 from avmsf.fem.material import GLASS, WOOD
+from avmsf.field.config import FORMAT
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.scaled import BodyGains, ScaledGains
-from avmsf.field.header import FORMAT
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from factories.made_fields import Change, record_in, rewritten

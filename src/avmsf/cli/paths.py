@@ -15,7 +15,7 @@ from avmsf._utils.text import RecordError, like
 from avmsf.capture.filenames import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from avmsf.capture.table import REQUIRED, read_table
 from avmsf.errors import AvmsfError, FieldFileError
-from avmsf.field.header import FIELD
+from avmsf.field.config import FIELD
 from avmsf.pipeline.config import CACHE, CACHED_FIELD
 
 FileKind = Literal[

@@ -21,8 +21,8 @@ a kernel K with a noise share q, the scale s^2 integrated out:
   leave-one-place-out errors follow in closed form (R&W 5.4.2) and give `quality`, outliers and `next_contacts`.
 
 Types: `SoundField` (`sound_field`); `GainModel` with `AttentionGains` (the paper's network), `MixtureGains`,
-`BodyGains` (a guess without recordings) and `ScaledGains` (edits); `FitConfig` (`config`). `store` has the file,
-`header` its record. `hammer_access`: which places can be struck; `probable_body`: the body of most evidence.
+`BodyGains` (a guess without recordings) and `ScaledGains` (edits); `FitConfig` (`config`). `store` has the file.
+`hammer_access`: which places can be struck; `probable_body`: the body of most evidence.
 """
 
 import lazy_loader

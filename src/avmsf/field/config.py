@@ -1,16 +1,20 @@
-"""How a field is fitted: one flat record, which is the command line's options too."""
+"""How a field is fitted, one flat record that is the command line's options too, and the kind of its file."""
 
 import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from avmsf.errors import FitError
+from avmsf._utils.headers import FileKind
+from avmsf.errors import FieldFileError, FitError
 from avmsf.modal.config import scaled_fft_size
 
 AUTO, NETWORK = "auto", "network"
 GainModelName = Literal["auto", "network", "smooth", "thin-plate", "symmetry", "visual", "elastic"]
 """How gains vary over an object: see `avmsf.field.gains.estimator`."""
 
+FORMAT = 8
+"""Number of this format; it grows with every change that older versions could not read. Later versions read it."""
+FIELD = FileKind("avmsf", "a sound field", "fit and save it again", FieldFileError, (FORMAT,))
 ADDED_SETTINGS = {"positive_gains": False, "positive": False}
 """Settings of a fit and of the network that the first field files lack, and what they stand for there: files hold them
 only where they differ, so that earlier versions read all others."""

@@ -19,10 +19,9 @@ from avmsf.field.gains.data import GainData, gain_data
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
 from avmsf.field.gains.model import Gains
-from avmsf.field.header import SUPPORTING
 from avmsf.field.next_contacts import suggest
 from avmsf.field.quality import FieldQuality, PlaceErrors, smallest_within_error
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.field.training import GainEstimator, Progress, Trainer
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.residual_noise import Residual, estimate_residual, missing_background

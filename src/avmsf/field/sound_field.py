@@ -17,7 +17,6 @@ from avmsf.errors import FitError, PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
 from avmsf.field.gains.model import GainModel, Gains, expect_near, off_surface
-from avmsf.field.header import SUPPORTING
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
 from avmsf.modal.extraction.alignment import Alignment
@@ -25,6 +24,8 @@ from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import MEDIAN_LEVEL, Residual, low_fluctuation_noise, missing_background, shape_noise
 from avmsf.modal.synthesis import synthesize
 
+SUPPORTING = "supporting_poles"
+"""What a report calls the rows of the bank's poles that are no modes of the object."""
 _BATCH = 32
 """Contacts rendered at once, which bounds the memory."""
 _LEVEL_POINTS = 256

@@ -27,13 +27,13 @@ from avmsf._utils.text import RecordError, count_of, like, record_of, without_de
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import AvmsfError, FieldFileError
-from avmsf.field.config import ADDED_SETTINGS, REMOVED_SETTINGS, FitConfig
+from avmsf.fem.material import Material
+from avmsf.field.config import ADDED_SETTINGS, FIELD, REMOVED_SETTINGS, FitConfig
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
-from avmsf.field.header import FIELD, checked_report
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
-from avmsf.field.sound_field import Origin, SoundField
+from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
@@ -42,6 +42,8 @@ _GAINS, _ALIGNMENT = "gains.", "alignment."
 _POSITIVE = ("bank.frequency", "bank.damping")
 _MAX = {"bank.frequency": 1e9, "bank.damping": 1e9, "residual.magnitude": MAX_PEAK}
 """Largest values: hertz and 1/s beyond any solid's modes, and noise as loud as the loudest recording."""
+_RENAMED_EDITS = {"recast": "change_material", "retune": "adjust_modes", "steer": "guided"}
+"""Kinds of edits that earlier versions wrote, and what they are called now."""
 _KINDS: dict[str, type[GainModel]] = {**FITTED, ScaledGains.kind: ScaledGains}
 """The gain fields that a file may hold, by what it calls them."""
 
@@ -119,7 +121,7 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
         per_newton=like(origin["per_newton"], True, "origin.per_newton"),
         config=record_of(FitConfig, config, "config", added=ADDED_SETTINGS),
-        report=checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
+        report=_checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
         settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
     )
     if (quality := read.report.get("quality")) is not None:
@@ -134,6 +136,32 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
             got = f"{low:.3g} to {high:.3g}"
             raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=FIELD.advice)
     return read
+
+
+def _checked_report(report: dict[str, Any], modes: int) -> dict[str, Any]:
+    """Return the checked report on a field of so many modes, with its edits called as this version calls them."""
+    for row, pole in enumerate(like(report.get(SUPPORTING, []), [], f"origin.report.{SUPPORTING}")):
+        name = f"origin.report.{SUPPORTING}.{row}"
+        if not 0 <= like(pole, 0, name) < modes:
+            raise RecordError.expected(f"a row from 0 to {modes - 1}", pole, name=name)
+    edits = like(report.get("edits", []), [], "origin.report.edits")
+    found = [_edit_of(entry, f"origin.report.edits.{row}", modes) for row, entry in enumerate(edits)]
+    return {**report, "edits": found} if found else report
+
+
+def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
+    known: dict[str, Any] = like(entry, {}, name)
+    written = like(known.get("edit"), "", f"{name}.edit")
+    kind = _RENAMED_EDITS.get(written, written)
+    if kind == "change_material":
+        record_of(Material, known.get("to"), f"{name}.to")
+    if kind == "adjust_modes":
+        for key in ("pitch", "decay"):
+            factors = known.get(key)
+            for factor in factors if isinstance(factors, list) and len(factors) == modes else [factors]:
+                if not 0.0 < like(factor, 1.0, f"{name}.{key}") < math.inf:
+                    raise RecordError.expected("a number above 0", factor, name=f"{name}.{key}")
+    return {**known, "edit": kind}
 
 
 def _background_force(record: Mapping[str, Any]) -> float | None:
