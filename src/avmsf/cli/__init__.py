@@ -3,9 +3,9 @@
 What goes in are words; what comes out are files, text on the standard error and results on the standard output, as
 tables for people or with `--json` as one object. Each module of a verb has `Options`, a frozen dataclass of which tyro
 makes the command line, and `run(options)`, which imports what computes, calls the package and prints: start reading
-with `render`. `options` parses and checks before anything is loaded, `settings` reads `--set` and `--config`, `paths`
-says what files and folders have to be, `many` runs a verb for each of several inputs, `contacts` reads positions,
-`report` says what fields are, `edits` edits them and says how, `output` prints.
+with `render`. `options` parses and checks before anything is loaded, and reads `--set` and `--config`, `paths` says
+what files and folders have to be, `many` runs a verb for each of several inputs, `contacts` reads positions, `report`
+says what fields are, `edits` edits them and says how, `output` prints.
 """
 
 import os

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options import Configured, Flag
+from avmsf.cli.options import Configured, Flag, with_settings
 from avmsf.cli.output import next_command, print_json, show
 from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg, expect_free
-from avmsf.cli.settings import with_settings
 from avmsf.editing.config import STABLE_AUDIO, EditSettings
 from avmsf.errors import EditError
 from avmsf.fem.material import material_named

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.options import Configured, Device, Flag
+from avmsf.cli.options import Configured, Device, Flag, with_settings
 from avmsf.cli.output import display, next_command, next_step, note, print_json, say, show, table
 from avmsf.cli.paths import CacheFolder, ContactData, Existing, OutputFolder, arg
-from avmsf.cli.settings import with_settings
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.registry import PROTOCOLS, EvaluationSettings, expect_suited, protocol_named, suited_methods

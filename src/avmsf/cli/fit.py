@@ -14,10 +14,9 @@ from avmsf.capture.filenames import expect_views
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.cli.info import describe_shape, draw_field
 from avmsf.cli.many import Many, run_many
-from avmsf.cli.options import Configured, Device, Flag, Int, Name, Number, expect_capture, option_of
+from avmsf.cli.options import Configured, Device, Flag, Int, Name, Number, expect_capture, option_of, with_settings
 from avmsf.cli.output import display, next_command, next_step, print_json, print_result, show
 from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, arg, expect_free
-from avmsf.cli.settings import with_settings
 from avmsf.errors import FitError
 from avmsf.fem.material import material_named
 from avmsf.field.config import GainModelName

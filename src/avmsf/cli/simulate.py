@@ -7,10 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options import Configured, Flag, Int, Name, Number
+from avmsf.cli.options import Configured, Flag, Int, Name, Number, with_settings
 from avmsf.cli.output import display, next_command, print_json, print_result, show, table
 from avmsf.cli.paths import CacheFolder, Existing, OutputFolder, arg
-from avmsf.cli.settings import with_settings
 from avmsf.errors import SimulationError
 from avmsf.fem.material import MATERIALS
 from avmsf.simulate.recipe import EXAMPLE, NON_SYMMETRIC, SETS, ObjectRecipe, named_recipe
