@@ -84,7 +84,7 @@ def test_the_sample_rate_hardly_matters(cdpam):
 
 @needs_weights
 def test_a_sound_is_embedded_once(cdpam, monkeypatch):
-    sounds, asked = strikes(1000), []
+    sounds, asked = strikes(200), []
     expected = cdpam.embed(sounds, sample_rate=RATE)
     monkeypatch.setattr(
         "avmsf.evaluation.cdpam.conv1d", lambda *given, **named: asked.append(given) or conv1d(*given, **named)
