@@ -28,23 +28,7 @@ test contacts. What has seen the contacts that it is tested at is never marked a
 DAMPING_FORMS = ("paper", "paper-per-contact")
 """The methods that it is a choice of: where both have values, its row is shown."""
 Values = Mapping[str, Mapping[str, Mapping[str, float]]]
-"""By object, method and metric."""
-
-
-@dataclass(frozen=True)
-class Mean:
-    """A mean over objects."""
-
-    mean: float
-    standard_error: float | None
-    """As if the objects were a random sample; None for a single one."""
-    objects: int
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Mean":
-        """Return the mean of at least one value."""
-        error = stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
-        return cls(fmean(values), error, len(values))
+"""By method, metric and object."""
 
 
 def _is_rising(metric: str) -> bool:
@@ -87,34 +71,37 @@ def object_values(
 def values_of(
     records: Iterable[ObjectRecord], label: str, average: Callable[[Sequence[float]], float] = fmean
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Return all objects' figures in one experiment, as `object_values`; objects without any are left out."""
-    figures = {record.identifier: object_values(record, label, average) for record in records}
-    return {identifier: found for identifier, found in figures.items() if found}
-
-
-def _by_metric(table: Values) -> dict[str, dict[str, dict[str, float]]]:
-    """Return the values by method, metric and object."""
+    """Return all objects' figures in one experiment by method, metric and object, each as `object_values`."""
     found: dict[str, dict[str, dict[str, float]]] = {}
-    for identifier, figures in table.items():
-        for method, values in figures.items():
+    for record in records:
+        for method, values in object_values(record, label, average).items():
             for metric, value in values.items():
-                found.setdefault(method, {}).setdefault(metric, {})[identifier] = value
+                found.setdefault(method, {}).setdefault(metric, {})[record.identifier] = value
     return found
 
 
-def means(table: Values) -> dict[str, dict[str, Mean]]:
-    """Return the means over objects by method and metric."""
-    pooled = _by_metric(table).items()
-    return {method: {name: Mean.of([*each.values()]) for name, each in metrics.items()} for method, metrics in pooled}
+def means(table: Values, statistic: Callable[[Sequence[float]], Any] = fmean) -> dict[str, dict[str, Any]]:
+    """Return the means over objects, or another statistic of their values, by method and metric."""
+    return {method: {name: statistic([*each.values()]) for name, each in row.items()} for method, row in table.items()}
+
+
+def standard_error(values: Sequence[float]) -> float | None:
+    """Return the standard error of a mean, as if the objects were a random sample; None for a single one."""
+    return stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
+
+
+def _objects(*metrics: Mapping[str, Mapping[str, float]]) -> set[str]:
+    """Return the objects that methods have values of."""
+    return {identifier for each in metrics for values in each.values() for identifier in values}
 
 
 def ratios(table: Values, *, of_means: bool = False) -> dict[str, dict[str, float]]:
     """Return the geometric means of the ratios to the baseline, object by object, or the ratios `of_means`."""
-    pooled, found = _by_metric(table), dict[str, dict[str, float]]()
-    for method, metrics in pooled.items():
+    known, found = table.get(BASELINE, {}), dict[str, dict[str, float]]()
+    for method, metrics in table.items():
         for metric, values in metrics.items():
-            known = pooled.get(BASELINE, {}).get(metric, {})
-            pairs = [(value, known[name]) for name, value in values.items() if known.get(name, 0.0) > 0]
+            others = known.get(metric, {})
+            pairs = [(value, others[name]) for name, value in values.items() if others.get(name, 0.0) > 0]
             row = found.setdefault(method, {}) if pairs else {}
             if pairs and of_means and not _is_rising(metric):
                 row[metric] = math.fsum(one for one, _ in pairs) / math.fsum(base for _, base in pairs)
@@ -139,8 +126,11 @@ def summarize(
     labels = labels_of(records)
     tables = {label: values_of(records, label) for label in labels}
     main = tables[labels[0]] if labels else {}
-    found = means(main)
-    parts = {name: {each: main[each] for each in main if each in members} for name, members in (subsets or {}).items()}
+    parts = {
+        name: values_of([each for each in records if each.identifier in members], labels[0])
+        for name, members in (subsets or {}).items()
+        if labels
+    }
     return {
         **{key: identity.get(key) for key in ("protocol", "dataset", "version", "seed", "metrics")},
         "main_case": labels[0] if labels else None,
@@ -148,23 +138,21 @@ def summarize(
         "test_contacts": sum(
             len({name for case in each.cases if case.label in labels[:1] for name in case.test}) for each in records
         ),
-        "methods": _plain(found),
-        "standard_errors": _plain(found, "standard_error"),
-        "medians": _plain(means(values_of(records, labels[0], median))) if labels else {},
-        "counts": {method: max(each.objects for each in figures.values()) for method, figures in found.items()},
+        "methods": means(main),
+        "standard_errors": means(main, standard_error),
+        "medians": means(values_of(records, labels[0], median)) if labels else {},
+        "counts": {method: max(map(len, metrics.values())) for method, metrics in main.items()},
         f"ratio_to_{BASELINE}": ratios(main),
         f"ratio_of_means_to_{BASELINE}": ratios(main, of_means=True),
-        "cases": {label: _plain(means(table)) for label, table in tables.items()},
+        "cases": {label: means(table) for label, table in tables.items()},
         "subsets": {
-            name: {"objects": len(table), "methods": _plain(means(table))} for name, table in parts.items() if table
+            name: {"objects": len(_objects(*table.values())), "methods": means(table)}
+            for name, table in parts.items()
+            if table
         },
         "failures": failures_of(records),
         "missing": {name: list(methods) for name, methods in (missing or {}).items()},
     }
-
-
-def _plain(table: Mapping[str, Mapping[str, Mean]], name: str = "mean") -> dict[str, dict[str, Any]]:
-    return {method: {metric: getattr(each, name) for metric, each in row.items()} for method, row in table.items()}
 
 
 def missing_of(records: Iterable[ObjectRecord], wanted: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -233,7 +221,7 @@ def sections(
     parts = [report.opening()]
     if report.main:
         parts.append(report.main_table())
-        if any(BASELINE in methods for methods in report.main.values()):
+        if BASELINE in report.main:
             parts.append(report.ratio_table())
         parts.append(report.median_table())
         if len(report.tables) > 1:
@@ -253,14 +241,12 @@ class _Report:
         self.tables = {label: self._ordered(values_of(records, label)) for label in labels_of(records)}
         self.label: str | None = next(iter(self.tables), None)
         self.main: Values = next(iter(self.tables.values()), {})
-        known = {metric for methods in self.main.values() for values in methods.values() for metric in values}
+        known = {metric for metrics in self.main.values() for metric in metrics}
         self.shown = [metric for metric, entry in METRICS.items() if metric in known and entry.heading]
 
     def _ordered(self, table: Values) -> Values:
         order = [*self.identity["methods"], CHOSEN_ON_TEST]
-        return {
-            name: {method: values[method] for method in order if method in values} for name, values in table.items()
-        }
+        return {method: table[method] for method in order if method in table}
 
     def opening(self) -> Section:
         dataset, name = self.experiment
@@ -297,34 +283,34 @@ class _Report:
         return [f"Incomplete: results of {objects} are missing: {', '.join(listed)}. {advice}"] if listed else []
 
     def main_table(self) -> Section:
-        found, (dataset, _), objects = means(self.main), self.experiment, self.main.values()
+        (dataset, _), objects = self.experiment, _objects(*self.main.values())
         rows = [
-            (*_row(method, values, self.shown), str(max((each.objects for each in values.values()), default=0)))
-            for method, values in found.items()
+            (*_row(method, metrics, self.shown), str(max(map(len, metrics.values()))))
+            for method, metrics in self.main.items()
         ]
         paper = [row for row in PUBLISHED.get(self.experiment, ()) if row.label in (None, self.label)]
         rows += [(*_row(f"paper: {row.title}", row.values, self.shown), _DASH) for row in paper]
         best = set()
         for column, metric in enumerate(self.shown, 1):
             # Among the methods that have the metric of all objects that have it.
-            total = sum(any(metric in values for values in methods.values()) for methods in objects)
+            total = len({name for metrics in self.main.values() for name in metrics.get(metric, ())})
             complete = {
-                row: values[metric].mean
-                for row, (method, values) in enumerate(found.items())
-                if metric in values and values[metric].objects == total and method != CHOSEN_ON_TEST
+                row: fmean(metrics[metric].values())
+                for row, (method, metrics) in enumerate(self.main.items())
+                if len(metrics.get(metric, ())) == total and method != CHOSEN_ON_TEST
             }
             if complete:
                 best.add(((max if _is_rising(metric) else min)(complete, key=complete.__getitem__), column))
         remarks = [f"The paper has no values of this experiment on {dataset}."]
         if self.experiment in PUBLISHED:
             remarks = [f"Rows that begin with “paper:” are the paper's values on {dataset}."]
-        if fewer := [method for method in found if any(method not in methods for methods in objects)]:
+        if fewer := [method for method, metrics in self.main.items() if _objects(metrics) != objects]:
             remarks.insert(
                 0,
                 f"Not of all {len(objects)} objects: {', '.join(fewer)}. Their means are of other objects than those "
                 "of the other rows, and not marked as best; ratios are of the same objects.",
             )
-        if titles := [f"{each}: {METHODS[kind_of(each)].title}" for each in found if kind_of(each) in METHODS]:
+        if titles := [f"{each}: {METHODS[kind_of(each)].title}" for each in self.main if kind_of(each) in METHODS]:
             remarks.append(f"{'; '.join(titles)}.")
         title = "All methods" + (f": {self.label}" if len(self.tables) > 1 else "")
         columns = ("method", *(METRICS[metric].heading for metric in self.shown), "objects")
@@ -347,24 +333,25 @@ class _Report:
         return Section(f"Ratio to {BASELINE}", (text,), columns, tuple(rows))
 
     def median_table(self) -> Section:
-        found = means(self._ordered(values_of(self.records, str(self.label), median)))
-        rows = [_row(method, values, self.shown) for method, values in found.items()]
+        table = self._ordered(values_of(self.records, str(self.label), median))
+        rows = [_row(method, metrics, self.shown) for method, metrics in table.items()]
         text = "Medians over an object's test recordings, which single contacts do not decide, then means over objects."
         return Section("Medians", (text,), ("method", *(METRICS[metric].heading for metric in self.shown)), tuple(rows))
 
     def case_table(self, metric: str) -> Section:
-        found = {label: means(table) for label, table in self.tables.items()}
-        methods = dict.fromkeys(method for each in found.values() for method in each)
+        methods = dict.fromkeys(method for table in self.tables.values() for method in table)
         rows = [
-            _row(method, {label: each.get(method, {}).get(metric) for label, each in found.items()}, found)
+            _row(
+                method, {label: table.get(method, {}).get(metric) for label, table in self.tables.items()}, self.tables
+            )
             for method in methods
         ]
         paper = PUBLISHED.get(self.experiment, ())
         for title in dict.fromkeys(row.title for row in paper):
             own = {row.label: row.values[metric] for row in paper if row.title == title and metric in row.values}
-            if own.keys() & found.keys():
-                rows.append(_row(f"paper: {title}", own, found))
-        return Section(f"{METRICS[metric].heading} by case", (), ("method", *found), tuple(rows))
+            if own.keys() & self.tables.keys():
+                rows.append(_row(f"paper: {title}", own, self.tables))
+        return Section(f"{METRICS[metric].heading} by case", (), ("method", *self.tables), tuple(rows))
 
     def times(self) -> Section:
         times, rows, steps = list(times_of(self.records).values()), [], ("fit", "render")
@@ -386,14 +373,14 @@ class _Report:
         return Section("Failures", () if rows else ("None.",), columns, rows)
 
 
-def _row(name: str, values: Mapping[Any, Mean | float | None], columns: Iterable[str]) -> tuple[str, ...]:
-    """Return a row of a table: of means also their standard errors, and a dash where there is no value."""
-    cells = []
-    for value in (values.get(column) for column in columns):
-        error = value.standard_error if isinstance(value, Mean) else None
-        text = format_number(value.mean if isinstance(value, Mean) else value)
-        cells.append(text if error is None else f"{text} ± {format_number(error, 2)}")
-    return name, *cells
+def _row(name: str, cells: Mapping[Any, Mapping[str, float] | float | None], columns: Iterable[str]) -> tuple[str, ...]:
+    """Return a row of a table: of objects' values their mean with its standard error, and a dash for no value."""
+    texts = []
+    for cell in (cells.get(column) for column in columns):
+        values = [*cell.values()] if isinstance(cell, Mapping) else []
+        error, text = standard_error(values), format_number(fmean(values) if isinstance(cell, Mapping) else cell)
+        texts.append(text if error is None else f"{text} ± {format_number(error, 2)}")
+    return name, *texts
 
 
 def _listed(settings: Mapping[str, Any]) -> str:
