@@ -143,7 +143,7 @@ def test_noise_and_uneven_cover_hide_no_symmetry():
     assert max(min(degrees(each.normal, axis) for axis in np.eye(3)) for each in found.mirrors) < 2.0
 
 
-@pytest.mark.parametrize("count", [240, 500, 4000])
+@pytest.mark.parametrize("count", [240, 4000])
 def test_a_blob_has_none_however_few_points_there_are(count):
     ball = trimesh.creation.icosphere(subdivisions=4)
     random = np.random.default_rng(0)

@@ -66,8 +66,7 @@ def wandering(spread: float, *, contacts: int = 24) -> Tensor:
 
 def test_what_falls_within_a_period_is_no_mode_however_much_it_explains() -> None:
     bank = ModalBank(TRUTH.frequency[:2], torch.stack([TRUTH.damping[0], 1.1 * TRUTH.frequency[1]]))
-    sounds = record(bank, shapes(8, 3)[:, :2])
-    assert measure_quality(sounds, fitted(sounds, bank), sample_rate=RATE).is_mode.tolist() == [True, False]
+    assert quality_of(record(bank, shapes(8, 3)[:, :2]), bank).is_mode.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("contacts", [4, 20])
