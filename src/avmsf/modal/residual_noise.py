@@ -141,8 +141,7 @@ def noise_at(
     noise: Float[Tensor, "contacts bins"], bank: ModalBank, sample_rate: float
 ) -> Float64[Tensor, "contacts modes"]:
     """Return the noise's power at each mode: the most of the three bins there, for its spectrum may be steep."""
-    padded = torch.nn.functional.pad(noise, (1, 1))
-    highest = torch.maximum(torch.maximum(padded[:, :-2], padded[:, 2:]), noise)
+    highest = torch.nn.functional.max_pool1d(noise, 3, stride=1, padding=1)
     place = torch.round(bank.frequency * (2 * (noise.shape[1] - 1) / sample_rate)).long()
     return highest[:, place].to(torch.float64)
 

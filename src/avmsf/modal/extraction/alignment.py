@@ -183,13 +183,15 @@ def align(impacts: Impacts) -> Alignment | None:
     background = background_power(impacts.sounds, bank, impacts.sample_rate)
     measured = MeasuredPhases(impacts, bank, reach=reach, background=background)
     before = after = coherence(measured.amplitude, bank.damping)
-    fit, agreement = _estimate(measured, exact=0.0 if has_lead else _STILL_LOG_ODDS)
+    fit, agreement = _with_agreement(measured, _first_fit(measured, exact=0.0 if has_lead else _STILL_LOG_ODDS))
     delays, offset = fit.delays, 0.0
     if bool((delays != 0).any()):
         # Once more, from sounds that start where the first estimate says; then closely, with the spreads found.
         for reached, vague in ((reach, _USUAL_RECORDINGS), (_LAST_REACH_SAMPLES, 0.0)):
             measured = MeasuredPhases(impacts.delayed(delays), bank, reach=reached, background=background)
-            fit, agreement = _estimate(measured, earlier=delays, vague=vague)
+            # The prior is of all that a sound has been moved by.
+            climbed = _climb(measured, DelayPrior(-delays, _MAX_JITTER_SAMPLES), vague=vague)
+            fit, agreement = _with_agreement(measured, climbed)
             delays = delays + fit.delays
         offset = _common_onset(impacts, delays, agreement) if has_lead else -float(delays.min())
         delays = delays + offset
@@ -256,26 +258,27 @@ class _Fit:
     """Up to a constant."""
 
 
-def _estimate(
-    measured: MeasuredPhases, *, earlier: PerContact | None = None, vague: float = _USUAL_RECORDINGS, exact: float = 0.0
-) -> tuple[_Fit, PerContact]:
-    """Return a fit with the delays' medians, and the probabilities that recordings agree.
+def _first_fit(measured: MeasuredPhases, *, exact: float) -> _Fit:
+    """Return the likeliest of fits from several starts and of no delays, with `exact` more log odds a recording."""
+    prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _MAX_JITTER_SAMPLES)
+    energy = measured.squares / measured.bank.damping
+    broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_MAX_REFERENCES]
+    fits = list[_Fit]()
+    for reference in broadest.tolist():
+        fits.append(_climb(measured, prior, reference=reference, known=fits))
+    fits.append(_climb(measured, prior))
+    delays, spread = torch.zeros(len(measured), dtype=torch.float64), torch.full_like(measured.power, FIRST_SPREAD)
+    for _ in range(_ROUNDS_OF_FIXED_JITTER):
+        spread = measured.spread(measured.concentration(spread), delays, vague=_USUAL_RECORDINGS)
+    weights = measured.concentration(spread)
+    turned = weights * measured.doubled(delays)
+    likelihood = measured.log_likelihood(weights, spread, turned.sum(0)) + exact * len(measured)
+    fits.append(_Fit(delays, turned, spread, DelayPrior(delays[:1], _MIN_JITTER_SAMPLES), likelihood))
+    return max(fits, key=lambda each: each.log_posterior)
 
-    `earlier` are the delays that the sounds have been moved by already: the prior is of the sum. Without them, all are
-    zero where that is likelier, with `exact` added to its log odds a recording. `vague` as in `MeasuredPhases.spread`.
-    """
-    if earlier is None:
-        prior = DelayPrior(torch.zeros(1, dtype=torch.float64), _MAX_JITTER_SAMPLES)
-        energy = measured.squares / measured.bank.damping
-        broadest = torch.argsort((energy / energy.sum(0)).sum(1), descending=True)[:_MAX_REFERENCES]
-        fits = list[_Fit]()
-        for reference in broadest.tolist():
-            fits.append(_climb(measured, prior, reference=reference, known=fits))
-        still = _unmoved(measured)
-        fits += [_climb(measured, prior), replace(still, log_posterior=still.log_posterior + exact * len(measured))]
-        fit = max(fits, key=lambda each: each.log_posterior)
-    else:
-        fit = _climb(measured, DelayPrior(-earlier, _MAX_JITTER_SAMPLES), vague=vague)
+
+def _with_agreement(measured: MeasuredPhases, fit: _Fit) -> tuple[_Fit, PerContact]:
+    """Return a fit with the delays' medians, and the probabilities that recordings agree."""
     _, odds, _ = measured.search(fit.spread, fit.turned.sum(0) - fit.turned, fit.prior)
     agreement = odds.sigmoid()
     # The share that agrees is learned from all: without common phases single recordings may agree by chance.
@@ -321,13 +324,3 @@ def _climb(
     bend = (measured.turn.square() * (turned * total.conj()).real / total.abs().clamp_min(1e-300)).sum(1)
     share = float(occam_factor(prior, delays, bend).sum())
     return _Fit(delays, turned, spread, prior, measured.log_likelihood(weights, spreads, total) + share)
-
-
-def _unmoved(measured: MeasuredPhases) -> _Fit:
-    """Return the fit without any delay."""
-    delays, spread = torch.zeros(len(measured), dtype=torch.float64), torch.full_like(measured.power, FIRST_SPREAD)
-    for _ in range(_ROUNDS_OF_FIXED_JITTER):
-        spread = measured.spread(measured.concentration(spread), delays, vague=_USUAL_RECORDINGS)
-    weights = measured.concentration(spread)
-    turned, prior = weights * measured.doubled(delays), DelayPrior(delays[:1], _MIN_JITTER_SAMPLES)
-    return _Fit(delays, turned, spread, prior, measured.log_likelihood(weights, spread, turned.sum(0)))

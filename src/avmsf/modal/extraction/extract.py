@@ -56,7 +56,7 @@ class Extraction:
 
     def take(self, rows: Sequence[int]) -> "Extraction":
         """Return the gains of some of the recordings, with the same modes."""
-        shifts = None if self.shifts is None else self.shifts.take(list(rows))
+        shifts = None if self.shifts is None else replace(self.shifts, poles=self.shifts.poles[list(rows)])
         return replace(self, gains=self.gains[rows], shifts=shifts)
 
     def aligned(self, impacts: Impacts) -> Impacts:

@@ -90,10 +90,6 @@ class FrequencyShifts:
     relative: float
     """Standard deviation of the relative shifts of frequency, median over modes by energy."""
 
-    def take(self, rows: list[int]) -> "FrequencyShifts":
-        """Return those of some of the recordings."""
-        return FrequencyShifts(self.bank, self.poles[rows], self.relative)
-
     def gains(self, sounds: Sounds, *, sample_rate: float) -> Complex[Tensor, "contacts modes"]:
         """Return the gains that fit each sound best at its own poles."""
         found = [
