@@ -6,14 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avmsf.editing.material import (
-    LAWS,
-    MAX_MISMATCH,
-    change_material,
-    edit,
-    guess_materials,
-    infer_material,
-)
+from avmsf.editing.material import LAWS, MAX_MISMATCH, change_material, edit, guess_materials, infer_material
 from avmsf.editing.modal_edit import adjust_modes, silenced
 from avmsf.errors import EditError, SimulationError
 from avmsf.fem.damping import rayleigh

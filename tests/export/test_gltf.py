@@ -35,14 +35,9 @@ def read(path: Path) -> tuple[dict, list[np.ndarray]]:
     magic, version, length = struct.unpack_from("<4sII", content)
     assert (magic, version, length) == (b"glTF", 2, len(content))
     size, kind = struct.unpack_from("<I4s", content, 12)
-    assert kind == b"JSON"
-    assert size % 4 == 0
-    document = json.loads(content[20 : 20 + size])
-    rest, kind = struct.unpack_from("<I4s", content, 20 + size)
-    assert kind == b"BIN\0"
-    data = content[28 + size :]
-    assert len(data) == rest
-    arrays = []
+    assert (kind, size % 4) == (b"JSON", 0)
+    document, data, arrays = json.loads(content[20 : 20 + size]), content[28 + size :], []
+    assert struct.unpack_from("<I4s", content, 20 + size) == (len(data), b"BIN\0")
     for accessor in document["accessors"]:
         view = document["bufferViews"][accessor["bufferView"]]
         count = accessor["count"] * WIDTHS[accessor["type"]]

@@ -108,12 +108,8 @@ def test_descriptors_tell_what_they_are_made_to_tell():
     stripes[:, ::8] = 0.8
     checks = plain.clone()
     checks[:, ::8] = checks[::8] = 0.8
-    first = (
-        ENCODER.describe(plain)[:, 64, 64],
-        ENCODER.describe(stripes)[:, 64, 64],
-        ENCODER.describe(checks)[:, 64, 64],
-    )
-    flat, lined, crossed = (dict(zip(NAMES, each[6:18].tolist(), strict=True)) for each in first)
+    found = (ENCODER.describe(each)[6:18, 64, 64].tolist() for each in (plain, stripes, checks))
+    flat, lined, crossed = (dict(zip(NAMES, each, strict=True)) for each in found)
     # Nothing varies on a plain gray: no gradient, no orientation, no spread, no curvature.
     assert all(abs(value) < 1e-2 for value in flat.values())
     # Stripes have one orientation (both signs of it: no first coefficient), checks two at right angles: no second.

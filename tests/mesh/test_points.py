@@ -11,13 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.mesh.neighborhoods import describe_neighborhoods, read_neighborhoods
-from avmsf.mesh.points import (
-    closest_points,
-    cluster,
-    farthest_points,
-    lattice,
-    nearest_points,
-)
+from avmsf.mesh.points import closest_points, cluster, farthest_points, lattice, nearest_points
 from avmsf.mesh.surface import Surface, sample_surface
 from factories.looked_at import surface_of
 from factories.raising import raises
