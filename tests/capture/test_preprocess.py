@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
-from avmsf.capture import CaptureSettings, check, read_capture
+from avmsf.capture import CaptureReport, CaptureSettings, Impacts, check, read_capture
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.folder import check_and_read
 from avmsf.capture.prepare import prepare
@@ -168,13 +168,30 @@ def agreement(found: NDArray, reference: NDArray) -> tuple[float, NDArray, NDArr
     return float(np.linalg.norm(difference) / np.linalg.norm(size)), difference / size, correlation
 
 
-def test_the_aircraft_s_blows_deconvolved_are_its_measured_impulse_responses(shared: Path) -> None:
-    captures = Path(__file__).resolve().parents[2] / "benchmarks/captures"
-    struck_settings = CaptureSettings.read(captures / "aircraft.toml")
-    reference = read_capture(
-        shared / "aircraft_response", CaptureSettings.read(captures / "aircraft_response.toml")
-    ).impacts
-    found = read_capture(shared / "aircraft", struck_settings).impacts
+AIRCRAFT = ("aircraft", "aircraft_response")
+
+
+def aircraft_settings(name: str) -> CaptureSettings:
+    return CaptureSettings.read(Path(__file__).resolve().parents[2] / f"benchmarks/captures/{name}.toml")
+
+
+@pytest.fixture(scope="module")
+def measured(shared: Path) -> list[tuple[CaptureReport, Impacts]]:
+    """Return the reports and the impacts of both measurements of the aircraft."""
+    return [check_and_read(shared / name, aircraft_settings(name)) for name in AIRCRAFT]
+
+
+def test_measured_strikes_pass(measured) -> None:
+    for report, _ in measured:
+        assert report.readable
+        # Two files of this measurement are the same, at contacts 112 mm apart.
+        (problem,) = report.problems
+        assert problem.split(", to")[0].replace("impacts/", "") == "017.wav: the same sound as 016.wav"
+        assert [row.problems for row in report.recordings] == [()] * 74
+
+
+def test_the_aircraft_s_blows_deconvolved_are_its_measured_impulse_responses(shared: Path, measured) -> None:
+    (_, found), (_, reference) = measured
     assert (found.sample_rate, reference.sample_rate) == (512, 400)
     assert torch.equal(found.contacts, reference.contacts)
     truth = spectra(reference.sounds, 400)
@@ -196,7 +213,7 @@ def test_the_aircraft_s_blows_deconvolved_are_its_measured_impulse_responses(sha
     assert np.quantile(correlations, 0.1) > 0.99
 
     # Divided by the peak alone the pulse stays in the sound, and with it the delay of its flank.
-    peak = read_capture(shared / "aircraft", replace(struck_settings, normalize="peak")).impacts
+    peak = read_capture(shared / "aircraft", replace(aircraft_settings("aircraft"), normalize="peak")).impacts
     assert agreement(spectra(peak.sounds, 512, decay=0.13), truth)[0] > 0.4
 
 

@@ -1,4 +1,4 @@
-"""From what a folder shows of the object to features on its surface: views, Gaussians, features, each a stage."""
+"""From what a folder shows of the object to its shape and its features: views, Gaussians, features, each a stage."""
 
 import math
 from collections.abc import Callable, Sequence
