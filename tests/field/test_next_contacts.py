@@ -67,8 +67,9 @@ def open_variance(field: SoundField, extra: Tensor, points: Tensor) -> Tensor:
         known = kernel(contacts, contacts) + NOISE * torch.eye(len(contacts))
         scale = torch.einsum("cd,ce,ed->", values[:, mode], torch.linalg.inv(known), values[:, mode])
         all_of = kernel(struck, struck) + NOISE * torch.eye(len(struck))
-        left = kernel(points, points) - kernel(points, struck) @ torch.linalg.inv(all_of) @ kernel(struck, points)
-        total += scale / len(contacts) * torch.diagonal(left) / (4 * BANK.damping[mode])
+        cross, own = kernel(points, struck), (1 - REMAINDER) * cosines(points).square() @ shares + REMAINDER
+        left = own - (cross @ torch.linalg.inv(all_of) * cross).sum(1)
+        total += scale / len(contacts) * left / (4 * BANK.damping[mode])
     return total
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import pytest
@@ -11,7 +12,7 @@ from torch import nn
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import AttentionShape, FitConfig
 from avmsf.field.gains.attention import Attention, AttentionGains
-from avmsf.field.gains.data import gain_data
+from avmsf.field.gains.data import GainData, gain_data
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.training import AdamW, Targets, TrainingRun
 from avmsf.mesh.points import cluster
@@ -268,9 +269,13 @@ def test_steps_are_those_of_torch_also_from_a_state_of_before() -> None:
 SHORT = replace(QUICK, warmup_steps=2, steps=2)
 
 
+@cache
+def prepared(config: FitConfig) -> GainData:
+    return gain_data(plate_impacts(), plate_features(), plate_extraction(plate_impacts()), config)
+
+
 def begun(config: FitConfig) -> tuple[TrainingRun, Targets]:
-    impacts = plate_impacts()
-    data = gain_data(impacts, plate_features(), plate_extraction(impacts), config)
+    data = prepared(config)
     network, rows = Attention().start(data)
     return TrainingRun(network, data), Targets.of(data, rows)
 
@@ -334,9 +339,7 @@ def test_regressed_gains_are_the_warm_ups_aim_without_signs() -> None:
 def test_the_residual_may_start_from_the_quietest_segments() -> None:
     impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
     bins = len(modes.residual.magnitude)
-    case = gain_data(impacts, plate_features(), modes, replace(SHORT, residual_start="quietest"))
+    case = prepared(replace(SHORT, residual_start="quietest"))
     expected = noise_power(impacts.sounds.float(), bins=bins).mean(0).sqrt()
     assert torch.equal(case.modes.residual.magnitude, expected)
-    assert torch.equal(
-        gain_data(impacts, plate_features(), modes, SHORT).modes.residual.magnitude, modes.residual.magnitude
-    )
+    assert torch.equal(prepared(SHORT).modes.residual.magnitude, modes.residual.magnitude)
