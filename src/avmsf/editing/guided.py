@@ -249,8 +249,8 @@ class _Optimization:
                     preview = self._preview(self._normalized_edit().of(self.field))
                     if self.score is not None:
                         # The field before the edit is scored with the first preview.
-                        heard = ({} if self.scores else {0: self._preview(self.field)}) | {self.step: preview}
-                        self.scores |= {step: self.score.of(sound) for step, sound in heard.items() if sound.any()}
+                        sounds = ({} if self.scores else {0: self._preview(self.field)}) | {self.step: preview}
+                        self.scores |= {step: self.score.of(sound) for step, sound in sounds.items() if sound.any()}
                 if progress is not None:
                     factors = edit.pitch_factor, edit.decay_factor
                     progress(GuidedEditProgress(self.step, self.config.steps, loss, *factors, preview))
