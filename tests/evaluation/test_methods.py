@@ -15,6 +15,7 @@ import torch
 from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import EvaluationError, FitError, SceneError
 from avmsf.evaluation.methods import (
     NETWORK,
@@ -109,6 +110,8 @@ def plate_task(train: Impacts, *, impacts: Impacts | None = None, seed: int = 0)
         modes=lambda: plate_extraction(train),
         features=lambda look: plate_features(200),
         bodies=plate_bodies,
+        symmetries=lambda: None,
+        settings=CaptureSettings(),
         other_recording=lambda: torch.linspace(-1, 1, SAMPLES),
         family=plate_family,
         gaussians=lambda: cloud(60),
@@ -288,7 +291,7 @@ def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training(monkeypatch):
         assert len(modes.gains) == len(impacts)
         return fit(impacts, features, modes, config, **rest)
 
-    monkeypatch.setattr("avmsf.evaluation.methods.fit", watched)
+    monkeypatch.setattr("avmsf.pipeline.fit.fit_field", watched)
     # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
     grid = {"clusters": (8,), "learning_rate": (1e-7, 2e-2), "steps": (30,), "damping": ("shared",)}
     method = with_fit(FieldMethod("grid", grid=grid), replace(TINY, warmup_steps=1, warmup_rate=1e-7))

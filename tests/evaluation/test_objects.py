@@ -38,13 +38,13 @@ class OneObject(Dataset):
     """A dataset of one object, which can be seen in `seen` or nowhere."""
 
     name = "one"
+    contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
 
     def __init__(self, seen: Path | None, surface: Surface | None = None, **settings: Any) -> None:
         self.seen, self.surface, self.settings = seen, surface, CaptureSettings(**settings)
 
     def capture(self, identifier: str) -> Capture:
-        contacts = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.1, 0.0, 0.1]], dtype=torch.float64)
-        impacts = Impacts(contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c"))
+        impacts = Impacts(self.contacts, torch.zeros(3, 8), 100.0, ("a", "b", "c"))
         return Capture("slab", impacts, self.surface, self.settings)
 
     def visual_source(self, identifier: str) -> VisualSource | None:
@@ -139,6 +139,7 @@ def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Pat
 def test_bodies_are_held_at_points_of_the_object_that_its_user_states(tmp_path: Path) -> None:
     # Centimeters, of which the slab has fewer than a hundred.
     dataset = OneObject(None, slab(), held=((0.0, 0.0, 0.0), (100.0, 0.0, 0.0)), unit="cm")
+    dataset.contacts = slab().vertices[:3].double()
     with raises(CaptureError, name="held", value=pytest.approx(0.76, abs=0.01)):
         ObjectInputs(dataset, tmp_path, CONFIG).bodies("slab")
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avmsf.capture import read_capture
+from avmsf.capture import read_capture, write_capture
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
@@ -35,12 +35,17 @@ from avmsf.evaluation.task import Method, Renderer, Task
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.fit import fit as field_fit
 from avmsf.field.gains.attention import Attention
+from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.sound_field import SoundField
+from avmsf.mesh import Surface
+from avmsf.pipeline.config import PipelineConfig
+from avmsf.pipeline.fit import fit
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.delayed_plate import delays, strikes
 from factories.plate_field import QUICK
-from factories.plate_set import PlateInputs, fill_plates
+from factories.plate_set import PlateInputs, fill_plates, plate_named
 from factories.raising import raises
+from oracles.plate import plate_surface_points
 
 CHEAP = ("white-noise", "nearest", "knn3", "random-impact")
 NO_CDPAM = MetricSettings(cdpam=False)
@@ -125,6 +130,24 @@ def test_changed_wavs_are_scored_again_and_no_others(plates: Path, tmp_path: Pat
     run_objects(evaluation, ("a", "b"), results)
     errors = [sum(each.outcomes[0].values["relative_stft"]) for each in (first, results.read("a"))]
     assert errors[0] < 1e-3 < errors[1]
+
+
+def test_without_a_body_the_default_method_is_the_fit_with_its_symmetries(plates: Path, tmp_path: Path) -> None:
+    capture = read_capture(plates / "a")
+    points = Surface(plate_surface_points(plate_named("a"), 400), torch.zeros(0, 3, dtype=torch.int64))
+    write_capture(replace(capture, surface=points), tmp_path / "plates" / "a")
+    tasks, dataset = list[Task](), CaptureCollection(tmp_path / "plates")
+    plan = planned(plates, asking(tasks.append))
+    run_objects(replace(plan, inputs=ObjectInputs(dataset, tmp_path)), ("a",), ResultsFolder(tmp_path / "results"))
+    (task,) = tasks
+    config = PipelineConfig("auto", fit=replace(QUICK, steps=3))
+    evaluated = FieldMethod("field-auto", config, "surface").fit(task)
+    fitted = fit(replace(dataset.capture("a"), impacts=task.train, folder=None), config=config, progress=False)
+    for field in (evaluated, fitted):
+        assert Symmetric.kind in {each.kind for each in field.fitted_mixture.families}
+    assert torch.equal(evaluated.render(task.contacts), fitted.render(task.contacts))
+    assert (evaluated.origin.settings, evaluated.origin.config) == (fitted.origin.settings, fitted.origin.config)
+    assert evaluated.origin.report["supporting_poles"] == fitted.origin.report["supporting_poles"]
 
 
 def test_an_object_that_cannot_be_read_or_shows_nothing_is_a_failure(tmp_path: Path) -> None:

@@ -201,6 +201,14 @@ def test_bodies_take_part_despite_rough_surfaces_thick_glue_and_a_wrong_row(coun
         assert estimator(body).solve(case(count, contacts=each))[0].report["bodies"]
 
 
+def no_symmetries() -> None:
+    return None
+
+
+def walled() -> CandidateBodies:
+    return candidate_bodies(dome(), BodyConfig(wall=0.004))
+
+
 @pytest.mark.parametrize(
     ("config", "name", "value"),
     [(BodyConfig(wall=3.0), "wall", 3.0), (BodyConfig(wall=0.0), "wall", 0.0), (BodyConfig(dofs=5), "dofs", 5)],
@@ -213,18 +221,18 @@ def test_stated_settings_that_leave_no_body_are_refused(config: BodyConfig, name
     models: tuple[GainModelName, ...] = ("auto", "elastic")
     for model in models:
         with raises(SimulationError, name=name, value=value):
-            estimator_for(model, make)
-    estimator_for("smooth", make)
+            estimator_for(model, make, no_symmetries)
+    estimator_for("smooth", make, no_symmetries)
 
 
 def test_without_enough_memory_a_fit_has_no_elastic_family_and_no_stated_wall_is_blamed(monkeypatch):
     monkeypatch.setattr("avmsf.fem.body_meshes.free_memory", lambda: 1000.0)
     told: list[str] = []
-    estimator_for("auto", lambda: candidate_bodies(dome(), BodyConfig(wall=0.004)), log=told.append)
+    estimator_for("auto", walled, no_symmetries, log=told.append)
     assert told[0].startswith("no elastic mode shapes: ")
     assert "free for" in told[0]
     with raises(SimulationError, name="memory"):
-        estimator_for("elastic", lambda: candidate_bodies(dome(), BodyConfig(wall=0.004)))
+        estimator_for("elastic", walled, no_symmetries)
 
 
 def test_contacts_elsewhere_are_refused_before_any_body_is_computed() -> None:

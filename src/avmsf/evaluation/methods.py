@@ -34,15 +34,15 @@ from avmsf.evaluation.task import Contacts, Method, Renderer, Sounds, Task, Visu
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.material import MATERIALS
 from avmsf.field.config import FitConfig, GainModelName
-from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.estimator import estimator_for
-from avmsf.field.sound_field import SoundField
+from avmsf.field.sound_field import SUPPORTING, SoundField
 from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_sounds
 from avmsf.modal.extraction.finders import lowest_frequency
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import Residual
 from avmsf.pipeline.config import PRESETS, PipelineConfig
+from avmsf.pipeline.fit import fit_gains
 from avmsf.pipeline.stages import digest_files, digest_of
 
 _SAME_POSITION_M = 1e-6
@@ -279,6 +279,8 @@ class FieldMethod:
             count, bins = len(modes.bank), len(modes.residual.magnitude)
             generator = torch.Generator().manual_seed(task.seed)
             modes = random_modes(task.train, modes=count, bins=bins, generator=generator)
+            # Poles that were drawn say nothing of which of the trained ones are modes.
+            report[SUPPORTING] = []
             steps = config.warmup_steps + config.steps
             config = replace(config, warmup_steps=0, steps=steps, correction_rate=_UNINFORMED_RATE)
         found = self._fitted(task, task.train, features, modes, config)
@@ -290,9 +292,10 @@ class FieldMethod:
         """Fit the field to some of a task's recordings, in whose modes they are rows."""
         # An object of few points has no more regions than points.
         clusters = min(config.clusters, len(torch.unique(features.points, dim=0)))
-        gains = estimator_for(self.pipeline.gain_model, task.bodies)
-        config = replace(config, clusters=clusters, seed=task.seed)
-        return fit(train, features, modes, config, gains=gains, capture=task.name, device=task.device)
+        gains = estimator_for(self.pipeline.gain_model, task.bodies, task.symmetries)
+        fitted = replace(config, clusters=clusters, seed=task.seed)
+        pipeline = replace(self.pipeline, fit=fitted, device=task.device)
+        return fit_gains(train, features, modes, pipeline, gains, name=task.name, settings=task.settings)
 
     def _choose(
         self, grid: Grid, task: Task, features: FeatureField, modes: Extraction

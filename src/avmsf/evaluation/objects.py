@@ -24,7 +24,7 @@ from avmsf.evaluation.mode_embedding import check_materials
 from avmsf.evaluation.registry import Protocol
 from avmsf.evaluation.task import VisualInput
 from avmsf.features.feature_field import FeatureField
-from avmsf.features.store import load_features
+from avmsf.features.store import load_features, read_report
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
@@ -33,9 +33,11 @@ from avmsf.modal.clips import resampled, with_length
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
+from avmsf.pipeline.shape import mesh_symmetries, reported_symmetries
 from avmsf.pipeline.stages import StageFolder
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate import recipe
+from avmsf.symmetry.symmetries import Symmetries
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,13 @@ class ObjectInputs:
             if capture.surface is None:
                 return FeatureField.from_contacts(capture.impacts.contacts)
             return FeatureField.from_points(capture.surface.vertices)
+        with self._features(identifier, visual_input, views) as path:
+            features = load_features(path)
+        return FeatureField.from_points(features.points) if bare else features
+
+    @contextmanager
+    def _features(self, identifier: str, visual_input: VisualInput, views: int | None) -> Iterator[Path]:
+        """Yield the file of the features of the points that views show, locked."""
         lift = self.paper if visual_input.startswith("paper") else self.scene.lift
         if visual_input == "surface" and lift.encoder == AUTO:
             # Positions do not depend on the encoder.
@@ -86,8 +95,7 @@ class ObjectInputs:
         if visual_input in ("surface", "positions", "visual"):
             name = FEATURES
         with self._stages(identifier, replace(self.scene, lift=lift), views, name) as stages:
-            features = load_features(stages.features.path)
-        return FeatureField.from_points(features.points) if bare else features
+            yield stages.features.path
 
     def cloud(self, identifier: str, views: int | None = None) -> GaussianCloud:
         """Return an object's Gaussians: those in its folder, or fitted to its views, or to pictures of its mesh.
@@ -99,8 +107,20 @@ class ObjectInputs:
 
     def bodies(self, identifier: str) -> CandidateBodies:
         """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
-        settings, cache = self.dataset.capture(identifier).settings, self.cache / identifier / "bodies"
-        return candidate_bodies(self._surface(identifier), self.body, settings=settings, cache=cache)
+        capture, cache = self.dataset.capture(identifier), self.cache / identifier / "bodies"
+        return candidate_bodies(
+            self._surface(identifier), self.body, impacts=capture.impacts, settings=capture.settings, cache=cache
+        )
+
+    def symmetries(self, identifier: str, views: int | None = None) -> Symmetries | None:
+        """Return the symmetries of an object's shape, of its mesh or else of its views; None where nothing shows it."""
+        surface = self.dataset.capture(identifier).surface
+        if surface is not None and self.geometry != "gaussians":
+            return mesh_symmetries(surface, self.seed)
+        if self.dataset.visual_source(identifier) is None:
+            return None
+        with self._features(identifier, "surface", views) as path:
+            return reported_symmetries(read_report(path))
 
     def family(self, identifier: str) -> BodyFamily:
         """Return an object's bodies for DiffSound. Raises SceneError and SimulationError likewise."""

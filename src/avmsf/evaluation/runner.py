@@ -16,7 +16,7 @@ from torch import Tensor
 from avmsf._utils.caching import Given, Result, content_digest, once
 from avmsf._utils.device import one_thread
 from avmsf._utils.parallel import run_tasks, workers_at
-from avmsf.capture.impacts import Impacts
+from avmsf.capture import Capture
 from avmsf.errors import AvmsfError, EvaluationError, WorkerError
 from avmsf.evaluation.editing import EditTask, Generated, score_edit
 from avmsf.evaluation.localization import located, write_map
@@ -61,7 +61,8 @@ class ObjectData:
         self.identifier, self.facts = identifier, dataset.facts(identifier)
         self.impacts = capture.impacts
         """Recordings on which all methods are scored."""
-        self.own_starts = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier).impacts
+        self.capture = capture
+        self.own_starts = None if evaluation.own_starts is None else evaluation.own_starts.capture(identifier)
         """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are
         not of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the
         signs of the gains, and which the truth of all does not have."""
@@ -75,6 +76,7 @@ class ObjectData:
         self.vertices = None if surface is None or not len(surface.faces) else surface.vertices
         self.features = once(partial(inputs.features, identifier))
         self.bodies = once(partial(inputs.bodies, identifier))
+        self.symmetries = once(partial(inputs.symmetries, identifier))
         self.family = once(partial(inputs.family, identifier))
         self.gaussians = once(partial(inputs.cloud, identifier))
         self.other_recording = once(partial(draw_other_recording, dataset, identifier, self.impacts, seed=inputs.seed))
@@ -83,8 +85,9 @@ class ObjectData:
 class _Recordings:
     """A case's recordings from one kind of start, aligned when first asked for, and their modes, stored in a file."""
 
-    def __init__(self, impacts: Impacts, case: Case, finder: ModeFinder, path: Path) -> None:
-        self.train, self.test = impacts.take(case.train), impacts.take(case.test)
+    def __init__(self, capture: Capture, case: Case, finder: ModeFinder, path: Path) -> None:
+        self.settings = capture.settings
+        self.train, self.test = capture.impacts.take(case.train), capture.impacts.take(case.test)
         self.modes = once(lambda: extract_once(self.train, finder, path))
 
     def align(self) -> None:
@@ -104,7 +107,7 @@ class CaseRun:
         path, finder, edits = folder / "modes" / f"{self.name}.safetensors", evaluation.finder, evaluation.edits
         if edits is not None:
             path = edits.modes_file(data.identifier)
-        self.scored = self.own = _Recordings(data.impacts, case, finder, path)
+        self.scored = self.own = _Recordings(data.capture, case, finder, path)
         if data.own_starts is not None:
             own_path = path.with_name(f"{number:02d} own starts.safetensors")
             self.own = _Recordings(data.own_starts, case, finder, own_path)
@@ -217,6 +220,8 @@ class CaseRun:
             modes=self._shared(recordings.modes),
             features=self._shared(lambda visual_input: data.features(visual_input, views)),
             bodies=self._shared(data.bodies),
+            symmetries=self._shared(lambda: data.symmetries(views)),
+            settings=recordings.settings,
             other_recording=self._shared(data.other_recording),
             family=self._shared(data.family),
             gaussians=self._shared(lambda: data.gaussians(views)),

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.capture.impacts import Impacts
+from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import EvaluationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.sound_field import SoundField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.modal.extraction.extract import Extraction
+from avmsf.symmetry.symmetries import Symmetries
 
 Contacts = Float[Tensor, "contacts 3"]
 """Points in the object frame, meters; or as directions, unit vectors."""
@@ -105,6 +107,10 @@ class Task:
     """Computes the features of the object's points. Raises SceneError without visual input."""
     bodies: Callable[[], CandidateBodies]
     """Computes the candidate FE models of the object. Raises AvmsfError where its shape is unknown or unfit."""
+    symmetries: Callable[[], Symmetries | None]
+    """Finds the symmetries of the object's shape; None where nothing shows it."""
+    settings: CaptureSettings
+    """Of the capture that the recordings are of."""
     other_recording: Callable[[], Float[Tensor, " samples"]]
     """Draws, by `seed`, the recording of another object, at the sample rate and of the length of `train`. Raises
     EvaluationError where there is no other object."""

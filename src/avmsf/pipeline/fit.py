@@ -27,7 +27,7 @@ from avmsf.field.gains.estimator import estimator_for
 from avmsf.field.gains.kernels import Visual
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
-from avmsf.field.training import Progress
+from avmsf.field.training import GainEstimator, Progress
 from avmsf.mesh import Surface
 from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_once
 from avmsf.modal.extraction.quality import measure_quality
@@ -193,12 +193,7 @@ def _fit_shape(
         return made
 
     estimator = once(
-        lambda: estimator_for(
-            config.gain_model,
-            bodies,
-            symmetries=shape.symmetries,
-            log=listener.note if shape.known else None,
-        )
+        lambda: estimator_for(config.gain_model, bodies, shape.symmetries, log=listener.note if shape.known else None)
     )
 
     def find_modes(path: Path) -> None:
@@ -206,21 +201,16 @@ def _fit_shape(
         extract_once(train, method, path, needed=True)
 
     def train_field(path: Path, found: Path) -> None:
-        modes = extract_once(train, method, found)
-        supporting = supporting_poles(modes, train)
-        listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
-        fitted = fit_field(
+        fitted = fit_gains(
             train,
             shape.features if config.gain_model in (NETWORK, Visual.kind) else shape.points,
-            modes,
-            config.fit,
-            gains=estimator(),
-            capture=capture.name,
+            extract_once(train, method, found),
+            config,
+            estimator(),
+            name=capture.name,
             settings=capture.settings,
             checkpoint=pipeline.folder.checkpoint(FIELD),
-            progress=lambda progress: _show_step(progress, listener),
-            device=config.device,
-            supporting=supporting,
+            listener=listener,
         )
         save(with_record(fitted, config, shape.report), path)
 
@@ -236,6 +226,41 @@ def _fit_shape(
     found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
     field = pipeline.add(Stage(FIELD, train_field, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
     return StagedFit(field.path, pipeline.made, shape.report, extract_once(train, method, found.path))
+
+
+def fit_gains(
+    train: Impacts,
+    features: FeatureField,
+    modes: Extraction,
+    config: PipelineConfig,
+    gains: GainEstimator,
+    *,
+    name: str,
+    settings: CaptureSettings,
+    checkpoint: Path | None = None,
+    listener: ProgressListener | None = None,
+) -> SoundField:
+    """Fit the field of a capture of this name and these settings, whose report has the supporting poles.
+
+    Arguments and errors are those of `avmsf.field.fit`.
+    """
+    listener = ProgressListener() if listener is None else listener
+    quality = measure_quality(modes.aligned(train).sounds, modes, sample_rate=train.sample_rate)
+    supporting = torch.nonzero(~quality.is_mode).flatten().tolist()
+    listener.log(f"fit: a field of {modes_words(len(modes.bank), len(supporting))}")
+    return fit_field(
+        train,
+        features,
+        modes,
+        config.fit,
+        gains=gains,
+        capture=name,
+        settings=settings,
+        checkpoint=checkpoint,
+        progress=lambda progress: _show_step(progress, listener),
+        device=config.device,
+        supporting=supporting,
+    )
 
 
 def _is_final(path: Path, config: PipelineConfig, bodies: Callable[[], object]) -> bool:
@@ -322,12 +347,6 @@ def with_record(made: SoundField, config: PipelineConfig, features: Mapping[str,
     values["scene"] = features.get("scene")
     values["encoder"] = features.get("encoder")
     return replace(made, origin=replace(made.origin, report={**made.origin.report, RECORD: values}))
-
-
-def supporting_poles(modes: Extraction, impacts: Impacts) -> list[int]:
-    """Return the rows of the poles that are no modes of the object, from the recordings that they were found in."""
-    quality = measure_quality(modes.aligned(impacts).sounds, modes, sample_rate=impacts.sample_rate)
-    return torch.nonzero(~quality.is_mode).flatten().tolist()
 
 
 def modes_words(poles: int, supporting: int) -> str:

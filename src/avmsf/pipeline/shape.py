@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -123,17 +124,25 @@ def shape_of(
         )
         points = FeatureField.from_contacts(impacts.contacts)
 
-    def symmetries() -> Symmetries | None:
-        generator = torch.Generator().manual_seed(seed)
-        if found is None:
-            return None
-        return find_symmetries(FeatureField.from_mesh(found, seed=generator).points, seed=generator)
-
     surface, digest = object_shape(found, None)
     if config.gain_model != NETWORK and is_mesh(found):
         keep_surface(pipeline, surface, digest)
     known = found is not None or features is not None
-    return FitShape(points, points, symmetries, surface, digest, report, known)
+    return FitShape(points, points, partial(mesh_symmetries, found, seed), surface, digest, report, known)
+
+
+def mesh_symmetries(surface: Surface | None, seed: int) -> Symmetries | None:
+    """Return the symmetries of points on a surface; None without one."""
+    if surface is None:
+        return None
+    generator = torch.Generator().manual_seed(seed)
+    return find_symmetries(FeatureField.from_mesh(surface, seed=generator).points, seed=generator)
+
+
+def reported_symmetries(report: Mapping[str, Any]) -> Symmetries | None:
+    """Return the symmetries that the report of a features' file has; None without any."""
+    found = report.get("symmetries")
+    return None if found is None else Symmetries.from_dict(found)
 
 
 def _shape_of_views(
@@ -177,11 +186,8 @@ def _shape_of_views(
     if scene.splats is None or given is not None:
         expect_on_object(impacts.contacts, features.points, names=impacts.names, strict=found_frame)
 
-    def symmetries() -> Symmetries | None:
-        found = report.get("symmetries")
-        return None if found is None else Symmetries.from_dict(found)
-
-    return FitShape(FeatureField.from_points(features.points), features, symmetries, surface, digest, report)
+    bare, symmetries = FeatureField.from_points(features.points), partial(reported_symmetries, report)
+    return FitShape(bare, features, symmetries, surface, digest, report)
 
 
 def moved_onto(features: FeatureField, surface: Surface) -> FeatureField:

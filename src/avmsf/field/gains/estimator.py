@@ -241,8 +241,8 @@ class MixtureEstimator(GainEstimator):
 def estimator_for(
     name: GainModelName,
     bodies: Callable[[], CandidateBodies],
+    symmetries: Callable[[], Symmetries | None],
     *,
-    symmetries: Callable[[], Symmetries | None] = lambda: None,
     log: Callable[[str], None] | None = None,
 ) -> GainEstimator:
     """Return the estimator of this name.
