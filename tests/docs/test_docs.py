@@ -71,6 +71,18 @@ def test_each_module_is_named_by_its_packages_page(page: Path) -> None:
     assert {path.stem for path in page.parent.glob("*.py")} - {"__init__", *verbs} <= set(re.findall(r"\w+", text))
 
 
+def test_each_identifier_on_a_packages_page_exists() -> None:
+    source, known = REPOSITORY / "src" / "avmsf", set[str]()
+    trees = {path: ast.parse(path.read_text()) for path in source.rglob("*.py")}
+    for path, tree in trees.items():
+        known |= {*path.relative_to(source).with_suffix("").parts}
+        known |= {str(getattr(node, kind, "")) for node in ast.walk(tree) for kind in ("id", "attr", "name", "arg")}
+    pages = {path: ast.get_docstring(tree) or "" for path, tree in trees.items() if path.stem == "__init__"}
+    named = [(path, name) for path, page in pages.items() for name in re.findall(r"`([\w.]*[A-Z_][\w.]*)[`(]", page)]
+    assert len(named) > 200
+    assert [each for each in named if not set(each[1].split(".")) <= known | {"avmsf"}] == []
+
+
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_no_text_directly_below_a_table_becomes_a_row(page: Path) -> None:
     assert re.findall(r"^\|.*\n(?![|\n]).+", page.read_text(), re.MULTILINE) == []

@@ -13,7 +13,7 @@ is compared with.
 - `paper_demo.write_demo`: the layout of the paper's web demo.
 
 A new format is a writer here, a name in `writing.Format`, entries in `writing.FORMATS` and `write.WRITERS`, and in
-`avmsf.cli.export` the options that it uses (`_USED`, `Options`), what to do with its files (`_NEXT`) and `_prepared`.
+`avmsf.cli.export` the options that it uses (`_USED`, `Options`), what to do with its files (`_NEXT`) and `_for_format`.
 
 `write.write` (`avmsf.write`) chooses the writer by a file's ending. Files and folders are written atomically, and
 replaced only with `overwrite=True`. Start reading at `sampled_field`, then `one_phase` for formats with real amplitudes

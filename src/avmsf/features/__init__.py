@@ -5,8 +5,8 @@ each with a vector of about unit size, which the gain models of `avmsf.field` re
 
 - `encoder.Encoder` turns an image into a map of features: DINOv2 (Oquab et al. 2023; `dino`), EfficientNet-Lite0 (Tan
   and Le 2019; `efficientnet`), or descriptors of color, orientation and curvature that need no download
-  (`descriptors`). Both see the object's colors continued over the
-  background (pull-push, Gortler et al. 1996; `encoder.continue_outside`).
+  (`descriptors`). All see the object's colors continued over the background (pull-push, Gortler et al. 1996;
+  `encoder.continue_outside`).
 - `lift.lift` and `lift.lift_points` give each point the weighted mean of the maps at its places in the views that see
   it, by a depth test against the Gaussians or the mesh (`avmsf.gaussians.visibility`; paper, section 3.2).
   `lift.supported` leaves out points that no view shows on the surface.

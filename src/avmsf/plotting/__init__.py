@@ -1,7 +1,7 @@
 """Figures of sounds, modes, gains and surfaces, with matplotlib.
 
 In go plain values of the other packages: tensors of sounds and points, `ModalBank`, `ContactPosterior`, `Surface`.
-Out comes a `matplotlib.figure.Figure`, never a window, which `save_picture` writes as png, pdf or svg. Every
+Out comes a matplotlib `Figure`, never a window, which `save_picture` writes as png, pdf or svg. Every
 figure has one style (`style.styled`), with colors that color-blind people tell apart.
 
 - `spectrograms`: short-time spectra of recordings and renderings, with logarithmic frequency.
