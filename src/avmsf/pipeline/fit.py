@@ -125,6 +125,7 @@ def fit(
             raise FitError.expected("a Capture or a folder", type(source).__name__, name="capture")
         if features is None and source.folder is not None:
             expect_shape(source)
+        # Which stages there are, to know the folder that keeps them; none of them is made in this one.
         views = isinstance(pipeline_of(source, config, features, StageFolder(Path()), listener=listener), SceneStages)
         with _stage_folder(cache, source.folder if views else None) as stages:
             return load(fit_in_stages(source, config, stages, features=features, listener=listener).field)
@@ -183,6 +184,7 @@ def _fit_shape(
     method, listener = FINDERS[config.extraction](modes=config.modes), pipeline.listener
     recorded = {"impacts": train.digest(), "method": repr(method)}
 
+    @once
     def bodies() -> CandidateBodies:
         listener.log("bodies: finite-element models of the object")
         cache, begun = pipeline.folder.path(BODIES), time.monotonic()
@@ -192,9 +194,13 @@ def _fit_shape(
         listener.ready(BODIES, time.monotonic() - begun)
         return made
 
-    estimator = once(
-        lambda: estimator_for(config.gain_model, bodies, shape.symmetries, log=listener.note if shape.known else None)
-    )
+    @once
+    def estimator() -> GainEstimator:
+        return estimator_for(config.gain_model, bodies, shape.symmetries, log=listener.note if shape.known else None)
+
+    def expect_usable_shape() -> None:
+        """Raise what is wrong with the object's shape, which shows in less time than the modes take."""
+        estimator()
 
     def find_modes(path: Path) -> None:
         listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
@@ -221,8 +227,7 @@ def _fit_shape(
         return {**recorded, **values, "surface": shape.surface_digest}
 
     if not pipeline.folder.path(MODES).exists():
-        # First: what is wrong with the object's shape shows in less time than the modes take.
-        estimator()
+        expect_usable_shape()
     found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
     field = pipeline.add(Stage(FIELD, train_field, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
     return StagedFit(field.path, pipeline.made, shape.report, extract_once(train, method, found.path))
