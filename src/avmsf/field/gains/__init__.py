@@ -14,8 +14,8 @@ unless said otherwise. p is the phase of each mode, `GainData.phase`.
 
 - `Extraction.gains`: complex c; the sound is Im(c exp((-d + 2 pi i f) t)). Read by `modal` and `data`.
 - `GainData.values`, `MeasuredGains.values`: complex c exp(-i p). Read by `regression`, `fitting`, `outliers`.
-- `GainData.gains`: real, amplitudes of sines of phase p times `orientation_signs`, or of spectra without a sign. Read by
-  `attention` and `training`.
+- `GainData.gains`: real, amplitudes of sines of phase p times `orientation_signs`, or of spectra without a sign. Read
+  by `attention` and `training`.
 - `SoundField.gains`: real part of what is predicted of c exp(-i p). Read by users and published localization.
 - `SoundField.complex_gains`: complex A = -i c; the sound is Re(A exp((-d + 2 pi i f) t)). Read by `evaluation`.
 
