@@ -120,6 +120,10 @@ def test_lists_and_arrays_sound_like_tensors(kind):
     assert field().render(kind(contacts), kind([[0.0, 0.0, -1.0]] * 2), 2).shape == sounds.shape
     assert torch.equal(field().dampings(kind(contacts)), field().dampings(torch.tensor(contacts)))
     assert field().known(kind(contacts)).mean.shape == (2, len(field().bank))
+    assert field().relative_gain_std(kind(contacts)).shape == (2,)
+    down = kind([[0.0, 0.0, -1.0]])
+    found = avmsf.suggest(field(), 1, candidates=kind([CONTACT]), directions=down, progress=False)
+    assert found.rows.tolist() == [0]
 
 
 def test_directions_count_as_unit_vectors_and_no_direction_as_none():
@@ -202,7 +206,7 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         *((lambda size=size: avmsf.split(capture(), size), EvaluationError, {}) for size in (0.0, 1.0, -0.5, 0, 1000)),
         *(
             (lambda method=method, where=where: getattr(field(), method)(where), ArrayError, {"name": name, "row": row})
-            for method in ("render", "posterior", "gains")
+            for method in ("render", "posterior", "gains", "relative_gain_std")
             for where, name, row in (
                 (CONTACT, "positions", None),
                 ([[0.05, 0.06]], "positions", None),
@@ -212,7 +216,9 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         ),
         (lambda: field().render([CONTACT], directions=[[0, 0, 1.0]] * 2), ArrayError, {"name": "directions"}),
         (lambda: field().render([CONTACT], forces=[1.0, 2.0]), ArrayError, {"name": "forces"}),
+        (lambda: field().render([CONTACT], forces=-5), ArrayError, {"name": "forces", "row": 0, "value": -5.0}),
         (lambda: field().render(AWAY), PositionError, {"row": 1}),
+        (lambda: field().relative_gain_std(AWAY), PositionError, {"row": 1}),
         (lambda: field().render([CONTACT], samples=-1), AvmsfError, {"name": "samples", "value": -1}),
         (lambda: field().render([CONTACT], samples=2.5), AvmsfError, {"name": "samples", "value": 2.5}),
         (lambda: impacts_of(sounds=capture().impacts.sounds[:3]), ArrayError, {"name": "sounds"}),

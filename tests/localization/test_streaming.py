@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -113,6 +114,14 @@ def test_an_offset_and_rumble_are_not_heard() -> None:
     assert found == list(STRUCK)
 
 
+@pytest.mark.parametrize("kind", [Tensor.numpy, Tensor.tolist])
+def test_blocks_and_sounds_are_lists_or_arrays_as_well(kind) -> None:
+    listener, sound = StreamingLocalizer(locator()), stream()[BEGINS[0] :][:1000]
+    blows = [blow for part in torch.split(stream(), 500) for blow in listener.process(kind(part))]
+    assert [spot(blow) for blow in blows] == list(STRUCK)
+    assert torch.equal(locator().locate(kind(sound)).probability, locator().locate(sound).probability)
+
+
 def test_what_does_not_belong_to_the_object_is_counted_and_the_next_blow_found() -> None:
     listener = StreamingLocalizer(locator())
     burst = torch.zeros(800, dtype=torch.float64)
@@ -166,6 +175,8 @@ def test_streams_that_cannot_be_located_are_refused(name, value, given) -> None:
     listener = StreamingLocalizer(locator())
     with raises(LocationError, name="block"):
         listener.process(torch.tensor([0.0, float("nan")]))
+    with raises(LocationError, name="block", value=[100, 2]):
+        listener.process(np.zeros((100, 2)))
     assert listener.clock + len(listener.waiting) == 0
 
 

@@ -54,12 +54,27 @@ def as_count(value: SupportsIndex, name: str, *, raising: type[AvmsfError] = Arr
     return count
 
 
-def as_numbers(values: float | int | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
-    """Return `count` numbers, or one that holds for all, as a tensor of `count`. Raises as `as_vectors`."""
+def as_forces(values: float | int | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
+    """Return `count` numbers of 0 or more, or one that holds for all, as a tensor of `count`. Raises as `as_vectors`.
+
+    An impact pushes: a negative force would be a pull.
+    """
     found = as_floats(values, name)
     if found.ndim > 1 or (found.ndim == 1 and len(found) != count):
         raise ArrayError.expected(f"one number or {count}", list(found.shape), name=name)
-    return _finite(found.expand(count), name)
+    forces = _finite(found.expand(count), name)
+    if len(wrong := torch.nonzero(forces < 0)):
+        raise ArrayError.expected("0 or more", float(forces[wrong[0]]), name=name, row=int(wrong[0]))
+    return forces
+
+
+def as_samples(values: ArrayLike, name: str) -> Float[Tensor, " samples"]:
+    """Return the samples of one channel, finite or not. Raises ArrayError for another shape and what are no numbers."""
+    found = as_floats(values, name)
+    if found.ndim != 1:
+        wanted, shape = "samples of one channel, in shape [samples]", list(found.shape)
+        raise ArrayError.expected(wanted, shape, name=name, advice="give one channel")
+    return found
 
 
 def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows columns"]:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_numbers, as_rate, as_rows, as_vectors
+from avmsf._utils.arrays import ArrayLike, as_forces, as_rate, as_rows, as_vectors
 from avmsf._utils.caching import content_digest
 from avmsf.errors import ArrayError
 
@@ -79,7 +79,7 @@ class Impacts:
             as_rate(sample_rate),
             named,
             None if directions is None else as_vectors(directions, "directions", count=count).float(),
-            None if forces is None else as_numbers(forces, "forces", count=count).float(),
+            None if forces is None else as_forces(forces, "forces", count=count).float(),
         )
 
     @property

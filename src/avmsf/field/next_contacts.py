@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import SupportsIndex
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_count, as_vectors, short_repr
+from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_vectors, short_repr
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.errors import FitError
 from avmsf.field.gains.kernels import Sites
@@ -59,7 +59,7 @@ def suggest(
     count: SupportsIndex = 5,
     *,
     candidates: ArrayLike | None = None,
-    directions: Float[Tensor, "_given 3"] | None = None,
+    directions: ArrayLike | None = None,
     unseen: bool = False,
     progress: bool = True,
 ) -> Suggestions:
@@ -79,19 +79,22 @@ def suggest(
         The contacts [count, 3], meters, and the expected error after each.
 
     Raises:
+        ArrayError: For candidates and directions of other shapes, or with values that are not finite.
         FitError: For gains without a posterior, unfit arguments, no candidate without a recording, places none of which
             a hammer gets to, and `unseen` without a body.
     """
     count = as_count(count, "count", raising=FitError)
     given = None if candidates is None else as_vectors(candidates, "candidates").double()
     gains = _mixture_of(field, unseen)
-    _expect_directions(directions, 0 if given is None else len(given))
+    ways = None
+    if directions is not None:
+        ways = as_directions(directions, "directions", count=0 if given is None else len(given))
     with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
         points = surface[farthest_points(surface, min(MAX_POINTS, len(surface)))].double()
         if given is None:
-            pool, directions = _reachable(gains, points)
+            pool, ways = _reachable(gains, points)
         else:
             pool = given
             _expect_on_surface(pool, gains)
@@ -104,7 +107,7 @@ def suggest(
         if len(pool) > most:
             kept = torch.nonzero(allowed).flatten()
             kept = kept[farthest_points(pool[kept], min(most, len(kept)))].sort().values
-        sites = gains.sites(pool[kept], None if directions is None else directions[kept])
+        sites = gains.sites(pool[kept], None if ways is None else ways[kept])
         rows, (before, *after) = _choose(field, gains, points, sites, allowed[kept], count, same=same)
     return Suggestions(
         sites.points[rows],
@@ -115,17 +118,6 @@ def suggest(
         points,
         len(points) - len(pool) if given is None else 0,
     )
-
-
-def _expect_directions(directions: Float[Tensor, "_given 3"] | None, count: int) -> None:
-    """Raise FitError unless there are none, or so many directions, all of finite numbers."""
-    if directions is None:
-        return
-    if len(directions) != count:
-        raise FitError.expected(f"one for each of {count} candidates", len(directions), name="directions")
-    if len(faulty := torch.nonzero(~directions.isfinite().all(dim=1)).flatten()):
-        row = int(faulty[0])
-        raise FitError.expected("finite numbers", directions[row].tolist(), row=row, name="directions")
 
 
 def _mixture_of(field: SoundField, unseen: bool) -> MixtureGains:

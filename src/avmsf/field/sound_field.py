@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Complex, Float, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_numbers, as_vectors, short_repr
+from avmsf._utils.arrays import ArrayLike, as_count, as_directions, as_forces, as_vectors, short_repr
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import FitError, PositionWarning
@@ -195,16 +195,18 @@ class SoundField:
         assert known.std is not None
         return GainPosterior(self._amplitudes(known), known.std.double().square().sum(2).sqrt())
 
-    def relative_gain_std(self, points: Float[Tensor, "points 3"]) -> Float64[Tensor, " points"]:
+    def relative_gain_std(self, points: ArrayLike) -> Float64[Tensor, " points"]:
         """Return the standard deviation of the gains at points (meters) over their root mean square on the object.
 
         Both as energy over all modes: 0 is certainty; places that may be louder than the mean can have more than 1.
-        Raises as `fitted_mixture`.
+        Points off the object give no warning. Raises as `fitted_mixture`.
         """
+        places = as_vectors(points, "positions")
+        expect_near(places, self.gain_field.points)
         _, surface = self.fitted_mixture, self.gain_field.points
         step = max(1, len(surface) // _MAX_MAPPED_POINTS)
         energy = self.energy(self.gain_field.predict(surface[::step]).parts).mean()
-        std = self.gain_field.posterior(points).std
+        std = self.gain_field.posterior(places).std
         assert std is not None
         return (self.energy(std) / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
@@ -268,9 +270,9 @@ class SoundField:
             positions: [contacts, 3], object frame, meters.
             directions: Unit vectors [contacts, 3] of the impacts. One of [0, 0, 0] is unknown, as in tables of
                 contacts: the impact goes straight into the surface, as all do without `directions`.
-            forces: One for all or one for each, in newtons where the recordings were divided by theirs, else relative
-                to an average one of them. By default sounds are as the training recordings on average, divided by the
-                force where these were.
+            forces: One for all or one for each, 0 or more, in newtons where the recordings were divided by theirs, else
+                relative to an average one of them. By default sounds are as the training recordings on average, divided
+                by the force where these were.
             samples: Length of the sounds, by default that of the training sounds.
             pulse: What a softer hammer adds to the recorded impacts' own pulses; it has the same impulse, however long
                 it is, and leaves the noise as it is.
@@ -293,7 +295,7 @@ class SoundField:
             parts.append(sounds + self._recorded(contacts[rows], way, length) if recorded else sounds)
         sounds = torch.cat(parts)
         usual = average or 1.0
-        given = as_numbers(usual if forces is None else forces, "forces", count=len(contacts))[:, None].to(sounds)
+        given = as_forces(usual if forces is None else forces, "forces", count=len(contacts))[:, None].to(sounds)
         if average is None:
             return given * (sounds + background)
         if recorded:

@@ -8,11 +8,11 @@ from statistics import fmean
 from threading import RLock
 
 import torch
-from jaxtyping import Complex64, Complex128, Float, Float32, Float64
+from jaxtyping import Complex64, Complex128, Float32, Float64
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_directions, as_vectors, short_repr
+from avmsf._utils.arrays import ArrayLike, as_directions, as_samples, as_vectors, short_repr
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.amplitudes import Amplitudes, Extractor
@@ -87,12 +87,12 @@ class Locator:
 
     def locate(
         self,
-        sound: Float[Tensor, " samples"],
+        sound: ArrayLike,
         *,
         highest: float | None = None,
         force: Force | float | int | None = None,
     ) -> ContactPosterior:
-        """Return the posterior of the contact for a sound that starts at its onset, at the field's rate.
+        """Return the posterior of the contact for a sound [samples] that starts at its onset, at the field's rate.
 
         The sound has 20 ms or more; what is longer than the training sounds is cut off. Modes above `highest` Hz are
         left out, for a recording of a lower sample rate. Fields whose dampings vary with the contact are compared by
@@ -103,11 +103,12 @@ class Locator:
         relative to an average impact of its training. A note says where the sound is too loud or too faint for that
         force at every likely position.
 
-        Raises LocationError for sounds that are too short, silent or not finite, and where the modes explain no more
-        than they would of noise.
+        Raises LocationError for sounds of several channels, too short, silent or not finite, and where the modes
+        explain no more than they would of noise.
         """
         known = force if force is None or isinstance(force, Force) else Force(force)
-        used = sound.detach().cpu()[: self.field.samples]
+        with location_errors():
+            used = as_samples(sound, "sound")[: self.field.samples]
         check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)
         amplitudes = length.extractor.extract(used, color=self.field.residual)

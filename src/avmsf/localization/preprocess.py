@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_floats, as_rate
+from avmsf._utils.arrays import ArrayLike, as_rate, as_samples
 from avmsf._utils.text import counted
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.measure import find_clipping, prepare_single
@@ -102,10 +102,8 @@ def open_recording(
         recording = read_recording(Path(recording))
     own = replace(field.origin.settings, align=True)
     if not isinstance(recording, Recording):
-        samples, own = as_floats(recording, "recording").double().numpy(), CaptureSettings()
-        if samples.ndim != 1:
-            shape, advice = list(samples.shape), "give one channel, or a Recording"
-            raise LocationError.expected("samples of one channel, in shape", shape, name="recording", advice=advice)
+        with location_errors():
+            samples, own = as_samples(recording, "recording").double().numpy(), CaptureSettings()
         rate = field.sample_rate if sample_rate is None else sample_rate
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:

@@ -16,12 +16,14 @@ import torch
 from jaxtyping import Complex128, Float, Float64
 from torch import Tensor
 
+from avmsf._utils.arrays import ArrayLike, as_samples
 from avmsf.capture.onset import find_onset
 from avmsf.capture.prepare import shortest_allowed
 from avmsf.errors import LocationError
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locate import assess_match
 from avmsf.localization.locator import Locator
+from avmsf.localization.preprocess import location_errors
 from avmsf.modal.inner_products import gram, poles_of
 from avmsf.modal.modes import ModalBank
 
@@ -142,16 +144,17 @@ class StreamingLocalizer:
         self._pending: _PendingImpact | None = None
         self._highpass = np.zeros((len(self.filter), 2))
 
-    def process(self, block: Float[Tensor, " samples"]) -> list[LocatedImpact]:
-        """Return the estimates that the next samples of the stream complete, in the order of time.
+    def process(self, block: ArrayLike) -> list[LocatedImpact]:
+        """Return the estimates that the next samples [samples] of the stream complete, in the order of time.
 
-        Raises LocationError for samples that are not finite; the block is skipped.
+        Raises LocationError for several channels and samples that are not finite; the block is skipped.
         """
         begun = time.perf_counter()
-        if not bool(torch.isfinite(block).all()):
+        with location_errors():
+            samples = as_samples(block, "block").double()
+        if not bool(torch.isfinite(samples).all()):
             advice = "leave them out or send zeros"
             raise LocationError.expected("finite samples", got="NaN or infinity", name="block", advice=advice)
-        samples = block.detach().double().cpu()
         if len(samples):
             passed, self._highpass = scipy.signal.sosfilt(self.filter, samples.numpy(), zi=self._highpass)
             samples = torch.from_numpy(passed)
