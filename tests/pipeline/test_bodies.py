@@ -311,8 +311,8 @@ def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
 
 def test_walls_that_cannot_be_had_are_left_out() -> None:
     found = CandidateBodies(Cup(most=0.01, thickness_range=(0.009, 0.018)), count=4, dofs=2000)
-    assert [body.thickness for body in found.bodies] == [pytest.approx(0.009)]
-    assert found.with_thicknesses(found.bodies[0], [0.011]) == [None]
+    assert [body.thickness for body in found.bodies] == [None, pytest.approx(0.009)]
+    assert found.with_thicknesses(found.bodies[1], [0.011]) == [None]
 
 
 def test_a_wall_thinner_than_tetrahedra_follow_is_refused_before_they_are_made(monkeypatch) -> None:
