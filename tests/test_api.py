@@ -242,6 +242,14 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         (lambda: avmsf.edit(field()), EditError, {}),
         (lambda: change_material(field(), "ceramic", "paper"), AvmsfError, {"name": "material", "value": "paper"}),
         (lambda: avmsf.write(field(), "plate.xyz"), ExportError, {"name": "to", "value": ".xyz"}),
+        *(
+            (lambda given=given: avmsf.write(field(), "new.html", **given), ExportError, attributes)
+            for given, attributes in (
+                ({"strikes": CORNERS}, {"name": "strikes", "value": "Tensor"}),
+                ({"strikez": 3}, {"value": "strikez"}),
+                ({"capture": "mug"}, {"value": "capture"}),
+            )
+        ),
         (lambda: avmsf.fit(3), AvmsfError, {"name": "capture", "value": "int"}),
         (lambda: avmsf.fit(ALONE, seed="x"), AvmsfError, {"name": "seed", "value": "x"}),
         (lambda: avmsf.fit(ALONE, gain_model="bad"), AvmsfError, {"name": "gain_model", "value": "bad"}),

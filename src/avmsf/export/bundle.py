@@ -51,12 +51,9 @@ def make_bundle(
     strikes: Impacts | None = None,
     mute: bool = False,
 ) -> Bundle:
-    """Return a field's bundle.
+    """Return a field's bundle, with options as `write_webpage`.
 
-    `object` is the geometry to show: a mesh with coordinates in units of `meters`, Gaussians, or by default the
-    contacts. `surface`, in meters, is an alternative to switch to, such as the surface of the field's body. `strikes`
-    are recorded impacts for comparison. A field without modes is allowed if `mute`, for an object that is not recorded
-    yet. Raises `ExportError`.
+    A field without modes is allowed if `mute`, for an object that is not recorded yet. Raises `ExportError`.
     """
     if len(field.frequency) == 0 and not mute:
         raise no_modes()
@@ -106,6 +103,10 @@ def _tensors(field: SampledField) -> dict[str, Shaped[np.ndarray, "..."]]:
 def _strikes(strikes: Impacts | None, field: SampledField) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
     if strikes is None:
         return [], {}
+    if not isinstance(strikes, Impacts):
+        raise ExportError.expected(
+            "Impacts, such as avmsf.read(folder).impacts", type(strikes).__name__, name="strikes"
+        )
     if strikes.sample_rate != field.sample_rate:
         wanted, advice = f"the field's {field.sample_rate:g} Hz", "name the capture that the field was fitted to"
         raise ExportError.expected(wanted, strikes.sample_rate, name="strikes", advice=advice)

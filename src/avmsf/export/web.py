@@ -19,10 +19,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
 from avmsf.export.bundle import Bundle, make_bundle
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Written, generator, write_files, write_folder
+from avmsf.mesh.surface import Surface
 
 IMPORT_MAP = re.compile(r'(<script type="importmap"[^>]*>)(.*?)(</script>)', re.DOTALL)
 """The import map, which has the addresses of three and spark."""
@@ -51,13 +53,25 @@ MEDIA_TYPES = {
 """Media types of the page's files by suffix; no other files are included or served."""
 
 
-def write_webpage(field: SampledField, output: str | Path, *, overwrite: bool = False, **options: Any) -> Written:
+def write_webpage(
+    field: SampledField,
+    output: str | Path,
+    *,
+    object: Path | Surface | None = None,
+    meters: float = 1.0,
+    surface: Path | Surface | None = None,
+    strikes: Impacts | None = None,
+    overwrite: bool = False,
+) -> Written:
     """Write a page that plays the field: one file if `output` ends in .html, otherwise a folder.
 
-    `options` are those of `make_bundle`, whose errors are raised: `object`, `surface` and `strikes` to show. What
-    exists is replaced only with `overwrite`.
+    `object` is the geometry to show: a mesh with coordinates in units of `meters`, Gaussians, or by default the
+    contacts. `surface`, in meters, is an alternative to switch to, such as the surface of the field's body. `strikes`
+    are recorded impacts for comparison, as `avmsf.read(folder).impacts`. What exists is replaced only with `overwrite`.
+    Raises `ExportError`.
     """
-    output, bundle = Path(output), make_bundle(field, **options)
+    output = Path(output)
+    bundle = make_bundle(field, object=object, meters=meters, surface=surface, strikes=strikes)
     if output.suffix.lower() in FORMATS["web"].suffixes:
         return Written(write_files({output: single_file(bundle).encode()}, overwrite=overwrite), bundle.remarks)
     content = {**_needed(page_files(), bundle), **bundle.files}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -43,14 +44,14 @@ def write(
         contacts: Number of points, spread over the object, at most; by default as many as the format's tools read
             easily.
         noise: Whether the residual noise is written, where the format has it.
-        options: Of the format's writer in `avmsf.export`, such as `strikes=` of `write_webpage`, or `overwrite=True` to
-            replace files.
+        options: Of the writer in `avmsf.export`: `overwrite=True` to replace files; of a page (`write_webpage`)
+            `strikes`, recorded Impacts to hear beside the field, `object` and `surface`, files or Surfaces to show.
 
     Returns:
         The files, and what the format could not hold.
 
     Raises:
-        ExportError: For an unknown ending, and as the writer.
+        ExportError: For an unknown ending or option, and as the writer.
     """
     output = Path(output)
     kind = _OF_SUFFIX.get(output.suffix.lower()) if to is None else to
@@ -61,6 +62,9 @@ def write(
             file=output,
             name="to",
         )
+    known = [name for name, each in signature(WRITERS[kind]).parameters.items() if each.kind is each.KEYWORD_ONLY]
+    if unknown := next((name for name in options if name not in known), None):
+        raise ExportError.unknown(unknown, known, name=f"an option of {kind}")
     remarks: tuple[str, ...] = ()
     if isinstance(field, SampledField):
         sampled = field

@@ -128,7 +128,7 @@ def check_free(path: Path, *, folder: bool = False, overwrite: bool = False) -> 
     found = [path.name]
     if folder:
         found = sorted(each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file())
-    wanted, advice = "a free name", "choose another, or add --overwrite to replace it"
+    wanted, advice = "a free name", "choose another, or replace it with --overwrite (in Python overwrite=True)"
     if overwrite:
         wanted, advice = "a folder with the files of an export alone", "choose another folder, or remove its files"
         found = sorted(set(found) - _exported(path)) if folder else []

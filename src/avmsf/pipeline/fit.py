@@ -122,7 +122,8 @@ def fit(
                 raise FitError.expected(wanted, got="a file without", file=source, name="material")
             source = read_capture(source, settings_of(source).starting(config.time_zero))
         if not isinstance(source, Capture):
-            raise FitError.expected("a Capture or a folder", type(source).__name__, name="capture")
+            advice = "avmsf.Capture(name, impacts, surface) makes one of Impacts"
+            raise FitError.expected("a Capture or a folder", type(source).__name__, name="capture", advice=advice)
         if features is None and source.folder is not None:
             expect_shape(source)
         # Which stages there are, to know the folder that keeps them; none of them is made in this one.
