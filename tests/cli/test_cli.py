@@ -290,6 +290,16 @@ def test_render_is_the_fields_own(words: str, path: Path, capsys: Streams) -> No
         assert np.array_equal(written, sound.numpy())
 
 
+def test_render_replaces_no_file_unless_asked(path: Path) -> None:
+    recording = path.with_name("001.wav")
+    recording.write_bytes(b"a recording")
+    words = ["render", str(path), *SPOT, "--output", str(recording)]
+    assert main(words) == 2
+    assert recording.read_bytes() == b"a recording"
+    assert main([*words, "--overwrite"]) == 0
+    assert soundfile.info(recording).samplerate == 8000
+
+
 @pytest.mark.parametrize("level", [-30.0, -10.0, 20.0])
 def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level: float) -> None:
     loudest, output = 20 * np.log10(float(load(path).render(PLACES[:1]).abs().max())), path.with_name("a.wav")

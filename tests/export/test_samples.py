@@ -151,6 +151,13 @@ def test_a_harder_impact_is_shorter_in_contact_by_hertzs_law():
     assert widths == pytest.approx([(3.0 / force) ** (1 / 3) for force in (0.3, 3.0, 1.0)])
 
 
+def test_layers_beneath_the_background_are_noted(tmp_path):
+    field = table(noisy=True, background_force=100.0)
+    for force in (0.5, 100.0):
+        written = write_grid(field, tmp_path / f"{force}", layers=[Layer(force)])
+        assert any("background" in remark for remark in written.remarks) == (force == 0.5)
+
+
 def cosines(**settings):
     """Return a table whose modes start as the demo's do."""
     field = table(**settings)

@@ -10,7 +10,7 @@ import tyro
 
 from avmsf.cli.options import Common, Flag, Number, Unit
 from avmsf.cli.output import doing, next_command, note, print_result
-from avmsf.cli.paths import ContactTable, FieldFile, New, OutputError, PositionList, expect_writable
+from avmsf.cli.paths import ContactTable, FieldFile, New, OutputError, PositionList, expect_free, expect_writable
 from avmsf.errors import PositionWarning
 from avmsf.modal.config import MAX_CONTACT_SECONDS, PulseShape
 
@@ -44,7 +44,8 @@ class Options(Common):
     unit: Unit = "m"
     """Unit of the coordinates; the field is in meters."""
     force: Number = None
-    """Peak force, newtons; relative where the field knows no forces. Without it, as the recordings on average."""
+    """Peak force, newtons; relative where the field knows no forces. Without it, as the recordings on average: divided
+    by their forces where these are known."""
     contact_time: float = 0.0
     """Of a softer hammer of the same impulse, seconds: .002 for felt."""
     pulse: PulseShape = "half-sine"
@@ -59,6 +60,8 @@ class Options(Common):
     """Additional gain in dB."""
     coding: Coding = "float32"
     """Format of the samples; int16 rejects what would clip."""
+    overwrite: Flag = False
+    """Replace files."""
 
     def _check(self) -> None:
         if bool(self.position) == (self.contact_table is not None):
@@ -83,7 +86,7 @@ def run(options: Options) -> int:
 
     field, positions, table = load(options.field), options.position, options.contact_table
     contacts = contacts_on(field, positions, table, unit=options.unit, directions=options.direction)
-    paths = _paths(options.output, contacts.names)
+    paths = _paths(options.output, contacts.names, overwrite=options.overwrite)
     if options.force not in (None, 1) and not field.origin.per_newton:
         note(f"the forces are not known: {options.force:g} is relative to an average recorded impact")
     if round(field.sample_rate) != field.sample_rate:
@@ -137,7 +140,7 @@ def _samples(seconds: float, rate: float) -> int:
     return samples
 
 
-def _paths(output: Path, names: tuple[str, ...]) -> list[Path]:
+def _paths(output: Path, names: tuple[str, ...], *, overwrite: bool) -> list[Path]:
     """Return the files of the sounds. Raises OutputError for one file of several, and where one cannot be written."""
     paths = [output / name for name in names]
     if output.suffix.lower() == ".wav" and not output.is_dir():
@@ -147,6 +150,7 @@ def _paths(output: Path, names: tuple[str, ...]) -> list[Path]:
         paths = [output]
     for path in paths:
         expect_writable(path)
+        expect_free(path, overwrite=overwrite)
     return paths
 
 

@@ -129,9 +129,10 @@ def check_free(path: Path, *, folder: bool = False, overwrite: bool = False) -> 
     if folder:
         found = sorted(each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file())
     wanted, advice = "a free name", "choose another, or replace it with --overwrite (in Python overwrite=True)"
+    if others := sorted(set(found) - _exported(path)) if folder else []:
+        advice = "choose another folder, or remove its files"
     if overwrite:
-        wanted, advice = "a folder with the files of an export alone", "choose another folder, or remove its files"
-        found = sorted(set(found) - _exported(path)) if folder else []
+        wanted, found = "a folder with the files of an export alone", others
     if found:
         got = f"{found[0]} in it" if folder else "a file"
         raise ExportError.expected(wanted, found, got=got, file=path, name="--overwrite", advice=advice)
