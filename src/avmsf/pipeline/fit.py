@@ -126,7 +126,6 @@ def fit(
             raise FitError.expected("a Capture or a folder", type(source).__name__, name="capture", advice=advice)
         if features is None and source.folder is not None:
             expect_shape(source)
-        # Which stages there are, to know the folder that keeps them; none of them is made in this one.
         views = isinstance(pipeline_of(source, config, features, StageFolder(Path()), listener=listener), SceneStages)
         with _stage_folder(cache, source.folder if views else None) as stages:
             return load(fit_in_stages(source, config, stages, features=features, listener=listener).field)
