@@ -203,7 +203,12 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
 @pytest.mark.parametrize(
     ("call", "kind", "attributes"),
     [
-        *((lambda size=size: avmsf.split(capture(), size), EvaluationError, {}) for size in (0.0, 1.0, -0.5, 0, 1000)),
+        *(
+            (lambda size=size: avmsf.split(capture(), size), EvaluationError, {})
+            for size in (0.0, 1.0, -0.5, 0, 1000, "a")
+        ),
+        (lambda: avmsf.split(np.zeros((3, 3))), EvaluationError, {"name": "recordings", "value": "ndarray"}),
+        (lambda: avmsf.Capture(capture().impacts, "plate"), CaptureError, {"name": "impacts", "value": "str"}),
         *(
             (lambda method=method, where=where: getattr(field(), method)(where), ArrayError, {"name": name, "row": row})
             for method in ("render", "posterior", "gains", "relative_gain_std")
@@ -255,6 +260,7 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         (lambda: avmsf.fit(ALONE, gain_model="bad"), AvmsfError, {"name": "gain_model", "value": "bad"}),
         (lambda: avmsf.evaluate(field(), "bowl"), AvmsfError, {"name": "test", "value": "str"}),
         (lambda: avmsf.extract_modes("bowl"), AvmsfError, {"name": "recordings", "value": "str"}),
+        (lambda: avmsf.locate("bowl.safetensors", "a.wav"), AvmsfError, {"name": "field", "value": "str"}),
         (
             lambda: avmsf.locate(field(), [0.0, 1.0] * 2000, sample_rate="48k"),
             *(AvmsfError, {"name": "sample_rate", "value": "48k"}),

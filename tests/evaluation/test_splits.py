@@ -197,7 +197,7 @@ def test_fewer_views_change_nothing_but_the_views() -> None:
 LONELY = replace(struck(3), contacts=torch.zeros(3, 3, dtype=torch.float64))
 REFUSED: dict[str, tuple[Callable[[], Any], str, Any]] = {
     "all contacts": (lambda: split(struck(10), 10), "count", 10),
-    "no contact": (lambda: split(struck(10), 0), "count", 0),
+    "no contact": (lambda: split(struck(10), 0), "train_size", 0),
     "a part of two contacts": (lambda: split(struck(10).take([0, 1, 0, 1, 0, 1]), 0.2), "count", 2),
     "more than all": (lambda: split(struck(10), 1.5), "train_size", 1.5),
     "a start that is not there": (lambda: split(struck(10), 0.2, start=10), "start", 10),

@@ -41,6 +41,12 @@ class Capture:
     folder: Path | None = None
     """Folder that it was read from, which may hold photographs, a video or Gaussians."""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.impacts, Impacts):
+            raise CaptureError.expected(
+                "Impacts, as in Capture(name, impacts, surface)", type(self.impacts).__name__, name="impacts"
+            )
+
     def __repr__(self) -> str:
         surface = "no surface" if self.surface is None else repr(self.surface)
         return f"Capture({self.name!r}, {self.impacts}, {surface})"

@@ -19,7 +19,7 @@ from avmsf.evaluation.cdpam import Cdpam
 from avmsf.evaluation.metrics import PerContact, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
 from avmsf.evaluation.registry import METRICS, MetricSettings, resolve
-from avmsf.evaluation.splits import align_split, evenly_spaced
+from avmsf.evaluation.splits import align_split, evenly_spaced, impacts_of
 from avmsf.evaluation.task import Renderer, Sounds, expect_renderer
 from avmsf.field.sound_field import SoundField
 from avmsf.simulate.ground_truth import Truth
@@ -82,9 +82,9 @@ def evaluate(
     Raises:
         EvaluationError: As `score`, for what is no renderer, and for one at another sample rate.
     """
-    impacts = _impacts_of(test, "test")
+    impacts = impacts_of(test, "test")
     if train is not None:
-        aligned, impacts = align_split(_impacts_of(train, "train"), impacts)
+        aligned, impacts = align_split(impacts_of(train, "train"), impacts)
         renderer = _made(renderer, aligned)
     made = expect_renderer(renderer)
     lengths = {}
@@ -103,13 +103,6 @@ def evaluate(
         warnings.simplefilter("ignore", PositionWarning)
         sounds = made.render(impacts.contacts, directions=impacts.directions, **lengths)
     return score(sounds, impacts)
-
-
-def _impacts_of(recordings: Capture | Impacts, name: str) -> Impacts:
-    impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
-    if not isinstance(impacts, Impacts):
-        raise EvaluationError.expected("a Capture or Impacts", type(impacts).__name__, name=name)
-    return impacts
 
 
 def _made(make: Any, train: Impacts) -> Any:

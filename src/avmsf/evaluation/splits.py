@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar, cast
 from jaxtyping import Float64
 from torch import Tensor
 
+from avmsf._utils.arrays import as_count
 from avmsf._utils.text import counted
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts, rows_by_place
@@ -207,6 +208,14 @@ class DistinctContacts:
         return Case(label, tuple(train), tuple(sorted(test)), fold)
 
 
+def impacts_of(recordings: Capture | Impacts, name: str) -> Impacts:
+    """Return the impacts of an argument. Raises EvaluationError for what is neither a capture nor impacts."""
+    impacts = recordings.impacts if isinstance(recordings, Capture) else recordings
+    if not isinstance(impacts, Impacts):
+        raise EvaluationError.expected("a Capture or Impacts", type(impacts).__name__, name=name)
+    return impacts
+
+
 def split(
     recordings: Recordings, train_size: float | int = 0.75, *, seed: int | None = None, start: int = 0
 ) -> tuple[Recordings, Recordings]:
@@ -228,14 +237,17 @@ def split(
     Raises:
         EvaluationError: Where no contact would remain to train on, with a fraction fewer than 2, or none to test.
     """
-    impacts = recordings if isinstance(recordings, Impacts) else recordings.impacts
+    impacts = impacts_of(recordings, "recordings")
     if isinstance(train_size, float) and not 0.0 < train_size < 1.0:
         wanted = "a fraction of the contacts between 0 and 1, or their whole number"
         raise EvaluationError.expected(wanted, train_size, name="train_size")
     if seed is not None:
         start = random.Random(seed).randrange(len(impacts))
     distinct = DistinctContacts.of(impacts)
-    count = distinct.count_of(train_size) if isinstance(train_size, float) else distinct.check_count(int(train_size))
+    if isinstance(train_size, float):
+        count = distinct.count_of(train_size)
+    else:
+        count = distinct.check_count(as_count(train_size, "train_size", raising=EvaluationError))
     if not 0 <= start < len(impacts):
         raise EvaluationError.expected(f"the index of a recording, 0 to {len(impacts) - 1}", start, name="start")
     first = next(contact for contact, rows in enumerate(distinct.rows) if start in rows)

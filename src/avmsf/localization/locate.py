@@ -155,7 +155,7 @@ def locate_impacts(
         sound = remove_rumble(response, chosen.highpass, whole)
     onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
-    finder = Locator.of(field) if locator is None else locator
+    finder = _locator_of(field) if locator is None else locator
     ratio = len(resampled) / len(sound)
     starts = [round(onset * ratio) for onset in onsets]
     found = []

@@ -96,8 +96,10 @@ def open_recording(
 
     Without `settings` these are those of the field's capture, and none for bare samples. Raises CaptureError as
     `read_recording`, and LocationError for samples of more than one channel, rates that are not above 0, silence,
-    samples that are not finite, and for a response channel that is not there.
+    samples that are not finite, for a response channel that is not there, and for what is no field.
     """
+    if not isinstance(field, SoundField):
+        raise LocationError.expected("a SoundField, as of avmsf.load(path)", type(field).__name__, name="field")
     if isinstance(recording, str | Path):
         recording = read_recording(Path(recording))
     own = replace(field.origin.settings, align=True)
@@ -165,7 +167,11 @@ def at_field_rate(
     ratio = Fraction(rate / own).limit_denominator(_MAX_RATIO_TERMS)
     resampled = scipy.signal.resample_poly(sound, ratio.numerator, ratio.denominator, padtype="line")
     note = f"{recording.name} was resampled from {own:g} Hz to the field's {rate:g} Hz"
-    left_out = int((frequency < 0.5 * rate).sum()) - held
-    if left_out:
-        note += f"; {left_out} of the object's {counted(len(frequency), 'mode')}, above {highest:.4g} Hz, left out"
+    if held < int(field.audible.sum()):
+        energy = field.amplitudes.square() / field.bank.damping
+        share = 100.0 * float(energy[frequency < highest].sum() / energy.sum())
+        note += (
+            f"; located by {held} of the object's {counted(len(frequency), 'mode')}, with {share:.2g} % of the energy "
+        )
+        note += f"of its sounds: those above {highest:.4g} Hz are left out"
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
