@@ -234,7 +234,9 @@ def test_nothing_clips_in_silence(field: Path, tmp_path: Path) -> None:
 
 def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "pictures"
-    told, _ = results_of(capsys, "info", field, "--capture", capture, "--plots", output)
+    told, shown = results_of(capsys, "info", field, "--capture", capture, "--plots", output)
+    # By what the table is sorted, and what its first column counts.
+    assert re.search(r"energy: squared amplitude times T60\n +mode +frequency Hz", shown)
     fitted = load(field)
     assert (told["capture"], told["sample_rate"]) == ("plate", RATE)
     frequency, is_mode = fitted.bank.frequency, fitted.is_mode

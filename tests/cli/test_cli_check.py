@@ -62,6 +62,28 @@ def test_no_settings_are_written_into_a_dataset(rumbling: Path, tmp_path: Path) 
     assert main(["check", str(tmp_path), "--write-settings"]) == 2
 
 
+@pytest.mark.parametrize(
+    ("replace", "words", "silent_words"),
+    [
+        # Which of two microphones holds the sound nothing tells, and nothing is measured that a table could show.
+        (
+            {f"{name}.wav": np.stack([ring(seed=row), ring(seed=9)], axis=1) for row, name in enumerate("abc")},
+            ("got different ones, 1 and 2; choose one by response_channel",),
+            ("proposed", "length (s)"),
+        ),
+        ({"b.wav": np.zeros(4000)}, ("remove its row", "length (s)"), ("response_channel",)),
+        # As docs/capture-format.md has it.
+        ({"b.wav": np.stack([ring(seed=1)] * 2, axis=1)}, (), ("b.wav: its channels",)),
+        ({"b.wav": np.stack([ring(seed=1), 0.5 * ring(seed=1)], axis=1)}, ("b.wav: its channels hold one sound",), ()),
+    ],
+)
+def test_what_is_said_of_channels_is_what_can_be_done(tmp_path, capsys, replace, words, silent_words):
+    main(["check", str(fill(tmp_path, replace=replace))])
+    said = capsys.readouterr().out
+    assert [each for each in words if each not in said] == []
+    assert [each for each in silent_words if each in said] == []
+
+
 def fill_five(folder: Path, *, own_phases: int | None = None) -> Path:
     """Write recordings of five modes with the impact after .1 s and some samples; one may have phases of its own."""
     generator = np.random.default_rng(1)

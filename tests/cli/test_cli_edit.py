@@ -102,6 +102,14 @@ def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, ca
     assert float((ratios - levels[1] / levels[0]).abs().min()) < 1e-4 * levels[1] / levels[0]
 
 
+@pytest.mark.parametrize("law", ["displacement", "acceleration"])
+def test_the_law_of_the_gains_is_named_and_the_one_of_close_microphones(field: Path, capsys: Streams, law: str) -> None:
+    words = ("edit", field, "-o", field.with_name("new.safetensors"), "--to", "wood", "--from", "ceramic")
+    shown = results_of(capsys, *words, *sets(f"material.law={law}"))[1]
+    assert f"in proportion to {law}" in shown
+    assert ("material.law=acceleration" in shown) == (law == "displacement")
+
+
 def test_supporting_poles_are_no_modes_in_the_table(field: Path, capsys: Streams) -> None:
     save(replace(ceramic(), origin=Origin("plate", report={SUPPORTING: [1]})), field)
     told, shown = results_of(capsys, "edit", field, "-o", field.with_name("new.safetensors"), "--pitch", "1.1")

@@ -14,7 +14,7 @@ from avmsf._utils.caching import key_of
 from avmsf.capture import read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.onset import find_onset
-from avmsf.cli import simulate
+from avmsf.cli import main, simulate
 from avmsf.errors import SimulationError
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
@@ -272,7 +272,10 @@ def test_a_set_killed_half_way_goes_on_and_refuses_to_mix(recipe, cache, tmp_pat
     monkeypatch.setattr(simulationset, "write_simulation", written)
     before = (tmp_path / "first" / TRUTH).stat().st_mtime_ns
     stages = []
-    simulate_set(recipes, tmp_path, cache=cache, progress=lambda message, done, total: stages.append((message, done)))
+    made = simulate_set(
+        recipes, tmp_path, cache=cache, progress=lambda message, done, total: stages.append((message, done))
+    )
+    assert made == ["second", "third"]
     assert [stage for stage in stages if stage[0].endswith(("exists", "done"))] == [
         ("first: exists", 1), ("second: done", 2), ("third: done", 3),
     ]  # fmt: skip
@@ -280,6 +283,16 @@ def test_a_set_killed_half_way_goes_on_and_refuses_to_mix(recipe, cache, tmp_pat
     assert len(read_capture(tmp_path / "third").impacts) == 12
     with raises(SimulationError, file=tmp_path / "first", value=["noise_db", "seed"]):
         simulate_set({"first": replace(recipes["first"], seed=9, noise_db=-20.0)}, tmp_path)
+
+
+def test_the_command_says_whether_it_wrote(simulation, recipe, tmp_path, capsys):
+    write_simulation(simulation, tmp_path / "tile")
+    names = ("thickness", "detail", "elastic_modes", "impacts", "seconds", "sample_rate", "views", "view_size")
+    settings = (word for name in names for word in ("--set", f"{name}={getattr(recipe, name)}"))
+    assert main(["simulate", "--mesh", str(recipe.mesh), "-o", str(tmp_path / "tile"), *settings]) == 0
+    said = capsys.readouterr()
+    assert "nothing was written" in said.out
+    assert "wrote" not in said.out.replace("nothing was written", "") + said.err
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import stdtrit
 
 from avmsf._utils.files import is_lfs_pointer
+from avmsf._utils.text import listed
 from avmsf.capture.filenames import similar_name
 from avmsf.errors import CaptureError, RecordingLengthError
 
@@ -89,9 +90,10 @@ class Recording:
             raise self.error(wanted, 0, got=got, name=key, advice=advice)
         loudest = max(levels, key=levels.__getitem__)
         if not all(self._agree(loudest, each) for each in levels if each != loudest):
-            got = f"{count} different ones"
+            got = f"different ones, {listed(list(map(str, levels)), separator=' and ')}"
             advice = (
-                "write response_channel, counted from 1, in capture.toml (`avmsf check` proposes one), or save as mono"
+                "choose one by response_channel in capture.toml (`avmsf check` proposes one where the recordings show "
+                "which), or save as mono"
             )
             raise self.error(wanted, count, got=got, name=key, advice=advice)
         return next(each for each, level in levels.items() if level >= MIN_CHANNEL_LEVEL * levels[loudest])
@@ -207,12 +209,13 @@ def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> byt
     return content if start < 12 else content[:start] + bytes(4) + content[start + 4 :]
 
 
-def check_not_silent(sound: Float64[np.ndarray, " frames"], name: str) -> None:
-    """Raise `CaptureError` where every sample is the same."""
+def check_not_silent(sound: Float64[np.ndarray, " frames"], recording: Recording) -> None:
+    """Raise `CaptureError` where every sample of a recording's sound is the same."""
     if np.ptp(sound) == 0:
         got = f"silence (all {len(sound)} samples are {sound[0]:g})"
-        advice = "record it again, or choose another response_channel"
-        raise CaptureError.expected("a sound", float(sound[0]), got=got, file=name, advice=advice)
+        other = "choose another response_channel" if len(recording.channels) > 1 else "remove its row"
+        advice = f"record it again, or {other}"
+        raise CaptureError.expected("a sound", float(sound[0]), got=got, file=recording.name, advice=advice)
 
 
 def clipped_samples(samples: Shaped[np.ndarray, " frames"]) -> int:

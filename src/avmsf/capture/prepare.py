@@ -47,7 +47,7 @@ def prepare(recording: Recording, settings: CaptureSettings, *, newtons: float |
         wanted = f"a sample rate of {LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz (the file's rate times playback_speed)"
         raise recording.error(wanted, played, name="sample_rate", advice="export it at another rate")
     sound = recording.response(settings.response_channel, force_channel=settings.force_channel)
-    check_not_silent(sound, recording.name)
+    check_not_silent(sound, recording)
     _check_length_and_peak(sound, recording)
     sound = remove_rumble(sound, settings.highpass, recording)
     pulse, onset = None, 0

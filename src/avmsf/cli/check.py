@@ -100,7 +100,8 @@ def run(options: Options) -> int:
     aligned = None if modes is None or impacts is None else AlignmentReport.of(modes, impacts)
     # The folder's first, then the recordings', common ones once.
     problems = [*report.problems, *shared_problems(report.recordings)]
-    lines = [_table(report, str(options.capture), aligned)] if report.recordings else []
+    measured = any(each.seconds is not None for each in report.recordings)
+    lines = [_table(report, str(options.capture), aligned)] if measured else []
     if visual is not None:
         problems += [*visual.problems, *visual.unused, *map(str, misplaced(options.capture, visual))]
         lines.append(visual.sentence)

@@ -147,6 +147,9 @@ def changes_table(rows: list[dict[str, Any]], old: SoundField, new: SoundField) 
 def notes_on(edits: list[dict[str, Any]], old: SoundField, new: SoundField, *, scale: float) -> list[str]:
     """Return what a user of an edited field should know."""
     notes = [*remarks(edits, new)]
+    for law in (each["law"] for each in edits if "law" in each):
+        other = "" if law == "acceleration" else "; of microphones close to the object: --set material.law=acceleration"
+        notes.append(f"gains by the law of recordings in proportion to {law}{other} (docs/editing.md)")
     seconds = new.samples / new.sample_rate
     before, ringing = (max([0.0, *field.bank.t60[field.amplitudes > 0].tolist()]) for field in (old, new))
     if ringing > max(seconds, before):

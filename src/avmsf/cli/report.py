@@ -261,8 +261,9 @@ def mode_table(of: str, rows: Sequence[dict[str, Any]], supporting: int, *, ever
     # Energy over time: proportional to the square of the amplitude and to the decay time.
     most = sorted(rows, key=lambda row: row["level_db"] + 10 * math.log10(row["t60_seconds"]), reverse=True)
     most = most if every else most[:MAX_LISTED_MODES]
-    which = "by energy" if len(most) == len(rows) else f"the {MAX_LISTED_MODES} of most energy (--all lists all)"
-    columns = ["", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
+    which = "sorted by" if len(most) == len(rows) else f"the {MAX_LISTED_MODES} (--all lists all) of most"
+    which += " energy: squared amplitude times T60"
+    columns = ["mode", "frequency Hz", "damping 1/s", "T60 s", "level dB"]
     scored = any("energy_share" in row for row in rows)
     columns += ["energy", "phase", "orders", "left out"] if scored else []
     cells = []

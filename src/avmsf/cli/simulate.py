@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from avmsf._utils.text import counted
 from avmsf.cli.options import Configured, Flag, Int, Name, Number, with_settings
 from avmsf.cli.output import display, next_command, print_json, print_result, show, table
 from avmsf.cli.paths import CacheFolder, Existing, OutputFolder, arg
@@ -93,8 +94,11 @@ def run(options: Options) -> int:
     else:
         place = options.output.resolve()
         recipes, folder = {place.name: options.all_settings}, place.parent
-    simulate_set(recipes, folder, cache=options.cache, progress=display.objects())
-    text = f"wrote {options.output}" if len(recipes) == 1 else f"wrote {len(recipes)} objects to {options.output}"
+    written = simulate_set(recipes, folder, cache=options.cache, progress=display.objects())
+    what = "" if len(recipes) == 1 else f"{counted(len(written), 'object')} to "
+    text = f"wrote {what}{options.output}"
+    if not written:
+        text = f"{options.output}: simulated before with these settings; nothing was written"
     print_result(text, {"output": str(options.output), "objects": [str(folder / name) for name in recipes]})
     next_command("avmsf check", folder / next(iter(recipes)))
     return 0

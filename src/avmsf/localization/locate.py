@@ -151,7 +151,7 @@ def locate_impacts(
         raise LocationError.expected(wanted, "deconvolve", file=whole.name, name="normalize", advice=advice)
     with location_errors():
         response = whole.response(chosen.response_channel, force_channel=chosen.force_channel)
-        check_not_silent(response, whole.name)
+        check_not_silent(response, whole)
         sound = remove_rumble(response, chosen.highpass, whole)
     onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)

@@ -99,8 +99,8 @@ def simulate_set(
     *,
     cache: Path | None = None,
     progress: Callable[[str, int, int], None] | None = None,
-) -> None:
-    """Simulate the objects that the folder does not hold yet, each into a folder of its name.
+) -> list[str]:
+    """Simulate the objects that the folder does not hold yet, each into a folder of its name; return their names.
 
     An interrupted run goes on with the first object that is not whole. `progress` is called with the object's name and
     what is being computed, `exists` or `done` where it is whole, the number of whole objects and that of all. Raises
@@ -122,6 +122,7 @@ def simulate_set(
             stage(f"{recipe.views} views" if recipe.views else "files")
             write_simulation(simulation, folder / name)
         stage("exists" if whole[name] else "done", done=done + 1)
+    return [name for name in recipes if not whole[name]]
 
 
 def example_mesh() -> TexturedMesh:
