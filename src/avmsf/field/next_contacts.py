@@ -32,7 +32,8 @@ class Suggestions:
     """Suggested contacts of the next impacts, in this order, with the expected error after each.
 
     Errors are relative: the square root of the expected squared error of the gains, as energy, over the energy that is
-    expected on the mean over the surface. 0 is certainty, 1 as wrong as silence.
+    expected on the mean over the surface. 0 is certainty, 1 as wrong as silence. `before` is that of the present
+    recordings, `after` those after each contact and the ones before it; `rows` tells which candidates the contacts are.
     """
 
     __repr__ = short_repr

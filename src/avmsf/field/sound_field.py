@@ -72,8 +72,10 @@ class SoundField:
 
     Positions, directions and forces are lists, numpy arrays or tensors. Methods raise ArrayError for other shapes and
     for values that are not finite, and PositionError for a position that lies farther from the object than this is
-    large; for one nearer but off the object they give a PositionWarning. Directions of any length count as unit
-    vectors. One of length zero is unknown, and the impact then goes straight into the surface.
+    large. For one nearer but off the object by more than 5 % of its diagonal they give a PositionWarning. Directions of
+    any length count as unit vectors. One of length zero is unknown, and the impact then goes straight into the surface.
+
+    `bank` has the modes' frequencies and dampings, `samples` is the length of rendered sounds, at `sample_rate` Hz.
     """
 
     bank: ModalBank

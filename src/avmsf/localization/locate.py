@@ -48,7 +48,8 @@ def locate(
 ) -> ContactPosterior:
     """Return where on the object a recorded impact was (paper, section Contact Localization, and a posterior).
 
-    The field's locator with its own points is cached, so that of several recordings only the first waits for it.
+    The locator of the last field, with its own points, is kept until the process ends, so that of several recordings
+    only the first waits for it. `Locator.prepare` makes what the first sound needs before it comes.
 
     Args:
         field: The object's field.

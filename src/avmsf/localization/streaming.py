@@ -54,7 +54,11 @@ _MAX_HIGHPASS_HZ = 20.0
 
 @dataclass(frozen=True, eq=False)
 class LocatedImpact:
-    """One impact and the posterior of its contact."""
+    """One impact of a stream and the posterior of its contact, `map`, from `used_seconds` of its sound.
+
+    It began at `seconds`, counted from the stream's first sample. `latency` is what passed from then on until this
+    estimate: the time of the audio that had come by then, and of the computation. A better one follows if not `final`.
+    """
 
     seconds: float
     """Its onset, from the stream's first sample on."""
@@ -88,8 +92,9 @@ class StreamingLocalizer:
     The first estimate of an impact uses `window` seconds from its onset on. With `later`, longer than that, a second
     and better one uses that length, or all up to the next impact. Impacts closer to each other than `window` count as
     one, and one more than 11 dB below the decay of earlier ones is not detected. The first 15 ms of a stream count as
-    its noise. The stream is high-pass filtered at a twentieth of the lowest mode's frequency, at most 20 Hz. At most
-    the length of the field's own sounds is used.
+    its noise. A jump where two recordings were joined may be located as an impact: give each its own listener. The
+    stream is high-pass filtered at a twentieth of the lowest mode's frequency, at most 20 Hz. At most the length of the
+    field's own sounds is used.
 
     Raises LocationError for a sample rate that is not the field's, times that are not positive, a window of less than
     20 ms, and a field of which no mode is audible.
