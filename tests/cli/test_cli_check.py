@@ -253,6 +253,34 @@ def test_what_is_wrong_with_cameras_is_named(tmp_path: Path, case: str) -> None:
     assert any(words in each for each in said) if words else said == []
 
 
+def test_check_leads_to_the_unit_without_which_fit_refuses(tmp_path: Path, capsys: Streams) -> None:
+    folder = pictured_slab(tmp_path / "slab")
+    head, *rows = (folder / "impacts.csv").read_text().split()
+    cells = [(name, *(str(100 * float(each)) for each in place[:3]), *place[3:]) for name, *place in
+             (row.split(",") for row in rows)]  # fmt: skip
+    (folder / "impacts.csv").write_text("\n".join([head, *map(",".join, cells), ""]))
+    settings = (folder / "capture.toml").read_text()
+    # By hand, where there are settings, which the command leaves alone.
+    assert main(["check", str(folder)]) == 0
+    said = capsys.readouterr()
+    assert 'unit = "mm"' not in said.out
+    assert f'next: add unit = "cm" to {folder / "capture.toml"}' in said.err
+    (folder / "capture.toml").unlink()
+    assert main(["check", str(folder)]) == 0
+    assert capsys.readouterr().err.splitlines()[-1] == f"next: avmsf check {folder} --write-settings"
+    assert main(["check", str(folder), "--write-settings"]) == 0
+    said = capsys.readouterr()
+    assert CaptureSettings.read(folder / "capture.toml") == CaptureSettings(unit="cm")
+    assert "outlines" not in said.out
+    assert said.err.splitlines()[-1].startswith("next: avmsf fit")
+    # A unit that was chosen is not proposed, and fit refuses it.
+    (folder / "capture.toml").write_text(f'{settings}\nunit = "m"\n')
+    assert main(["check", str(folder)]) == 0
+    said = capsys.readouterr()
+    assert "proposed: unit" not in said.out
+    assert said.err.splitlines()[-1].startswith("next: correct")
+
+
 TURN = Rotation.from_euler("zyx", [28, 15, -40], degrees=True)
 
 

@@ -108,8 +108,13 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
     return check_and_read(folder, settings)[0]
 
 
-def check_and_read(folder: str | Path, settings: CaptureSettings | None = None) -> tuple[CaptureReport, Impacts | None]:
-    """Return the report of `check`, and the impacts where the folder is readable."""
+def check_and_read(
+    folder: str | Path, settings: CaptureSettings | None = None, *, known: Collection[str] = ()
+) -> tuple[CaptureReport, Impacts | None]:
+    """Return the report of `check`, and the impacts where the folder is readable.
+
+    Warnings of settings that are `known` to need another value are left out.
+    """
     folder, issues = Path(folder), Issues(collect=True)
     try:
         settings = settings or settings_of(folder)
@@ -123,7 +128,8 @@ def check_and_read(folder: str | Path, settings: CaptureSettings | None = None) 
     names = [report.file for report in reports]
     if names == sorted(names) != sorted(names, key=number_key):
         remarks.append(TEXT_ORDER)
-    problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, set(names))]
+    warned = [str(each) for each in issues.warnings if each.name not in known]
+    problems = [*map(str, issues.errors), *warned, *_copies(issues), *_unlisted(folder, set(names))]
     readable = not issues.errors and all(each.readable for each in reports)
     report = CaptureReport(readable, tuple(reports), tuple(problems), tuple(remarks))
     return report, impacts if readable else None

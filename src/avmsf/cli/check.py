@@ -8,21 +8,27 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.capture.settings import TABLE, settings_of
+from avmsf.capture.settings import SETTINGS, TABLE, settings_of
 from avmsf.capture.table import read_rows
 from avmsf.cli.options import Common, Flag
 from avmsf.cli.output import decimals, doing, next_command, print_json, say, show, table
 from avmsf.cli.paths import ContactData, Existing
 from avmsf.datasets.detect import detect_dataset
-from avmsf.errors import CaptureError, ExtractionError
+from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, ExtractionError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from avmsf.capture import CaptureReport
+    from avmsf.capture.proposals import Proposal
     from avmsf.modal.extraction.alignment_report import AlignmentReport
+    from avmsf.pipeline.visual_checks import VisualInputs
 
 UNREADABLE = 2
 _STRONGEST = 32
 """Modes by which recordings of inverted polarity are found."""
+_UNITS = ("unit", "surface_unit", "views_unit")
+"""Settings without which `avmsf fit` refuses, where they are proposed."""
 _MEASURED = {
     "length (s)": ("seconds", 2),
     "rate (Hz)": ("sample_rate", 0),
@@ -78,21 +84,17 @@ def run(options: Options) -> int:
     """Print the report; return 2 where the capture, or every object of a dataset, cannot be read."""
     from avmsf.capture.folder import check_and_read
     from avmsf.capture.issues import shared_problems
-    from avmsf.capture.proposals import propose_settings, write_settings
     from avmsf.modal.extraction.alignment_report import AlignmentReport
     from avmsf.modal.extraction.extract import extract_modes
     from avmsf.modal.extraction.finders import HighResolution
-    from avmsf.pipeline.visual_checks import inputs, misplaced
+    from avmsf.pipeline.visual_checks import inputs
 
     if options.is_dataset:
         return _check_dataset(options)
     doing(f"reading {options.capture}")
-    proposals = propose_settings(options.capture)
-    if proposals and options.write_settings:
-        path = write_settings(options.capture, proposals)
-        show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
     visual = inputs(options.capture)
-    report, impacts = check_and_read(options.capture)
+    proposals, wrong = _propose(options, visual)
+    report, impacts = check_and_read(options.capture, known=[each.key for each in proposals])
     doing("finding the modes that align the recordings")
     modes = None
     with suppress(ExtractionError):
@@ -103,7 +105,7 @@ def run(options: Options) -> int:
     measured = any(each.seconds is not None for each in report.recordings)
     lines = [_table(report, str(options.capture), aligned)] if measured else []
     if visual is not None:
-        problems += [*visual.problems, *visual.unused, *map(str, misplaced(options.capture, visual))]
+        problems += [*visual.problems, *visual.unused, *map(str, wrong)]
         lines.append(visual.sentence)
     lines += problems
     if not options.write_settings:
@@ -122,17 +124,52 @@ def run(options: Options) -> int:
     )
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again", always=True)
+        _lead_to_settings(options, proposals)
         return UNREADABLE
     lines = [*report.remarks, *(aligned.sentences() if aligned else ())]
     if modes is None:
         lines = ["no mode was found to align the recordings: noisy or too short (see avmsf modes)"]
-    wrong = len(problems) + (modes is None) + (0 if aligned is None else len(aligned.warnings()))
-    show("\n".join([*lines, f"readable, with {counted(wrong, 'warning')}" if wrong else "no problem found"]))
-    if visual is not None and visual.reconstructs:
-        next_command("avmsf fit", options.capture, "-o field.safetensors")
+    count = len(problems) + (modes is None) + (0 if aligned is None else len(aligned.warnings()))
+    show("\n".join([*lines, f"readable, with {counted(count, 'warning')}" if count else "no problem found"]))
+    fitted = visual is not None and visual.reconstructs
+    if _lead_to_settings(options, [each for each in proposals if each.key in _UNITS]):
+        pass
+    elif fitted and any(isinstance(each, AvmsfError) for each in wrong):
+        next_command("correct what is said of the photographs, then avmsf check", options.capture)
     else:
-        next_command("avmsf modes", options.capture)
+        next_command(f"avmsf {'fit' if fitted else 'modes'}", options.capture, "-o field.safetensors" if fitted else "")
     return 0
+
+
+def _propose(
+    options: Options, visual: "VisualInputs | None"
+) -> "tuple[tuple[Proposal, ...], list[AvmsfWarning | AvmsfError]]":
+    """Return the settings that would help, written if asked for, and what then shows the object elsewhere."""
+    from avmsf.capture.proposals import propose_settings, write_settings
+    from avmsf.pipeline.visual_checks import misplaced, propose_units
+
+    proposals = propose_settings(options.capture)
+    wrong = [] if visual is None else misplaced(options.capture, visual)
+    if not any(each.key in _UNITS for each in proposals):
+        proposals += propose_units(options.capture, wrong)
+    if proposals and options.write_settings:
+        path = write_settings(options.capture, proposals)
+        show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
+        wrong = [] if visual is None else misplaced(options.capture, visual)
+    return proposals, wrong
+
+
+def _lead_to_settings(options: Options, proposals: "Sequence[Proposal]") -> bool:
+    """Say how proposals that are needed are written, and return whether there are any that are not."""
+    if not proposals or options.write_settings:
+        return False
+    if (path := options.capture / SETTINGS).exists():
+        next_command(
+            f"add {' and '.join(each.line for each in proposals)} to {path}, then avmsf check", options.capture
+        )
+    else:
+        next_command("avmsf check", options.capture, "--write-settings")
+    return True
 
 
 def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None") -> str:

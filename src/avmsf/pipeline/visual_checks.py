@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,13 +15,13 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
-from avmsf._utils.text import counted, listed
+from avmsf._utils.text import counted, listed, read_toml
 from avmsf.capture.checks import find_surface
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import FACTORS, WRONG_ROWS, check_placement, expect_placed
-from avmsf.capture.proposals import contacts_of
-from avmsf.capture.settings import CaptureSettings, settings_of, unit_named
+from avmsf.capture.proposals import Proposal, contacts_of
+from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of, unit_named
 from avmsf.capture.table import read_rows
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
 from avmsf.gaussians.ply import read_splats
@@ -239,9 +240,10 @@ def expect_mesh_in_views(surface: Surface, views: Sequence[View], settings: Capt
     others = {each: _box_difference(each * points, chosen) for each in FACTORS if each != 1}
     factor = min(others, key=others.__getitem__)
     if others[factor] < min(SAME_SHAPE, 0.5 * found):
+        changed = _mending("surface_unit", factor, settings, "scale the cameras or the mesh")
         raise CaptureError(
             f"expected the mesh and the cameras in one unit; the mesh appears as large as the photographs' masks when "
-            f"multiplied by {factor:.4g}; {_mending(factor, settings)}",
+            f"multiplied by {factor:.4g}; {changed}",
             name="surface_unit",
             value=factor,
         )
@@ -280,8 +282,7 @@ def expect_contacts_in_views(
     if 2 * _share_inside(contacts, chosen) > 1:
         return
     factor = max((each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS), default=1.0)
-    name = unit_named(factor * settings.meters)
-    changed = f'write unit = "{name}" in capture.toml' if name else "scale the contacts or the cameras"
+    changed = _mending("unit", factor, settings, "scale the contacts or the cameras")
     reason = f"and inside when multiplied by {factor:.4g}; {changed}"
     if factor == 1:
         hull = carve([view.foreground for view in chosen], [view.camera for view in chosen])
@@ -338,12 +339,36 @@ def _share_inside(contacts: Float[Tensor, "contacts 3"], views: Sequence[View]) 
     return float(np.median(found))
 
 
-def _mending(factor: float, settings: CaptureSettings) -> str:
-    """Return what to write in capture.toml where the mesh times a factor fits the cameras."""
+def propose_units(folder: Path, wrong: Sequence[AvmsfWarning | AvmsfError]) -> tuple[Proposal, ...]:
+    """Return the units that mend what `misplaced` found, unless the folder's `capture.toml` has chosen one of them."""
+    path = folder / SETTINGS
+    for each in wrong:
+        units = _fitting_units(each.name, each.value, settings_of(folder))
+        if units and not (path.is_file() and units.keys() & read_toml(path).keys()):
+            reason = f"Multiplied by {each.value:.4g}, the {_SCALED[str(each.name)]} fit the object in the photographs."
+            return tuple(Proposal(key, unit, reason) for key, unit in units.items())
+    return ()
+
+
+_SCALED = {"unit": "contacts", "surface_unit": "mesh's coordinates"}
+"""What the factor is on that an error of a unit has as its value, by the error's name."""
+
+
+def _fitting_units(name: str | None, factor: Any, settings: CaptureSettings) -> dict[str, str]:
+    """Return the settings that mend an error of a unit, whose name is this and whose value this factor."""
+    if name == "unit":
+        unit = unit_named(factor * settings.meters)
+        return {} if unit is None else {"unit": unit}
+    if name != "surface_unit":
+        return {}
     views, contacts = unit_named(settings.views_meters / factor), unit_named(settings.meters * factor)
     if views is not None:
-        return f'write views_unit = "{views}" in capture.toml'
+        return {"views_unit": views}
     mesh = unit_named(settings.surface_meters * factor)
-    if contacts is not None and mesh is not None:
-        return f'write unit = "{contacts}" and surface_unit = "{mesh}" in capture.toml'
-    return "scale the cameras or the mesh"
+    return {} if contacts is None or mesh is None else {"unit": contacts, "surface_unit": mesh}
+
+
+def _mending(name: str, factor: float, settings: CaptureSettings, otherwise: str) -> str:
+    """Return what to write in capture.toml against an error of a unit, or what to do where no unit mends it."""
+    lines = [f'{key} = "{unit}"' for key, unit in _fitting_units(name, factor, settings).items()]
+    return f"write {' and '.join(lines)} in capture.toml" if lines else otherwise
