@@ -126,7 +126,13 @@ def test_a_folder_that_shows_nothing_has_no_features_and_is_fitted_in_a_box(tmp_
     assert main(["fit", str(folder), "--until", "features", *LIFT[:2]]) == 2
     assert "expected photographs" in capsys.readouterr().err
     assert main(["fit", str(folder), *FIT, *MODES]) == 0
-    assert "bounding box" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "bounding box" in said
+    # Where no line moves, one says that a stage begins, and one that it is ready; of a stage that is cached the latter.
+    stages = [line.split()[0] for line in said.splitlines() if line.startswith(("modes", "fit", "field"))]
+    assert stages == ["modes:", "modes", "fit:", "field"]
+    assert main(["fit", str(folder), *FIT, *MODES]) == 0
+    assert "modes:" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["ply", "obj", "glb"])

@@ -36,7 +36,7 @@ class ProgressListener:
 class ProgressDisplay:
     """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready.
 
-    A notebook counts as a terminal.
+    A notebook counts as a terminal. Where no line moves, one says when a stage begins.
     """
 
     def __init__(self, *, shown: bool = True, verbose: bool = False) -> None:
@@ -44,6 +44,7 @@ class ProgressDisplay:
         self.shown, self.verbose = shown, verbose
         self._bar: Progress | None = None
         self._shown: tuple[str, TaskID] | None = None
+        self._begun: str | None = None
 
     def __enter__(self) -> "ProgressDisplay":
         return self
@@ -54,7 +55,7 @@ class ProgressDisplay:
     @property
     def listener(self) -> ProgressListener:
         """What the stages report to."""
-        return ProgressListener(self.doing, self.step, self.ready, self.note)
+        return ProgressListener(self._part, self.step, self.ready, self.note)
 
     def say(self, text: str, *, always: bool = False) -> None:
         """Print a line on what is done, if they are shown; with `always`, which errors are, even then."""
@@ -71,6 +72,15 @@ class ProgressDisplay:
         if self.verbose:
             self.say(text)
         self._show(text, text, 0, None)
+
+    def _part(self, text: str) -> None:
+        """Show what part of a stage begins, in a line only a stage's first, "stage: what is done"."""
+        stage, colon, _ = text.partition(":")
+        begins = bool(colon) and stage.isalpha()
+        if begins and stage != self._begun and not (self.verbose or self._moves):
+            self.say(f"{text} ...")
+        self._begun = stage if begins else self._begun
+        self.doing(text)
 
     def step(self, stage: str, done: int, total: int, message: str) -> None:
         """Show how many steps of a stage are done, and a message on the last one."""
@@ -106,8 +116,13 @@ class ProgressDisplay:
         if self._bar is not None:
             self._bar.stop()
 
+    @property
+    def _moves(self) -> bool:
+        """Whether the standard error shows a line that moves."""
+        return sys.stderr.isatty() or "ipykernel" in sys.modules
+
     def _show(self, stage: str, text: str, done: int, total: int | None) -> None:
-        if not self.shown or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
+        if not self.shown or not self._moves:
             return
         if self._bar is None:
             self._bar = _new_bar()
