@@ -41,7 +41,7 @@ from avmsf.mesh import Surface
 from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.fit import fit
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
-from factories.delayed_plate import delays, strikes
+from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
 from factories.plate_field import QUICK
 from factories.plate_set import PlateInputs, fill_plates, plate_named
 from factories.raising import raises
@@ -274,6 +274,19 @@ def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) ->
     evaluation = Evaluation("plates", PROTOCOLS["farthest"], (), inputs, NO_CDPAM, own_starts=own)
     case = Case("all", tuple(range(TRAIN)), tuple(range(TRAIN, STRIKES)))
     return CaseRun(evaluation, ObjectData(evaluation, "a"), case, folder=folder, number=1, stores_sounds=False)
+
+
+def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:
+    starts = delays(STRIKES)
+    run = run_of(strikes(STRIKES, starts=starts), tmp_path / "delayed")
+    methods = [method_named(name) for name in ("nearest", "knn3", "knn-gains")]
+    found = [run.outcome(method) for method in methods]
+    other = run_of(without_delays(run.data.impacts, run.scored.modes(), starts), tmp_path / "exact")
+    for one, expected in zip(found, map(other.outcome, methods), strict=True):
+        assert one.failure is None
+        for metric in ("relative_stft", "l1", "envelope"):
+            assert one.values[metric] == pytest.approx(expected.values[metric], rel=2 * ALIGNED), (one.method, metric)
+    assert distance(run.scored.test.sounds, other.scored.test.sounds) < ALIGNED
 
 
 class NearestThree:

@@ -75,6 +75,11 @@ def test_a_contacts_sound_does_not_depend_on_its_company(rows):
     torch.testing.assert_close(field().render(CONTACTS[rows]), sounds[rows], rtol=0, atol=1e-6 * loudest)
 
 
+def test_force_scales_noise_that_is_no_background():
+    trained = replace(field(), residual=replace(field().residual, force=None))
+    assert torch.equal(trained.render(CONTACTS, forces=4.0), 4.0 * trained.render(CONTACTS))
+
+
 def test_force_scales_the_modes_and_leaves_the_background():
     assert field().residual.force == 2.0
     modes, noise = field().render(CONTACTS, noise=False), field().noise()

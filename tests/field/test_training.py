@@ -289,6 +289,10 @@ def warmup_loss(config: FitConfig, offset: torch.Tensor) -> float:
 
 def test_equal_weights_make_equation_13_of_the_warm_up() -> None:
     modes = len(plate_extraction(plate_impacts()).bank)
+    run, targets = begun(replace(SHORT, warmup_weights="equal"))
+    difference = run.network.read(targets.rows).mean.detach().real - targets.gains
+    expected = float(difference.square().sum() / targets.gains.square().sum())
+    assert float(run.advance(targets)) == pytest.approx(expected, rel=1e-4)
     offsets = 1e-3 * torch.eye(modes)
     # One squared error, whichever mode makes it, and otherwise the energies of modes of unequal damping.
     plain, weighed = (

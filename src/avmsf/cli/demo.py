@@ -23,7 +23,7 @@ COMMANDS = (
     "fit {0}/capture --until gaussians --set splat.steps=500 --output {0}/mug.ply --overwrite",
     "fit {0}/capture --until surface --set splat.steps=500 --output {0}/mug-surface.ply --overwrite",
     "info {0}/mug.safetensors --capture {0}/capture --plots {0}/pictures",
-    "render {0}/mug.safetensors --contact-table {0}/capture/impacts.csv --output {0}/sounds --normalize peak",
+    "render {0}/mug.safetensors --contact-table {0}/capture/impacts.csv -o {0}/sounds --overwrite --normalize peak",
     "export {0}/mug.safetensors --to web --capture {0}/capture --object {0}/mug.ply --output {0}/mug.html --overwrite",
 )
 

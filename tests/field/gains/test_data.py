@@ -16,7 +16,7 @@ from avmsf.fem.supports import EndPatch, Place, Support, patches_about
 from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
-from avmsf.field.gains.data import GainData, orientation_signs
+from avmsf.field.gains.data import GainData, gain_data, orientation_signs
 from avmsf.field.gains.estimator import MixtureEstimator, RefinedGains
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import off_surface, points_on_object
@@ -89,6 +89,12 @@ def test_a_field_and_the_gains_it_is_checked_by_do_not_depend_on_delays(delayed,
     apart = fields[0].gains(FEATURES.points) - fields[1].gains(FEATURES.points)
     assert bool((apart.abs() < known[0].posterior(FEATURES.points).std[..., 0]).all())
     assert distance(*(torch.view_as_real(each.measured).flatten(1) for each in known)) < ALIGNED
+
+
+def test_aligned_recordings_are_not_delayed_again(delayed: tuple[Impacts, Extraction]) -> None:
+    train, modes = delayed
+    aligned = modes.aligned(train)
+    assert torch.equal(gain_data(aligned, FEATURES, modes, CONFIG).train.sounds, aligned.sounds)
 
 
 def test_rows_are_grouped_by_place_in_the_order_of_the_table() -> None:
