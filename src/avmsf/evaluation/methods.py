@@ -78,7 +78,7 @@ class FunctionMethod:
 
 def method_named(name: str) -> Method:
     """Return the method of this name. Raises EvaluationError that lists the known ones, and for a missing path."""
-    entry, settings, weights = method_entry(name), {}, ""
+    entry, settings, weights = method_entry(name), dict[str, Any](), ""
     if entry.path:
         given = name.partition(":")[2]
         path = Path(given).expanduser()
@@ -92,7 +92,14 @@ def method_named(name: str) -> Method:
         return made
     if entry.path:
         weights = folder_digest(path) if entry.is_folder else digest_of(path)[:16]
-    return FunctionMethod(name, partial(resolve(entry.fit), **entry.settings, **settings), weights, entry.visual_input)
+    # Of a class method ray would send the code, not the name.
+    fit = partial(_fit_with, entry.fit, **entry.settings, **settings)
+    return FunctionMethod(name, fit, weights, entry.visual_input)
+
+
+def _fit_with(function: str | Callable[..., Any], /, task: Task, **settings: Any) -> Renderer:
+    made: Renderer = resolve(function)(task, **settings)
+    return made
 
 
 def mean_trained_gains(task: Task) -> MeanGains:
