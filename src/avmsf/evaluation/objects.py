@@ -106,7 +106,11 @@ class ObjectInputs:
             return read_splats(stages[CLOUD].path)
 
     def bodies(self, identifier: str) -> CandidateBodies:
-        """Return an object's bodies. Raises SceneError where its shape is unknown, SimulationError for an unfit one."""
+        """Return an object's bodies, which all its cases share.
+
+        Raises SceneError where its shape is unknown, SimulationError for an unfit one, FitError where the contacts, the
+        test ones too, do not lie on the surface, and CaptureError where the points do not at which it was held.
+        """
         capture, cache = self.dataset.capture(identifier), self.cache / identifier / "bodies"
         return candidate_bodies(
             self._surface(identifier), self.body, impacts=capture.impacts, settings=capture.settings, cache=cache
@@ -123,7 +127,7 @@ class ObjectInputs:
             return reported_symmetries(read_report(path))
 
     def family(self, identifier: str) -> BodyFamily:
-        """Return an object's bodies for DiffSound. Raises SceneError and SimulationError likewise."""
+        """Return an object's bodies for DiffSound. Raises SceneError and SimulationError as `bodies` does."""
         return body_family(self._surface(identifier), count=DIFFSOUND_MODES)
 
     def _surface(self, identifier: str) -> Surface | ObjectShape:
