@@ -23,7 +23,8 @@ from avmsf.mesh.surface import Surface, surface_points
 from avmsf.photographs.folder import read_camera_file, write_frames
 from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced
 from factories.capture_folder import RATE, fill, ring
-from factories.plate_capture import fill_plate
+from factories.plate_capture import PLATE, fill_plate
+from factories.plate_field import rectangle
 from factories.raising import raises
 from factories.small_scene import slab, slab_views
 from factories.verbs import results_of
@@ -253,12 +254,30 @@ def test_what_is_wrong_with_cameras_is_named(tmp_path: Path, case: str) -> None:
     assert any(words in each for each in said) if words else said == []
 
 
-def test_check_leads_to_the_unit_without_which_fit_refuses(tmp_path: Path, capsys: Streams) -> None:
-    folder = pictured_slab(tmp_path / "slab")
+def in_centimeters(folder: Path) -> Path:
+    """Write the contacts of a folder in centimeters, as no setting says."""
     head, *rows = (folder / "impacts.csv").read_text().split()
     cells = [(name, *(str(100 * float(each)) for each in place[:3]), *place[3:]) for name, *place in
              (row.split(",") for row in rows)]  # fmt: skip
     (folder / "impacts.csv").write_text("\n".join([head, *map(",".join, cells), ""]))
+    return folder
+
+
+def test_a_proposed_unit_is_a_problem_and_said_once(tmp_path: Path, capsys: Streams) -> None:
+    folder = in_centimeters(fill_plate(tmp_path / "plate", surface=False))
+    mesh = rectangle(PLATE)
+    Surface(100 * mesh.vertices, mesh.faces).write(folder / "surface.ply")
+    assert main(["check", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[-1] == "readable, with 1 warning"
+    assert (out.count('unit = "cm"'), out.count("20.4 m")) == (1, 1)
+    report, _ = results_of(capsys, "check", folder)
+    assert ["20.4 m apart" in each for each in report["problems"]] == [True]
+    assert [each["key"] for each in report["proposals"]] == ["unit"]
+
+
+def test_check_leads_to_the_unit_without_which_fit_refuses(tmp_path: Path, capsys: Streams) -> None:
+    folder = in_centimeters(pictured_slab(tmp_path / "slab"))
     settings = (folder / "capture.toml").read_text()
     # By hand, where there are settings, which the command leaves alone.
     assert main(["check", str(folder)]) == 0

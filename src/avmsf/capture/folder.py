@@ -109,18 +109,15 @@ def check(folder: str | Path, settings: CaptureSettings | None = None) -> Captur
 
 
 def check_and_read(
-    folder: str | Path, settings: CaptureSettings | None = None, *, known: Collection[str] = ()
-) -> tuple[CaptureReport, Impacts | None]:
-    """Return the report of `check`, and the impacts where the folder is readable.
-
-    Warnings of settings that are `known` to need another value are left out.
-    """
+    folder: str | Path, settings: CaptureSettings | None = None
+) -> tuple[CaptureReport, Impacts | None, list[CaptureWarning]]:
+    """Return the report of `check`, the impacts where the folder is readable, and the warnings among the problems."""
     folder, issues = Path(folder), Issues(collect=True)
     try:
         settings = settings or settings_of(folder)
         impacts, _ = _walk(folder, settings, issues)
     except CaptureError as error:
-        return CaptureReport(False, (), (str(error),)), None
+        return CaptureReport(False, (), (str(error),)), None, []
     reports, remarks = sorted(issues.reports, key=lambda report: report.line), []
     if issues.uncut:
         reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
@@ -128,11 +125,10 @@ def check_and_read(
     names = [report.file for report in reports]
     if names == sorted(names) != sorted(names, key=number_key):
         remarks.append(TEXT_ORDER)
-    warned = [str(each) for each in issues.warnings if each.name not in known]
-    problems = [*map(str, issues.errors), *warned, *_copies(issues), *_unlisted(folder, set(names))]
+    problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, set(names))]
     readable = not issues.errors and all(each.readable for each in reports)
     report = CaptureReport(readable, tuple(reports), tuple(problems), tuple(remarks))
-    return report, impacts if readable else None
+    return report, impacts if readable else None, issues.warnings
 
 
 def _walk(folder: Path, settings: CaptureSettings, issues: Issues) -> tuple[Impacts | None, Surface | None]:

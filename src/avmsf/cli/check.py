@@ -94,7 +94,7 @@ def run(options: Options) -> int:
     doing(f"reading {options.capture}")
     visual = inputs(options.capture)
     proposals, wrong = _propose(options, visual)
-    report, impacts = check_and_read(options.capture, known=[each.key for each in proposals])
+    report, impacts, warned = check_and_read(options.capture)
     doing("finding the modes that align the recordings")
     modes = None
     with suppress(ExtractionError):
@@ -107,7 +107,11 @@ def run(options: Options) -> int:
     if visual is not None:
         problems += [*visual.problems, *visual.unused, *map(str, wrong)]
         lines.append(visual.sentence)
-    lines += problems
+    # A unit that is proposed is one problem, whatever else says that it is wrong.
+    units = [] if options.write_settings else [each for each in proposals if each.key in _UNITS]
+    of_units = {str(each) for each in [*warned, *wrong] if units and each.name in _UNITS}
+    said = {str(each) for each in warned} & of_units
+    lines += [each for each in problems if each not in said]
     if not options.write_settings:
         lines += [f"proposed: {each.line} (--write-settings writes it). {each.reason}" for each in proposals]
     elif not proposals:
@@ -129,7 +133,8 @@ def run(options: Options) -> int:
     lines = [*report.remarks, *(aligned.sentences() if aligned else ())]
     if modes is None:
         lines = ["no mode was found to align the recordings: noisy or too short (see avmsf modes)"]
-    count = len(problems) + (modes is None) + (0 if aligned is None else len(aligned.warnings()))
+    count = sum(each not in of_units for each in problems) + bool(units) + (modes is None)
+    count += 0 if aligned is None else len(aligned.warnings())
     show("\n".join([*lines, f"readable, with {counted(count, 'warning')}" if count else "no problem found"]))
     fitted = visual is not None and visual.reconstructs
     if _lead_to_settings(options, [each for each in proposals if each.key in _UNITS]):
