@@ -1,5 +1,6 @@
 """`avmsf check`: what each recording of a capture is worth, what a dataset holds, and what is wrong."""
 
+import shlex
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from avmsf._utils.text import counted
 from avmsf.capture.settings import SETTINGS, TABLE, settings_of
 from avmsf.capture.table import read_rows
 from avmsf.cli.options import Common, Flag
-from avmsf.cli.output import decimals, doing, next_command, print_json, say, show, table
+from avmsf.cli.output import decimals, doing, next_command, next_step, print_json, say, show, table
 from avmsf.cli.paths import ContactData, Existing
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, ExtractionError
@@ -128,7 +129,8 @@ def run(options: Options) -> int:
     )
     if not report.readable:
         say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again", always=True)
-        _lead_to_settings(options, proposals)
+        if proposals and not options.write_settings:
+            next_step(_next_command(options, proposals, visual, wrong))
         return UNREADABLE
     lines = [*report.remarks, *(aligned.sentences() if aligned else ())]
     if modes is None:
@@ -136,13 +138,7 @@ def run(options: Options) -> int:
     count = sum(each not in of_units for each in problems) + bool(units) + (modes is None)
     count += 0 if aligned is None else len(aligned.warnings())
     show("\n".join([*lines, f"readable, with {counted(count, 'warning')}" if count else "no problem found"]))
-    fitted = visual is not None and visual.reconstructs
-    if _lead_to_settings(options, [each for each in proposals if each.key in _UNITS]):
-        pass
-    elif fitted and any(isinstance(each, AvmsfError) for each in wrong):
-        next_command("correct what is said of the photographs, then avmsf check", options.capture)
-    else:
-        next_command(f"avmsf {'fit' if fitted else 'modes'}", options.capture, "-o field.safetensors" if fitted else "")
+    next_step(_next_command(options, units, visual, wrong))
     return 0
 
 
@@ -164,17 +160,23 @@ def _propose(
     return proposals, wrong
 
 
-def _lead_to_settings(options: Options, proposals: "Sequence[Proposal]") -> bool:
-    """Say how proposals that are needed are written, and return whether there are any that are not."""
-    if not proposals or options.write_settings:
-        return False
-    if (path := options.capture / SETTINGS).exists():
-        next_command(
-            f"add {' and '.join(each.line for each in proposals)} to {path}, then avmsf check", options.capture
-        )
-    else:
-        next_command("avmsf check", options.capture, "--write-settings")
-    return True
+def _next_command(
+    options: Options,
+    needed: "Sequence[Proposal]",
+    visual: "VisualInputs | None",
+    wrong: "Sequence[AvmsfWarning | AvmsfError]",
+) -> str:
+    """Return what is to do next: set what is needed, correct what is wrong with photographs, or go on."""
+    capture, path = shlex.quote(str(options.capture)), options.capture / SETTINGS
+    if needed and path.exists():
+        return f"add {' and '.join(each.line for each in needed)} to {path}, then avmsf check {capture}"
+    if needed:
+        return f"avmsf check {capture} --write-settings"
+    if visual is None or not visual.reconstructs:
+        return f"avmsf modes {capture}"
+    if any(isinstance(each, AvmsfError) for each in wrong):
+        return f"correct what is said of the photographs, then avmsf check {capture}"
+    return f"avmsf fit {capture} -o field.safetensors"
 
 
 def _table(report: "CaptureReport", title: str, aligned: "AlignmentReport | None") -> str:
