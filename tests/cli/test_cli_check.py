@@ -85,6 +85,15 @@ def test_what_is_said_of_channels_is_what_can_be_done(tmp_path, capsys, replace,
     assert [each for each in silent_words if each in said] == []
 
 
+def test_each_file_is_named_with_its_error_where_nothing_is_measured(tmp_path: Path, capsys: Streams) -> None:
+    folder = fill(tmp_path, sounds={f"{number}.wav": ring(seed=number) for number in range(6)})
+    for path in folder.glob("*.wav"):
+        path.write_bytes(b"no sound")
+    assert main(["check", str(folder)]) == 2
+    out = capsys.readouterr().out
+    assert [out.count(f"{number}.wav") for number in range(6)] == [1] * 6
+
+
 def fill_five(folder: Path, *, own_phases: int | None = None) -> Path:
     """Write recordings of five modes with the impact after .1 s and some samples; one may have phases of its own."""
     generator = np.random.default_rng(1)

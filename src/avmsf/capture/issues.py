@@ -67,8 +67,8 @@ class Issues:
             self.errors += [] if recordings else [error]
 
 
-def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
-    """Return the recordings' problems, each with its file; common ones once, with the first names."""
+def shared_problems(reports: Sequence[RecordingReport], *, most: int = 3) -> list[str]:
+    """Return the recordings' problems, each with its file; common ones once, with the first names, `most` of them."""
     places: dict[str, list[str]] = {}
     for report in reports:
         for problem in report.problems:
@@ -77,7 +77,7 @@ def shared_problems(reports: Sequence[RecordingReport]) -> list[str]:
     for problem, files in places.items():
         where = f"{files[0]}: "
         if len(files) > 1:
-            where = f"{len(files)} recordings ({listed(files, most=3)}): "
+            where = f"{len(files)} recordings ({listed(files, most=most)}): "
         # Errors of the table's reader say which rows they are about.
         sentences.append(problem if problem.startswith(TABLE) else f"{where}{problem}")
     return sentences

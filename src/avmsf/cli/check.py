@@ -101,9 +101,10 @@ def run(options: Options) -> int:
     with suppress(ExtractionError):
         modes = None if impacts is None else extract_modes(impacts, HighResolution(modes=_STRONGEST))
     aligned = None if modes is None or impacts is None else AlignmentReport.of(modes, impacts)
-    # The folder's first, then the recordings', common ones once.
-    problems = [*report.problems, *shared_problems(report.recordings)]
     measured = any(each.seconds is not None for each in report.recordings)
+    # The folder's first, then the recordings', common ones once; with the names of all where no table shows them.
+    most = 3 if measured else len(report.recordings)
+    problems = [*report.problems, *shared_problems(report.recordings, most=most)]
     lines = [_table(report, str(options.capture), aligned)] if measured else []
     if visual is not None:
         problems += [*visual.problems, *visual.unused, *map(str, wrong)]
