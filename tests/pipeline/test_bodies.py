@@ -310,9 +310,13 @@ def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
 
 
 def test_walls_that_cannot_be_had_are_left_out() -> None:
-    found = CandidateBodies(Cup(most=0.01, thickness_range=(0.009, 0.018)), count=4, dofs=2000)
+    messages: list[str] = []
+    cup = Cup(most=0.01, thickness_range=(0.009, 0.018))
+    found = CandidateBodies(cup, count=4, dofs=2000, log=messages.append)
     assert [body.thickness for body in found.bodies] == [None, pytest.approx(0.009)]
-    assert found.with_thicknesses(found.bodies[1], [0.011]) == [None]
+    assert found.with_thicknesses(found.bodies[1], [0.012, 0.011]) == [None, None]
+    # In the order of the thicknesses, whichever thread ends first.
+    assert [each.partition(": ")[2].partition(":")[0] for each in messages[-2:]] == ["wall of 12 mm", "wall of 11 mm"]
 
 
 def test_a_wall_thinner_than_tetrahedra_follow_is_refused_before_they_are_made(monkeypatch) -> None:

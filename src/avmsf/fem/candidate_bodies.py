@@ -230,17 +230,22 @@ class CandidateBodies:
     def with_thicknesses(self, body: CandidateBody, thicknesses: Sequence[float]) -> list[CandidateBody | None]:
         """Return bodies like another with walls so thick, meters, coarse as of several; None where that fails.
 
-        `log` is called with the reason.
+        `log` is called with the reasons, in the order of the thicknesses.
         """
+        refused: dict[float, SimulationError | MemoryError] = {}
 
         def make(thickness: float) -> CandidateBody | None:
             try:
                 return self._body(thickness, body.closed, fine=False)
             except (SimulationError, MemoryError) as error:
-                self._log_refused(f"{body_name(thickness, closed=body.closed)}: {error}")
+                refused[thickness] = error
                 return None
 
-        return _side_by_side(make, thicknesses)
+        made = _side_by_side(make, thicknesses)
+        for each in thicknesses:
+            if each in refused:
+                self._log_refused(f"{body_name(each, closed=body.closed)}: {refused[each]}")
+        return made
 
     def _log_refused(self, reason: str) -> None:
         """Log why a body cannot be had, where there are others; without an error's name and advice."""
