@@ -295,9 +295,10 @@ class CandidateBodies:
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
         name, make = body_name(thickness), partial(self.modes, thickness, dofs=COARSE_DOFS, perturbed=False)
         with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(1) as pool:
-            check = pool.submit(self._attempt, f"{name}: mesh convergence not checked", make)
+            check = pool.submit(make)
             modes = self.modes(thickness)
-        if (coarse := check.result()) is None or (error := _frequency_error(coarse, modes)) <= MAX_FREQUENCY_ERROR:
+        coarse = self._attempt(f"{name}: mesh convergence not checked", check.result)
+        if coarse is None or (error := _frequency_error(coarse, modes)) <= MAX_FREQUENCY_ERROR:
             return modes
         finer = self._attempt(f"{name}: no finer mesh", partial(self.modes, thickness, dofs=2 * self.dofs))
         if finer is not None:
