@@ -25,7 +25,7 @@ from avmsf.evaluation.methods import FieldMethod, FunctionMethod, method_named
 from avmsf.evaluation.modal_metrics import compare_modes, truth_at
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.plan import Evaluation
-from avmsf.evaluation.registry import PROTOCOLS, MetricSettings
+from avmsf.evaluation.registry import METRICS, PROTOCOLS, MetricSettings
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import CaseRun, ObjectData, Progress, run_objects
@@ -205,6 +205,12 @@ def test_results_of_different_evaluations_are_not_mixed(plates, tmp_path, monkey
     for name, (evaluation, value) in others.items():
         with raises(EvaluationError, file=results.path, name=name, value=value):
             run_objects(evaluation, ("a",), results)
+    monkeypatch.setitem(METRICS, "peak", METRICS["l1"])
+    monkeypatch.delitem(METRICS, "umap")
+    with raises(EvaluationError, file=results.path, name="columns", value=held["columns"]) as caught:
+        run_objects(plan, ("a",), results)
+    assert "metrics, got those without peak and with umap" in str(caught.value)
+    monkeypatch.undo()
     monkeypatch.setattr("avmsf.evaluation.plan.source_digest", lambda module: "of other code")
     with raises(EvaluationError, file=results.path, name="source", value=held["source"]):
         run_objects(plan, ("a",), results)

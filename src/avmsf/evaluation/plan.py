@@ -66,7 +66,7 @@ class Evaluation:
             "seed": self.inputs.seed,
             "time_zero": self.time_zero,
             "metrics": _plain(self.metric_settings),
-            "columns": list(METRICS),
+            "columns": sorted(METRICS),
             "modes": _plain(self.finder),
             "settings": dict(self.settings),
         }
