@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from avmsf.cli import main
+from avmsf.cli.evaluate import FAILED
 from avmsf.evaluation.registry import METRICS
 from avmsf.evaluation.report import SUMMARY
 from avmsf.simulate.recipe import ABLATED, SIM20
@@ -56,7 +57,7 @@ def _evaluate(
             code = main(words)
         if code > 128:
             raise KeyboardInterrupt
-        if code:
+        if code not in (0, FAILED):
             raise RuntimeError(f"avmsf {' '.join(words)} ended with {code}")
         summary = json.loads((output / SUMMARY).read_text(encoding="utf-8"))
     if summary["failures"]:

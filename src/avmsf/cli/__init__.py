@@ -53,8 +53,9 @@ _WIDEST = 120
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb and return its exit code: 0, 2 for input that cannot be used, 130 after Ctrl-C, 143 after SIGTERM.
+    """Run one verb and return its exit code.
 
+    It is 0, 1 where methods of `evaluate` failed, 2 for input that cannot be used, 130 after Ctrl-C, 143 after SIGTERM.
     Raises SystemExit(0), as command lines do, for a verb's help.
     """
     for name in ("stdout", "stderr"):

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from avmsf.evaluation.tables import Section
     from avmsf.evaluation.task import Method
 
+FAILED = 1
+"""The exit code where methods or objects failed and others have results."""
 _SHOWN = 5
 """Failures that are printed; the report lists all."""
 _Names = Annotated[tuple[str, ...], arg("NAMES")]
@@ -169,7 +171,7 @@ def run(options: Options) -> int:
     summary, parts = write(), write_page(results)
     _print_results(folder, summary, parts, write_figures(results) if options.figures else [])
     next_command(f"avmsf evaluate {'farthest' if protocol.name == 'shots' else 'shots'}", options.data)
-    return 0
+    return FAILED if summary["failures"] else 0
 
 
 def _print_results(
