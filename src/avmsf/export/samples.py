@@ -114,15 +114,21 @@ def write_grid(
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in ordered]
     remarks.append(f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB")
-    background = len(rows) * float((field.average_force * field.noise[:samples]).double().square().sum())
-    loudest = float(rendered[-1][1].double().square().sum())
-    if field.background_force is not None and loudest < 2 * background:
-        known = f"an average recorded impact has {field.average_force:.3g}"
-        remarks.append(f"the recordings' background is louder than all layers: {known}; or leave the noise out")
+    remarks += _on_background(field, rendered[-1][1])
     if ordered != list(layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)
         remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
     return Written(write_folder(Path(folder), files, manifest, overwrite=overwrite), tuple(remarks))
+
+
+def _on_background(field: SampledField, sounds: Float32[Tensor, "rows samples"]) -> list[str]:
+    """Return a remark where the background makes up most of the loudest layer's energy."""
+    noise = field.average_force * field.noise[: sounds.shape[1]].double()
+    background = len(sounds) * float(noise.square().sum())
+    if field.background_force is None or float(sounds.double().square().sum()) >= 2 * background:
+        return []
+    known = f"an average recorded impact has {field.average_force:.3g}"
+    return [f"the recordings' background is louder than all layers: {known}; or leave the noise out"]
 
 
 def _check(
