@@ -84,8 +84,7 @@ def write_grid(
     rendered = []
     for layer in layers:
         pulse = ForcePulse(layer.contact_time, layer.shape)
-        sounds = field.render(rows, force=layer.force, samples=samples, pulse=pulse)
-        rendered.append((layer, sounds))
+        rendered.append((layer, field.render(rows, force=layer.force, samples=samples, pulse=pulse)))
     # From soft to loud; equally loud ones stay in order.
     rendered.sort(key=lambda each: float(each[1].double().square().sum()))
     ordered = [layer for layer, _ in rendered]
