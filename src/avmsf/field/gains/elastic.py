@@ -98,6 +98,8 @@ class Elastic(KernelFamily):
         self._along = lru_cache(maxsize=3)(lambda sites: self.modes.gains(sites.points, sites.directions))
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
+        half = (len(modes) + 1) // 2
+        self._growth = math.log(len(modes) / half) / max(float(apart[-1, half - 1]), _MARGIN)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
         profiles += [torch.exp(-0.5 * (apart / width).square()) + _FAR for width in WIDTHS]
         profile, diagonal = torch.stack(profiles), self._along(reference).square().T
@@ -187,13 +189,22 @@ class Elastic(KernelFamily):
 
     def match(
         self, log_frequency: Float64[Tensor, " modes"], modes: Int[Tensor, " some"] | None = None
-    ) -> Float64[Tensor, "pairs shapes some"]:
-        """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes."""
+    ) -> Float64[Tensor, "pairs shapes+1 some"]:
+        """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes.
+
+        The last row is for all shapes above the computed ones together.
+        """
         chosen = log_frequency if modes is None else log_frequency[modes]
         densities = torch.stack(list(self._densities(self.frequency_factors, chosen, log_frequency)), dim=1)
         # A mode has its body's error or, as an exception, any.
         exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
-        return torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception).flatten(0, 1)
+        known = torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception).flatten(0, 1)
+        low, high = _range(log_frequency)
+        inside, further, above = self._counts(self.frequency_factors, low, high)
+        # Uniform between the highest computed shape and the highest measured mode.
+        share = torch.log(further / (inside + further) * (high - low) / above.clamp_min(_MARGIN))[:, None]
+        beyond = torch.where(chosen > high - above[:, None], share, -torch.inf)
+        return torch.cat([known, beyond.repeat_interleave(len(FREQUENCY_ERRORS), 0)[:, None]], dim=1)
 
     def _densities(
         self,
@@ -202,18 +213,35 @@ class Elastic(KernelFamily):
         measured: Float64[Tensor, " modes"],
     ) -> Iterator[Float64[Tensor, "factors shapes some"]]:
         """Yield for each error the log probability of each shape times the density of a log frequency if it is that."""
-        # Shapes within the range of the measured modes are equally probable.
-        low, high = float(measured.min()) - _MARGIN, float(measured.max()) + _MARGIN
+        # Shapes within the range of the measured modes are equally probable, those above the computed ones too.
+        low, high = _range(measured)
         nominal = torch.log(factors[:, None] * self.modes.frequency)
-        inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
-        constant = (math.log(high - low) - inside.log())[:, None, None]
+        inside, further, _ = self._counts(factors, low, high)
+        constant = (math.log(high - low) - (inside + further).log())[:, None, None]
         square = (log_frequency - nominal[..., None]).square_()
         for error in FREQUENCY_ERRORS:
             yield square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
 
+    def _counts(
+        self, factors: Float64[Tensor, " factors"], low: float, high: float
+    ) -> tuple[Float64[Tensor, " factors"], Float64[Tensor, " factors"], Float64[Tensor, " factors"]]:
+        """Return the numbers of computed shapes and of those above them between two log frequencies.
+
+        Last how far the highest computed shape lies below the higher one. The number of shapes below a frequency grows
+        with a power of it: that of the upper half of the computed ones.
+        """
+        nominal = torch.log(factors[:, None] * self.modes.frequency)
+        inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
+        above = (high - nominal[:, -1]).clamp_min(0.0)
+        return inside, nominal.shape[1] * torch.expm1(self._growth * above), above
+
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:
         return self.frequency_weights.reshape(-1, len(FACTORS), len(FREQUENCY_ERRORS)).sum(2)
+
+
+def _range(log_frequency: Float64[Tensor, " modes"]) -> tuple[float, float]:
+    return float(log_frequency.min()) - _MARGIN, float(log_frequency.max()) + _MARGIN
 
 
 def frequency_log_prior(units: int = 1) -> Float64[Tensor, " pairs"]:

@@ -190,7 +190,8 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
     for each in families:
         if isinstance(each.family, Elastic):
             density = each.family.match(torch.log(measured.frequency), rows)
-            single = torch.logsumexp(density + _shape(each, each.family)[:, rows], dim=1)
+            shape = torch.cat([_shape(each, each.family)[:, rows], unknown[None, rows]])
+            single = torch.logsumexp(density + shape, dim=1)
             both = torch.logaddexp(single, unknown[rows])
             each.family.frequency_weights = torch.softmax(both.sum(1) + each.family.factor_log_prior, dim=0)
 
