@@ -203,8 +203,7 @@ class SoundField:
         Both as energy over all modes: 0 is certainty; places that may be louder than the mean can have more than 1.
         Points off the object give no warning. Raises as `fitted_mixture`.
         """
-        places = as_vectors(points, "positions")
-        expect_near(places, self.gain_field.points)
+        places = self._near(points, "positions")
         _, surface = self.fitted_mixture, self.gain_field.points
         step = max(1, len(surface) // _MAX_MAPPED_POINTS)
         energy = self.energy(self.gain_field.predict(surface[::step]).parts).mean()
@@ -241,7 +240,7 @@ class SoundField:
 
     def known(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Gains:
         """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings."""
-        places = as_vectors(contacts, "contacts")
+        places = self._near(contacts, "contacts")
         ways = None if directions is None else as_directions(directions, "directions", count=len(places))
         with torch.no_grad():
             return self.gain_field.point_estimate(places, ways)
@@ -304,12 +303,17 @@ class SoundField:
             background = missing_background(given / average, NEIGHBORS) * background
         return sounds + background if forces is None else given * sounds + average * background
 
+    def _near(self, positions: ArrayLike, name: str) -> Float[Tensor, "positions 3"]:
+        """Return positions as a tensor. Raises PositionError for one far from the object."""
+        places = as_vectors(positions, name)
+        expect_near(places, self.gain_field.points)
+        return places
+
     def _impacts(
         self, positions: ArrayLike, directions: ArrayLike | None
     ) -> tuple[Float[Tensor, "contacts 3"], Float[Tensor, "contacts 3"] | None]:
         """Return positions and directions as tensors. Warns of positions off the object."""
-        contacts = as_vectors(positions, "positions")
-        expect_near(contacts, self.gain_field.points)
+        contacts = self._near(positions, "positions")
         off = off_surface(contacts, self.gain_field)
         if off:
             row, distance = max(off, key=lambda each: each[1])
