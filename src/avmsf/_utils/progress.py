@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 LINE_SECONDS = 60.0
-"""After so long without a line of several objects one says what is being done."""
+"""After so long without a line one says what is being done."""
 
 
 def _ignore(*values: object) -> None:
@@ -36,7 +36,8 @@ class ProgressListener:
 class ProgressDisplay:
     """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready.
 
-    A notebook counts as a terminal. Where no line moves, one says when a stage begins.
+    A notebook counts as a terminal. Where no line moves, one says when a stage begins, and each minute without any
+    what is being done.
     """
 
     def __init__(self, *, shown: bool = True, verbose: bool = False) -> None:
@@ -45,6 +46,7 @@ class ProgressDisplay:
         self._bar: Progress | None = None
         self._shown: tuple[str, TaskID] | None = None
         self._begun: str | None = None
+        self._printed = time.monotonic()
 
     def __enter__(self) -> "ProgressDisplay":
         return self
@@ -60,6 +62,7 @@ class ProgressDisplay:
     def say(self, text: str, *, always: bool = False) -> None:
         """Print a line on what is done, if they are shown; with `always`, which errors are, even then."""
         self.close()
+        self._printed = time.monotonic()
         if always or self.shown:
             print(printable(text), file=sys.stderr, flush=True)
 
@@ -69,7 +72,7 @@ class ProgressDisplay:
 
     def doing(self, text: str) -> None:
         """Show what begins."""
-        if self.verbose:
+        if self.verbose or self._silent:
             self.say(text)
         self._show(text, text, 0, None)
 
@@ -84,7 +87,10 @@ class ProgressDisplay:
 
     def step(self, stage: str, done: int, total: int, message: str) -> None:
         """Show how many steps of a stage are done, and a message on the last one."""
-        self._show(stage, f"{stage}: {message}" if message else stage, done, total)
+        text = f"{stage}: {message}" if message else stage
+        if self._silent:
+            self.say(f"{text} ({done} of {total})")
+        self._show(stage, text, done, total)
 
     def ready(self, name: str, seconds: float | None) -> None:
         """Print that a stage is ready, with its time on the right."""
@@ -96,16 +102,13 @@ class ProgressDisplay:
         When one is done it calls `after_each` and prints a line, and another after a minute without one.
         """
         finished, begun = 0, time.monotonic()
-        printed = begun
 
         def show(message: str, done: int, total: int) -> None:
-            nonlocal finished, printed
-            now = time.monotonic()
+            nonlocal finished
             if done > finished:
                 after_each()
-            if done > finished or now - printed >= LINE_SECONDS:
-                self.say(f"{message} ({done} of {total}, {now - begun:.0f} s)")
-                printed = now
+            if done > finished or self._idle:
+                self.say(f"{message} ({done} of {total}, {time.monotonic() - begun:.0f} s)")
             finished = done
             self._show("objects", message, done, total)
 
@@ -120,6 +123,16 @@ class ProgressDisplay:
     def _moves(self) -> bool:
         """Whether the standard error shows a line that moves."""
         return sys.stderr.isatty() or "ipykernel" in sys.modules
+
+    @property
+    def _idle(self) -> bool:
+        """Whether no line was printed for long."""
+        return time.monotonic() - self._printed >= LINE_SECONDS
+
+    @property
+    def _silent(self) -> bool:
+        """Whether no line was printed for long and none moves."""
+        return self._idle and not self._moves
 
     def _show(self, stage: str, text: str, done: int, total: int | None) -> None:
         if not self.shown or not self._moves:
