@@ -147,10 +147,7 @@ def test_all_modes_together_tell_how_exact_the_frequencies_are(scatter, expected
 
 
 def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
-    """Half of the modes have the body's error, the others any; over a uniform density, .1 wider at both ends.
-
-    Shapes above the six computed ones count, which grow in number as from the third to the sixth.
-    """
+    """Half of the modes have the body's error, the others any; over a uniform density, .1 wider at both ends."""
     given, measured_modes = family(3), torch.log(plate().frequency * 1.03)
     weights = draw(len(FACTORS) * len(FREQUENCY_ERRORS), seed=3) + 0.5
     given.frequency_weights = weights / weights.sum()
@@ -159,7 +156,6 @@ def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
     for factor, each in zip(FACTORS.log(), given.frequency_weights.reshape(len(FACTORS), -1), strict=True):
         center = (factor + torch.log(plate().frequency)).numpy()
         inside = max(((center > low) & (center < high)).sum(), 1)
-        inside += SHAPES * (2.0 ** (max(high - center[-1], 0.0) / (center[-1] - center[2])) - 1.0)
         for error, weight in zip(FREQUENCY_ERRORS, 0.5 * each + 0.5 * each.mean(), strict=True):
             density = norm.pdf(measured_modes.numpy(), center[:, None], error)
             expected += float(weight) * density * (high - low) / inside

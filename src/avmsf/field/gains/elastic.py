@@ -192,19 +192,23 @@ class Elastic(KernelFamily):
     ) -> Float64[Tensor, "pairs shapes+1 some"]:
         """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes.
 
-        The last row is for all shapes above the computed ones together.
+        A mode may also be a shape above the computed ones, which share the last row. Their number below a frequency
+        grows with a power of it: that of the upper half of the computed ones.
         """
         chosen = log_frequency if modes is None else log_frequency[modes]
         densities = torch.stack(list(self._densities(self.frequency_factors, chosen, log_frequency)), dim=1)
         # A mode has its body's error or, as an exception, any.
         exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
-        known = torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception).flatten(0, 1)
+        known = torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception)
         low, high = _range(log_frequency)
-        inside, further, above = self._counts(self.frequency_factors, low, high)
-        # Uniform between the highest computed shape and the highest measured mode.
-        share = torch.log(further / (inside + further) * (high - low) / above.clamp_min(_MARGIN))[:, None]
-        beyond = torch.where(chosen > high - above[:, None], share, -torch.inf)
-        return torch.cat([known, beyond.repeat_interleave(len(FREQUENCY_ERRORS), 0)[:, None]], dim=1)
+        top = torch.log(self.frequency_factors * self.modes.frequency[-1])[:, None]
+        inside = self._inside(self.frequency_factors, low, high)[:, None]
+        total = inside + len(self.modes) * torch.expm1(self._growth * (high - top).clamp_min(0.0))
+        # The derivative of the number of shapes below a frequency, over what a uniform density has.
+        density = torch.log(self._growth * len(self.modes) * (high - low) / total) + self._growth * (chosen - top)
+        beyond = torch.where(chosen > top, density, -torch.inf)[:, None, None]
+        rows = [known + (inside / total).log()[..., None, None], beyond.expand(-1, len(FREQUENCY_ERRORS), -1, -1)]
+        return torch.cat(rows, dim=2).flatten(0, 1)
 
     def _densities(
         self,
@@ -213,27 +217,18 @@ class Elastic(KernelFamily):
         measured: Float64[Tensor, " modes"],
     ) -> Iterator[Float64[Tensor, "factors shapes some"]]:
         """Yield for each error the log probability of each shape times the density of a log frequency if it is that."""
-        # Shapes within the range of the measured modes are equally probable, those above the computed ones too.
+        # Shapes within the range of the measured modes are equally probable.
         low, high = _range(measured)
         nominal = torch.log(factors[:, None] * self.modes.frequency)
-        inside, further, _ = self._counts(factors, low, high)
-        constant = (math.log(high - low) - (inside + further).log())[:, None, None]
+        constant = (math.log(high - low) - self._inside(factors, low, high).log())[:, None, None]
         square = (log_frequency - nominal[..., None]).square_()
         for error in FREQUENCY_ERRORS:
             yield square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
 
-    def _counts(
-        self, factors: Float64[Tensor, " factors"], low: float, high: float
-    ) -> tuple[Float64[Tensor, " factors"], Float64[Tensor, " factors"], Float64[Tensor, " factors"]]:
-        """Return the numbers of computed shapes and of those above them between two log frequencies.
-
-        Last how far the highest computed shape lies below the higher one. The number of shapes below a frequency grows
-        with a power of it: that of the upper half of the computed ones.
-        """
+    def _inside(self, factors: Float64[Tensor, " factors"], low: float, high: float) -> Float64[Tensor, " factors"]:
+        """Return the number of computed shapes between two log frequencies, at least 1."""
         nominal = torch.log(factors[:, None] * self.modes.frequency)
-        inside = ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
-        above = (high - nominal[:, -1]).clamp_min(0.0)
-        return inside, nominal.shape[1] * torch.expm1(self._growth * above), above
+        return ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
 
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:
