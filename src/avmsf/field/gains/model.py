@@ -156,9 +156,12 @@ def expect_near(
 ) -> None:
     """Raise PositionError for a position farther outside the box of an object's points than the object is large.
 
-    Such a position counts another unit, or is in another frame. `label` says where a row's position was given.
+    Such a position counts another unit, or is in another frame. `label` says where a row's position was given. Of an
+    object without points no position is.
     """
     places, known = positions.double(), points.detach().cpu().double()
+    if not len(known):
+        return
     low, high = known.amin(0), known.amax(0)
     size = float((high - low).norm())
     outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
