@@ -224,7 +224,7 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         (lambda: field().render([CONTACT], forces=-5), ArrayError, {"name": "forces", "row": 0, "value": -5.0}),
         (lambda: field().render(AWAY), PositionError, {"row": 1}),
         (lambda: field().relative_gain_std(AWAY), PositionError, {"row": 1}),
-        (lambda: field().known(AWAY), PositionError, {"row": 1}),
+        (lambda: field().known(AWAY), PositionError, {"name": "contacts", "row": 1}),
         (lambda: field().render([CONTACT], samples=-1), AvmsfError, {"name": "samples", "value": -1}),
         (lambda: field().render([CONTACT], samples=2.5), AvmsfError, {"name": "samples", "value": 2.5}),
         (lambda: impacts_of(sounds=capture().impacts.sounds[:3]), ArrayError, {"name": "sounds"}),

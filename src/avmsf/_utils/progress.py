@@ -36,8 +36,8 @@ class ProgressListener:
 class ProgressDisplay:
     """Progress on the standard error: a line that moves on a terminal, and everywhere a line when a stage is ready.
 
-    A notebook counts as a terminal. Where no line moves, one says when a stage begins, and each minute without any
-    what is being done.
+    A notebook counts as a terminal. Where no line moves, one says when a stage begins, and what is done whenever
+    something is reported after a minute without a line.
     """
 
     def __init__(self, *, shown: bool = True, verbose: bool = False) -> None:

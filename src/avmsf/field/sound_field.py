@@ -239,7 +239,10 @@ class SoundField:
         return self._amplitudes(self.known(places, directions=ways))
 
     def known(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Gains:
-        """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings."""
+        """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings.
+
+        Contacts, directions and unit as in `gains`. Raises PositionError for a contact far from the object.
+        """
         places = self._near(contacts, "contacts")
         ways = None if directions is None else as_directions(directions, "directions", count=len(places))
         with torch.no_grad():
@@ -306,7 +309,7 @@ class SoundField:
     def _near(self, positions: ArrayLike, name: str) -> Float[Tensor, "positions 3"]:
         """Return positions as a tensor. Raises PositionError for one far from the object."""
         places = as_vectors(positions, name)
-        expect_near(places, self.gain_field.points)
+        expect_near(places, self.gain_field.points, name=name)
         return places
 
     def _impacts(

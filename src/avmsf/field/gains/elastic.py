@@ -60,6 +60,8 @@ _IMPROBABLE = 1e-6
 probabilities by less than a thousandth."""
 _MARGIN = 0.1
 """Log frequency by which the range of measured modes is widened at both ends."""
+_NARROWEST = 0.1
+"""Log frequency that the upper half of a body's shapes is taken to span at least, so that close ones say no more."""
 _LOWEST, _HIGHEST = (math.log(each) / FREQUENCY_ERRORS[0] for each in factor_range())
 FACTORS = torch.exp(torch.arange(math.ceil(_LOWEST), math.floor(_HIGHEST) + 1).double() * FREQUENCY_ERRORS[0])
 """Factors on the nominal frequencies that materials can have, in steps of the least error."""
@@ -98,8 +100,9 @@ class Elastic(KernelFamily):
         self._along = lru_cache(maxsize=3)(lambda sites: self.modes.gains(sites.points, sites.directions))
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
+        # The number of shapes below a frequency grows with a power of it: that of the upper half of these.
         half = (len(modes) + 1) // 2
-        self._growth = math.log(len(modes) / half) / max(float(apart[-1, half - 1]), _MARGIN)
+        self._growth = math.log(len(modes) / half) / max(float(apart[-1, half - 1]), _NARROWEST)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
         profiles += [torch.exp(-0.5 * (apart / width).square()) + _FAR for width in WIDTHS]
         profile, diagonal = torch.stack(profiles), self._along(reference).square().T
@@ -190,10 +193,12 @@ class Elastic(KernelFamily):
     def match(
         self, log_frequency: Float64[Tensor, " modes"], modes: Int[Tensor, " some"] | None = None
     ) -> Float64[Tensor, "pairs shapes+1 some"]:
-        """Return what `shape_log_prior` averages, for each pair of a factor and an error and all or some modes.
+        """Return the density of all or some modes for each pair of a factor and an error and each shape, as a log.
 
-        A mode may also be a shape above the computed ones, which share the last row. Their number below a frequency
-        grows with a power of it: that of the upper half of the computed ones.
+        It is what `shape_log_prior` averages, but that a mode may also be a shape above the computed ones, which share
+        the last row: without them a factor that brings all computed shapes below the modes would cost nothing. All
+        shapes within the range of the measured modes, computed or not, are equally probable. `log_frequency` is that
+        of frequencies in Hz.
         """
         chosen = log_frequency if modes is None else log_frequency[modes]
         densities = torch.stack(list(self._densities(self.frequency_factors, chosen, log_frequency)), dim=1)
@@ -203,8 +208,9 @@ class Elastic(KernelFamily):
         low, high = _range(log_frequency)
         top = torch.log(self.frequency_factors * self.modes.frequency[-1])[:, None]
         inside = self._inside(self.frequency_factors, low, high)[:, None]
-        total = inside + len(self.modes) * torch.expm1(self._growth * (high - top).clamp_min(0.0))
-        # The derivative of the number of shapes below a frequency, over what a uniform density has.
+        below = [len(self.modes) * torch.exp(self._growth * (each - top).clamp_min(0.0)) for each in (low, high)]
+        total = (inside + below[1] - below[0]).clamp_min(1.0)
+        # Of a log frequency, the derivative of the number of shapes below it, over a uniform density.
         density = torch.log(self._growth * len(self.modes) * (high - low) / total) + self._growth * (chosen - top)
         beyond = torch.where(chosen > top, density, -torch.inf)[:, None, None]
         rows = [known + (inside / total).log()[..., None, None], beyond.expand(-1, len(FREQUENCY_ERRORS), -1, -1)]
@@ -220,15 +226,15 @@ class Elastic(KernelFamily):
         # Shapes within the range of the measured modes are equally probable.
         low, high = _range(measured)
         nominal = torch.log(factors[:, None] * self.modes.frequency)
-        constant = (math.log(high - low) - self._inside(factors, low, high).log())[:, None, None]
+        constant = (math.log(high - low) - self._inside(factors, low, high).clamp_min(1.0).log())[:, None, None]
         square = (log_frequency - nominal[..., None]).square_()
         for error in FREQUENCY_ERRORS:
             yield square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
 
     def _inside(self, factors: Float64[Tensor, " factors"], low: float, high: float) -> Float64[Tensor, " factors"]:
-        """Return the number of computed shapes between two log frequencies, at least 1."""
+        """Return the number of computed shapes between two log frequencies."""
         nominal = torch.log(factors[:, None] * self.modes.frequency)
-        return ((nominal > low) & (nominal < high)).sum(1).clamp_min(1).double()
+        return ((nominal > low) & (nominal < high)).sum(1).double()
 
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:
@@ -236,6 +242,7 @@ class Elastic(KernelFamily):
 
 
 def _range(log_frequency: Float64[Tensor, " modes"]) -> tuple[float, float]:
+    """Return the ends of the range of measured modes, widened."""
     return float(log_frequency.min()) - _MARGIN, float(log_frequency.max()) + _MARGIN
 
 

@@ -152,12 +152,13 @@ class GainModel(ABC):
 def expect_near(
     positions: Float[Tensor, "contacts 3"],
     points: Float[Tensor, "points 3"],
-    label: Callable[[int], str] = "positions, row {}".format,
+    label: Callable[[int], str] | None = None,
+    name: str = "positions",
 ) -> None:
     """Raise PositionError for a position farther outside the box of an object's points than the object is large.
 
-    Such a position counts another unit, or is in another frame. `label` says where a row's position was given. Of an
-    object without points no position is.
+    Such a position counts another unit, or is in another frame. Of an object without points nothing is refused. `label`
+    says where a row's position was given, by default by their `name`.
     """
     places, known = positions.double(), points.detach().cpu().double()
     if not len(known):
@@ -169,10 +170,11 @@ def expect_near(
     if len(far):
         found = places[row := int(far[0])].tolist()
         where = ", ".join(f"{value:.4g}" for value in found)
+        given = f"{name}, row {row}" if label is None else label(row)
         raise PositionError(
-            f"{label(row)}: expected positions on the object, in meters, got ({where}), "
+            f"{given}: expected positions on the object, in meters, got ({where}), "
             f"{float(outside[row]):.3g} m outside an object {size:.3g} m across; check the unit and the frame",
-            name="positions", row=row, value=found,
+            name=name, row=row, value=found,
         )  # fmt: skip
 
 
