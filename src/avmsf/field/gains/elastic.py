@@ -192,7 +192,7 @@ class Elastic(KernelFamily):
 
     def match(
         self, log_frequency: Float64[Tensor, " modes"], modes: Int[Tensor, " some"] | None = None
-    ) -> Float64[Tensor, "pairs shapes+1 some"]:
+    ) -> Float64[Tensor, "pairs rows some"]:
         """Return the density of all or some modes for each pair of a factor and an error and each shape, as a log.
 
         It is what `shape_log_prior` averages, but that a mode may also be a shape above the computed ones, which share
