@@ -206,8 +206,8 @@ class Elastic(KernelFamily):
         exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
         known = torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception)
         low, high = _range(log_frequency)
-        top = torch.log(self.frequency_factors * self.modes.frequency[-1])[:, None]
-        inside = self._inside(self.frequency_factors, low, high)[:, None]
+        nominal = torch.log(self.frequency_factors[:, None] * self.modes.frequency)
+        top, inside = nominal[:, -1:], _inside(nominal, low, high)[:, None]
         below = [len(self.modes) * torch.exp(self._growth * (each - top).clamp_min(0.0)) for each in (low, high)]
         total = (inside + below[1] - below[0]).clamp_min(1.0)
         # Of a log frequency, the derivative of the number of shapes below it, over a uniform density.
@@ -226,19 +226,19 @@ class Elastic(KernelFamily):
         # Shapes within the range of the measured modes are equally probable.
         low, high = _range(measured)
         nominal = torch.log(factors[:, None] * self.modes.frequency)
-        constant = (math.log(high - low) - self._inside(factors, low, high).clamp_min(1.0).log())[:, None, None]
+        constant = (math.log(high - low) - _inside(nominal, low, high).clamp_min(1.0).log())[:, None, None]
         square = (log_frequency - nominal[..., None]).square_()
         for error in FREQUENCY_ERRORS:
             yield square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
 
-    def _inside(self, factors: Float64[Tensor, " factors"], low: float, high: float) -> Float64[Tensor, " factors"]:
-        """Return the number of computed shapes between two log frequencies."""
-        nominal = torch.log(factors[:, None] * self.modes.frequency)
-        return ((nominal > low) & (nominal < high)).sum(1).double()
-
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:
         return self.frequency_weights.reshape(-1, len(FACTORS), len(FREQUENCY_ERRORS)).sum(2)
+
+
+def _inside(nominal: Float64[Tensor, "factors shapes"], low: float, high: float) -> Float64[Tensor, " factors"]:
+    """Return the number of shapes between two log frequencies."""
+    return ((nominal > low) & (nominal < high)).sum(1).double()
 
 
 def _range(log_frequency: Float64[Tensor, " modes"]) -> tuple[float, float]:
