@@ -100,9 +100,9 @@ class Elastic(KernelFamily):
         self._along = lru_cache(maxsize=3)(lambda sites: self.modes.gains(sites.points, sites.directions))
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
-        # The number of shapes below a frequency grows with a power of it: that of the upper half of these.
+        # The number of shapes below a frequency grows with a power of it: that of the upper half of these, 0 for one.
         half = (len(modes) + 1) // 2
-        self._growth = math.log(len(modes) / half) / max(float(apart[-1, half - 1]), _NARROWEST)
+        self._growth = max(math.log(len(modes) / half), 1e-6) / max(float(apart[-1, half - 1]), _NARROWEST)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
         profiles += [torch.exp(-0.5 * (apart / width).square()) + _FAR for width in WIDTHS]
         profile, diagonal = torch.stack(profiles), self._along(reference).square().T
@@ -195,10 +195,11 @@ class Elastic(KernelFamily):
     ) -> Float64[Tensor, "pairs rows some"]:
         """Return the density of all or some modes for each pair of a factor and an error and each shape, as a log.
 
-        It is what `shape_log_prior` averages, but that a mode may also be a shape above the computed ones, which share
-        the last row: without them a factor that brings all computed shapes below the modes would cost nothing. All
-        shapes within the range of the measured modes, computed or not, are equally probable. `log_frequency` is that
-        of frequencies in Hz.
+        A mode may also be a shape above the computed ones, which share the last row: without them a factor that brings
+        all computed shapes below the modes would cost nothing. All shapes within the range of the measured modes,
+        computed or not, are equally probable. Densities are over that of modes that are no shapes: like the shapes
+        above, these are as dense at a frequency as the body's shapes, by a power law. `log_frequency` is that of
+        frequencies in Hz.
         """
         chosen = log_frequency if modes is None else log_frequency[modes]
         densities = torch.stack(list(self._densities(self.frequency_factors, chosen, log_frequency)), dim=1)
@@ -208,12 +209,13 @@ class Elastic(KernelFamily):
         low, high = _range(log_frequency)
         nominal = torch.log(self.frequency_factors[:, None] * self.modes.frequency)
         top, inside = nominal[:, -1:], _inside(nominal, low, high)[:, None]
-        below = [len(self.modes) * torch.exp(self._growth * (each - top).clamp_min(0.0)) for each in (low, high)]
-        total = (inside + below[1] - below[0]).clamp_min(1.0)
-        # Of a log frequency, the derivative of the number of shapes below it, over a uniform density.
-        density = torch.log(self._growth * len(self.modes) * (high - low) / total) + self._growth * (chosen - top)
-        beyond = torch.where(chosen > top, density, -torch.inf)[:, None, None]
-        rows = [known + (inside / total).log()[..., None, None], beyond.expand(-1, len(FREQUENCY_ERRORS), -1, -1)]
+        # Numbers of shapes below the ends by the law; only those above the computed ones follow it.
+        counts = len(self.modes) * torch.exp(self._growth * (torch.tensor([low, high], dtype=torch.float64) - top))
+        total = (inside + counts.clamp_min(len(self.modes)).diff(dim=1)).clamp_min(1.0)
+        reach = self._growth * (high - low)
+        law = self._growth * (chosen - high) + math.log(reach / -math.expm1(-reach))
+        beyond = torch.where(chosen > top, (counts.diff(dim=1) / total).log(), -torch.inf)[:, None, None]
+        rows = [known - law + (inside / total).log()[..., None, None], beyond.expand(-1, len(FREQUENCY_ERRORS), -1, -1)]
         return torch.cat(rows, dim=2).flatten(0, 1)
 
     def _densities(
