@@ -27,7 +27,7 @@ from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.recipe import ABLATED, SET
 from benchmarks import objects
-from benchmarks.ablation import ablation, outliers, supports
+from benchmarks.ablation import ablation, free, outliers, supports
 from benchmarks.processes import timed
 from benchmarks.records import Measurement, Record, Settings, means, records
 
@@ -226,5 +226,6 @@ PARTS: dict[str, Measurement] = {
     "ablation": ablation,
     "outliers": outliers,
     "supports": supports,
+    "free": free,
     "speed": _speed,
 }
