@@ -40,6 +40,8 @@ _GRACE = 3.0
 class _Processes:
     """Processes of this computer, new for each task, which is the end of its pipe; they end with this one."""
 
+    begun = "running"
+
     def __init__(self, count: int) -> None:
         self.count, self.processes = count, dict[connection.Connection, SpawnProcess]()
 
@@ -63,7 +65,7 @@ class _Processes:
             return pickle.loads(task.recv_bytes())
         except (EOFError, OSError):  # OSError: it ended while it answered.
             self.processes[task].join()
-            raise _ended_early(ending_of(self.processes[task].exitcode or 0)) from None
+            raise _ended_early(ending_of(self.processes[task].exitcode or 0), "with fewer --workers") from None
         finally:
             self.stop([task])
 
@@ -81,7 +83,7 @@ class _Processes:
 class _Cluster:
     """Processes of a ray cluster, which has a queue of its own, with the methods of `_Processes`."""
 
-    count = float("inf")
+    count, begun = float("inf"), "submitted"
 
     def __init__(self, ray: ModuleType) -> None:
         self.ray = ray
@@ -100,7 +102,7 @@ class _Cluster:
         except self.ray.exceptions.RayTaskError as error:  # Its process could not load what the task needs.
             return error.cause
         except self.ray.exceptions.RayError as error:
-            raise _ended_early(str(error).splitlines()[0]) from error
+            raise _ended_early(str(error).splitlines()[0], "on a cluster with fewer --num-cpus") from error
 
     def stop(self, tasks: Collection[Any]) -> None:
         for task in tasks:
@@ -108,7 +110,8 @@ class _Cluster:
 
 
 Workers = _Processes | _Cluster
-"""Where tasks run, each in a process on one thread; `count` tasks are begun before the first of them is done."""
+"""Where tasks run, each in a process on one thread; `count` tasks are begun before the first of them is done, and are
+then what `begun` says."""
 
 
 @contextmanager
@@ -157,7 +160,7 @@ def run_tasks(
                 running[workers.start(act, arguments[name])] = name, time.monotonic()
             longest = islice(running.values(), _NAMED)
             names = ", ".join(f"{name} for {time.monotonic() - begun:.0f} s" for name, begun in longest)
-            doing(f"running {names}{' and others' * (len(running) > _NAMED)}")
+            doing(f"{workers.begun} {names}{' and others' * (len(running) > _NAMED)}")
             for task in workers.wait(running):
                 name, _ = running.pop(task)
                 try:
@@ -202,8 +205,8 @@ def _outcome(act: Callable[[Argument], Result], argument: Argument) -> Result | 
         return error
 
 
-def _ended_early(by: str) -> WorkerError:
-    wanted, advice = "a process that finishes", "run the command again, with fewer --workers if memory ran out"
+def _ended_early(by: str, otherwise: str) -> WorkerError:
+    wanted, advice = "a process that finishes", f"run the command again, {otherwise} if memory ran out"
     return WorkerError.expected(
         wanted, by, got=f"ones that end early, {MAX_STARTS} in turn ({by})", name="worker", advice=advice
     )
