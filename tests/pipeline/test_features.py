@@ -76,6 +76,11 @@ def test_standardized_features_have_mean_zero_and_length_one() -> None:
     torch.testing.assert_close(features.features * (SAID - SAID.mean(0)).norm() / 300**0.5, SAID - SAID.mean(0))
 
 
+def test_components_are_not_standardized_as_well() -> None:
+    with raises(SceneError, name="standardize", value=32):
+        LiftConfig(standardize=True)
+
+
 def test_features_that_say_nothing_are_refused() -> None:
     for components in (0, 4):
         with raises(SceneError, name="made", value=300):

@@ -25,7 +25,7 @@ from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_publis
 from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.capture.filenames import files_in
-from avmsf.capture.impacts import Impacts, rows_by_place
+from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.evaluation.metrics import envelope_distance
 from avmsf.evaluation.registry import kind_of, method_entry, resolve
@@ -49,8 +49,6 @@ _SAME_POSITION_M = 1e-6
 """Distance of one contact from itself after float32, far below that of any two."""
 NETWORK = PipelineConfig(gain_model="network")
 """The attention network with the quick settings of the fit."""
-_MIN_VALIDATED_POSITIONS = 6
-"""Training positions from which on a part of them is held out to choose settings by, as in `fit` itself."""
 _UNINFORMED_RATE = 0.03
 """Adam's step for frequencies (in widths of their modes) and for the logarithms of dampings without extracted modes:
 frequencies, dampings and noise have to find where they belong."""
@@ -310,7 +308,7 @@ class FieldMethod:
         """Return the best settings of a grid, and the report of the choice."""
         base, train = self.pipeline.fit, task.train
         rows = held_out(train.contacts, base.validation)
-        if len(rows_by_place(train.contacts)) < _MIN_VALIDATED_POSITIONS or not rows:
+        if not rows:
             return base, {"validated": False}
         learnt, held = [row for row in range(len(train)) if row not in rows], train.take(rows)
         configs, errors = candidates(grid, base), []
@@ -323,7 +321,7 @@ class FieldMethod:
             "validated": True,
             "validation_contacts": list(held.names),
             "validation_envelope": errors,
-            "chosen": {name: getattr(chosen, name) for name in (names.split()[0] for names in grid)},
+            "chosen": {name: getattr(chosen, name) for names in grid for name in names.split()},
         }
 
 

@@ -88,7 +88,9 @@ class ObjectInputs:
             # Positions do not depend on the encoder.
             lift = replace(lift, encoder=DESCRIPTORS)
         lift = replace(
-            lift, symmetry=not visual_input.endswith("unaligned"), standardize=visual_input.endswith("standardized")
+            lift,
+            symmetry=lift.symmetry and not visual_input.endswith("unaligned"),
+            standardize=lift.standardize or visual_input.endswith("standardized"),
         )
         # The ablated features lie beside those of the fields without ablation.
         name = f"{visual_input.removesuffix('-positions')}.safetensors"

@@ -81,7 +81,7 @@ VisualInput = Literal[
 `positions`: only the positions of the points that visual features are of. `visual`: positions with visual features,
 pooled over the object's symmetries; `unaligned`: without pooling. `paper`: the paper's features of Gaussians;
 `paper-positions`: only their positions; `paper-unaligned`: without pooling; `paper-standardized`: of mean 0 and
-length 1."""
+length 1 before pooling."""
 
 
 @dataclass(frozen=True, eq=False)

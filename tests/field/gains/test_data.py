@@ -107,7 +107,8 @@ def test_without_repeats_the_last_of_the_farthest_points_are_held_out() -> None:
     contacts = plate_impacts(COUNT).contacts
     assert len(rows_by_place(contacts)) == COUNT
     assert held_out(contacts, 0.25) == farthest_points(contacts, COUNT).tolist()[-3:]
-    assert held_out(contacts, 0.0) == []
+    assert held_out(contacts, 0.0) == held_out(contacts[:5], 0.4) == []
+    assert len(held_out(contacts[:6], 0.4)) == 2
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-3])

@@ -23,7 +23,7 @@ from avmsf.mesh.points import farthest_points
 SHARED, PER_CONTACT = "shared", "per-contact"
 """Dampings that are the same everywhere, and those that vary with the contact."""
 _MIN_PLACES = 6
-"""Positions below which none are left to validate on."""
+"""Positions below which none are held out to validate on."""
 _MAX_LAYERS = 64
 """Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time
 to build before it can be compared with the file's tensors."""
@@ -195,7 +195,7 @@ class Attention(GainEstimator):
         reason = ""
         if len(dampings) == 1:
             reason = "as set"
-        elif not held or len(rows_by_place(train.contacts)) < _MIN_PLACES:
+        elif not held:
             reason = f"no positions are held out to validate on, of at least {_MIN_PLACES}"
         if reason:
             return {"damping": dampings[0], "validated": False, "damping_reason": reason}
@@ -222,11 +222,13 @@ class Attention(GainEstimator):
 
 
 def held_out(contacts: Float[Tensor, "contacts 3"], fraction: float) -> list[int]:
-    """Return all rows of the places, a fraction of all, that farthest-point sampling takes last.
+    """Return all rows of the places, a fraction of all, that farthest-point sampling takes last; none of fewer than 6.
 
     Of single rows it would take repeats last, whose places are trained on.
     """
     rows = rows_by_place(contacts)
+    if len(rows) < _MIN_PLACES:
+        return []
     order = farthest_points(contacts[[each[0] for each in rows]], len(rows)).tolist()
     return [row for place in order[len(rows) - round(fraction * len(rows)) :] for row in rows[place]]
 
