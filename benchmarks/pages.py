@@ -12,7 +12,7 @@ from functools import cache
 from benchmarks.records import DASH, NAMES, REPOSITORY, Record, described, in_digits, markdown, parts_of, row_of, stored
 
 STORED = REPOSITORY / "docs" / "benchmarks"
-PAGES = (REPOSITORY / "README.md", REPOSITORY / "docs" / "benchmarks.md")
+PAGES = (REPOSITORY / "README.md", *(REPOSITORY / "docs" / f"{each}.md" for each in ("benchmarks", "baselines")))
 MARKED = re.compile(r"(<!-- measured: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 RESULTS = (
     ("measured aircraft, 8", "gains.captures.8", "aircraft_response", ""),

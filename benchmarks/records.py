@@ -174,6 +174,8 @@ def row_of(record: Record) -> str:
 def markdown(found: Sequence[Record], columns: Sequence[str] = ()) -> str:
     """Return a table of these columns, or one for all groups with the same; a row for each group and object of a part.
 
+    Rows without any of the columns are left out.
+
     Names are those below the part's.
     """
     rows: dict[str, dict[str, Record]] = {}
@@ -181,7 +183,8 @@ def markdown(found: Sequence[Record], columns: Sequence[str] = ()) -> str:
         rows.setdefault(row_of(each), {})[each.name.rpartition(".")[2]] = each
     tables: dict[tuple[str, ...], dict[str, dict[str, Record]]] = {}
     for label, row in rows.items():
-        tables.setdefault(tuple(columns or row), {})[label] = row
+        if not columns or not row.keys().isdisjoint(columns):
+            tables.setdefault(tuple(columns or row), {})[label] = row
     return "\n\n".join("\n".join(_table(each, lines)) for each, lines in tables.items())
 
 
