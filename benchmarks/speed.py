@@ -104,6 +104,7 @@ def _many(settings: Settings) -> Iterator[Record]:
     The first ten of sim-20, with 8 impacts of .5 s and a mesh; default settings, one thread each, no stage cached; the
     commands make the tetrahedra that all have. speed: over one worker. agreement: part of the fields that are one
     worker's to the bit. gigabytes: most memory of a process. megabytes: of ten fields with records, and of the caches.
+    export: web pages of these fields, by one worker.
     """
     names = settings.some(list(SIM20)[:10], 2)
     with tempfile.TemporaryDirectory() as name:
@@ -117,23 +118,28 @@ def _many(settings: Settings) -> Iterator[Record]:
                 [each, "-o", output / f"{each.name}.safetensors", "--cache", cache / each.name, *more]
                 for each in captures
             ]
-            _, taken = timed(partial(_fit, [together] if workers else apart, place))
+            _, taken = timed(partial(_run, "fit", [together] if workers else apart, place))
             fields[way] = [(output / f"{each}.safetensors").read_bytes() for each in names]
             values = {"seconds": taken, "processor_seconds": processor_seconds() - before}
             values |= {"gigabytes": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9}
             found[way] = values | {"megabytes": _megabytes(output), "cache_megabytes": _megabytes(cache)}
+        made, pages, before = [output / f"{each}.safetensors" for each in names], place / "pages", processor_seconds()
+        words = [*made, "--to", "web", "--capture", place / "sim", "-o", pages]
+        _, taken = timed(partial(_run, "export", [words], place))
+        exported = {"seconds": taken, "processor_seconds": processor_seconds() - before, "megabytes": _megabytes(pages)}
     for way, values in found.items():
         same = [a == b for a, b in zip(fields[way], fields["one worker"], strict=True)]
         compared = {"speed": found["one worker"]["seconds"] / values["seconds"], "agreement": sum(same) / len(same)}
         yield from records(values | compared, object=way)
+    yield from records(exported, object="export")
 
 
-def _fit(commands: list[list[object]], place: Path) -> None:
-    """Run `avmsf fit` with the words of each command, on one thread and with tetrahedra of its own."""
+def _run(verb: str, commands: list[list[object]], place: Path) -> None:
+    """Run a verb of `avmsf` with the words of each command, on one thread and with tetrahedra of its own."""
     avmsf, environment = Path(sys.executable).with_name("avmsf"), os.environ | {"AVMSF_CACHE": str(place)}
     environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     for words in commands:
-        subprocess.run([str(avmsf), "fit", "--quiet", *map(str, words)], check=True, env=environment)
+        subprocess.run([str(avmsf), verb, "--quiet", *map(str, words)], check=True, env=environment)
 
 
 def _megabytes(folder: Path) -> float:
