@@ -101,6 +101,18 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     assert abs(math.log(elastic.factor / factor)) <= 0.01
 
 
+def test_weak_modes_tell_the_factor_beside_strong_ones_that_are_no_shapes():
+    """Sixteen modes of a hundred times the gains, which follow no shape at frequencies far apart, say nothing of it."""
+    sites = impacts(12, seed=1)
+    weak, frequency = measured(sites, factor=0.75), torch.linspace(2500.0, 9000.0, 16, dtype=torch.float64)
+    values = 100.0 * weak.values.abs().mean() * torch.view_as_complex(draw(12, 16, 2, seed=8))
+    strong = MeasuredGains(values, torch.full((16,), 1e-5).double(), frequency, torch.full((16,), 20.0).double())
+    pairs = zip(vars(weak).values(), vars(strong).values(), strict=True)
+    assert (
+        abs(math.log(weighed(MeasuredGains(*(torch.cat(pair, dim=-1) for pair in pairs)), sites).factor / 0.75)) <= 0.01
+    )
+
+
 @pytest.mark.parametrize("seed", [1, 3])
 @pytest.mark.parametrize("computed", [30, 20])
 def test_a_body_has_modes_above_those_that_were_computed(computed, seed):

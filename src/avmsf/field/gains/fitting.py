@@ -22,8 +22,8 @@ from avmsf.field.gains.mixture import (
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
 
-_STRONGEST = 16
-"""Modes of the most energy, which decide on the factor on nominal frequencies: many weak ones are not the body's."""
+_AT_ONCE = 16
+"""Modes that are matched with shapes at a time, for want of memory."""
 _ALL_NOISE = 1e12
 """Variance of the noise over the mean square of a part at most: far beyond what leaves anything of the gains."""
 _NEAR = 0.3
@@ -179,21 +179,18 @@ def total_evidence(families: Sequence[WeighedFamily], measured: MeasuredGains) -
 def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) -> None:
     """Give each elastic family the probabilities of factors on its frequencies and of their errors.
 
-    The strongest modes decide.
-
     A mode is a perturbed shape of the body with some frequency, or no shape of it; both parts of its gains share the
     shape. Given factor and error the modes are independent of each other.
     """
-    unknown = _no_shape(families)
-    energy = measured.energy * measured.distinct
-    rows = torch.topk(energy, min(_STRONGEST, int(measured.distinct.sum()))).indices
+    unknown, distinct = _no_shape(families), torch.nonzero(measured.distinct).flatten()
     for each in families:
         if isinstance(each.family, Elastic):
-            density = each.family.match(torch.log(measured.frequency), rows)
-            shape = torch.cat([_shape(each, each.family)[:, rows], unknown[None, rows]])
-            single = torch.logsumexp(density + shape, dim=1)
-            both = torch.logaddexp(single, unknown[rows])
-            each.family.frequency_weights = torch.softmax(both.sum(1) + each.family.factor_log_prior, dim=0)
+            shape, total = torch.cat([_shape(each, each.family), unknown[None]]), each.family.factor_log_prior
+            for rows in torch.split(distinct, _AT_ONCE):
+                density = each.family.match(torch.log(measured.frequency), rows)
+                single = torch.logsumexp(density.add_(shape[:, rows]), dim=1)
+                total = total + torch.logaddexp(single, unknown[rows]).sum(1)
+            each.family.frequency_weights = torch.softmax(total, dim=0)
 
 
 def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:
