@@ -158,4 +158,4 @@ def free(settings: Settings) -> Iterator[Record]:
             mistakes.append(float(found != "free"))
             row = {"held": mistakes[-1], "error": case.error(field)}
             yield from records(row, group=str(count), object=name, note=found)
-    yield from records({"held": sum(mistakes), "of": float(len(mistakes))})
+    yield from records({"held": sum(mistakes)}, note=f"of {len(mistakes)}")

@@ -25,7 +25,7 @@ RATE, SECONDS = 48_000.0, 0.5
 
 
 def _diffsound(settings: Settings) -> Iterator[Record]:
-    """Relative errors of stiffness E / rho and thickness, and that of Poisson's ratio, and seconds of processor time.
+    """Relative errors of stiffness E / rho and thickness, error of Poisson's ratio, all signed, and processor time.
 
     Two clips of the body, 16 modes of equal amplitude, Rayleigh damping; a material 37 % stiffer than the table's,
     which the fit does not know, nor the thickness. bodies_seconds: of the bodies computed beforehand.

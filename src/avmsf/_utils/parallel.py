@@ -40,7 +40,7 @@ _GRACE = 3.0
 class _Processes:
     """Processes of this computer, new for each task, which is the end of its pipe; they end with this one."""
 
-    begun = "running"
+    state = "running"
 
     def __init__(self, count: int) -> None:
         self.count, self.processes = count, dict[connection.Connection, SpawnProcess]()
@@ -83,7 +83,7 @@ class _Processes:
 class _Cluster:
     """Processes of a ray cluster, which has a queue of its own, with the methods of `_Processes`."""
 
-    count, begun = float("inf"), "submitted"
+    count, state = float("inf"), "submitted"
 
     def __init__(self, ray: ModuleType) -> None:
         self.ray = ray
@@ -110,8 +110,8 @@ class _Cluster:
 
 
 Workers = _Processes | _Cluster
-"""Where tasks run, each in a process on one thread; `count` tasks are begun before the first of them is done, and are
-then what `begun` says."""
+"""Where tasks run, each in a process on one thread; `count` tasks are begun before the first of them is done;
+`state` is what begun ones are said to be."""
 
 
 @contextmanager
@@ -160,7 +160,7 @@ def run_tasks(
                 running[workers.start(act, arguments[name])] = name, time.monotonic()
             longest = islice(running.values(), _NAMED)
             names = ", ".join(f"{name} for {time.monotonic() - begun:.0f} s" for name, begun in longest)
-            doing(f"{workers.begun} {names}{' and others' * (len(running) > _NAMED)}")
+            doing(f"{workers.state} {names}{' and others' * (len(running) > _NAMED)}")
             for task in workers.wait(running):
                 name, _ = running.pop(task)
                 try:

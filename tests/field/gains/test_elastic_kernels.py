@@ -107,10 +107,10 @@ def test_weak_modes_tell_the_factor_beside_strong_ones_that_are_no_shapes():
     weak, frequency = measured(sites, factor=0.75), torch.linspace(2500.0, 9000.0, 16, dtype=torch.float64)
     values = 100.0 * weak.values.abs().mean() * torch.view_as_complex(draw(12, 16, 2, seed=8))
     strong = MeasuredGains(values, torch.full((16,), 1e-5).double(), frequency, torch.full((16,), 20.0).double())
-    pairs = zip(vars(weak).values(), vars(strong).values(), strict=True)
-    assert (
-        abs(math.log(weighed(MeasuredGains(*(torch.cat(pair, dim=-1) for pair in pairs)), sites).factor / 0.75)) <= 0.01
+    both = MeasuredGains(
+        *(torch.cat(each, dim=-1) for each in zip(vars(weak).values(), vars(strong).values(), strict=True))
     )
+    assert abs(math.log(weighed(both, sites).factor / 0.75)) <= 0.01
 
 
 @pytest.mark.parametrize("seed", [1, 3])

@@ -12,9 +12,9 @@ broader profile serves, g_kj = exp(-log(f_k / f_j)^2 / 2 w^2) + 1/1000: whatever
 
 Which shape a mode is follows from its gains and from its frequency f: given shape k and a factor c on all nominal
 frequencies (the body's material and scale are not known), log f is normal about log(c f_k); under all other families it
-is uniform over the measured range. Its standard deviation is the same for half of the modes of a body, one of several,
-and the others have any of these: so the strongest modes together tell how exact the body's frequencies are, and with
-one or two impacts these tell which shape each mode is.
+is uniform over the measured range, except in weighing the factor (`Elastic.match`). Its standard deviation is the same
+for half of the modes of a body, one of several, and the others have any of these: so all modes together tell how exact
+the body's frequencies are, and with one or two impacts these tell which shape each mode is.
 """
 
 import math
@@ -43,7 +43,7 @@ RESIDUAL_PRIOR = (0.96, 0.04, 7e-4, 1e-4)
 """Typical share of the modes of a body with each of `RESIDUALS`.
 
 Both are of an earlier measurement whose script was not kept: narrower than the mean posterior probabilities over the
-modes of seven simulated objects with 8 impacts each as they are printed now (docs/decisions/few-impacts.md)."""
+modes of seven simulated objects with 8 impacts each, which are a worse prior (docs/decisions/few-impacts.md)."""
 EQUAL_PRIOR = 0.2
 """Probability that a body is not typical, so that all profiles and remainders are equally probable."""
 REACH = 0.15
@@ -100,7 +100,8 @@ class Elastic(KernelFamily):
         self._along = lru_cache(maxsize=3)(lambda sites: self.modes.gains(sites.points, sites.directions))
         self._reach = torch.tensor([REACH * size], dtype=torch.float64)
         apart = torch.log(modes.frequency[:, None] / modes.frequency)
-        # The number of shapes below a frequency grows with a power of it: that of the upper half of these, 0 for one.
+        # The number of shapes below a frequency grows with a power of it: that of the upper half of these.
+        # A single one says nothing of it: nearly 0.
         half = (len(modes) + 1) // 2
         self._growth = max(math.log(len(modes) / half), 1e-6) / max(float(apart[-1, half - 1]), _NARROWEST)
         profiles = [1.0 / (1.0 + (2.0 * apart / tau).square()) for tau in PERTURBATIONS]
