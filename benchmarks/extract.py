@@ -112,7 +112,7 @@ def _match(found: ModalBank, truth: PlateModes) -> dict[str, float]:
 def _bowl(settings: Settings) -> Iterator[Record]:
     """Relative STFT error of each clip of a bowl, fitted with the modes of the others (least squares, sine and cosine).
 
-    As recorded, and above 20 Hz without the rumble that holds half the energy and nobody hears; no mode found counts as
+    As recorded, and above 20 Hz without the inaudible rumble that holds half the energy; no mode found counts as
     silence, 1. doublet: of all clips' modes by pencil the nearest to 1681 and 1684 Hz.
     """
     for key, highpass in (("as recorded", 0.0), ("audible", 20.0)):

@@ -39,7 +39,7 @@ def page(settings: Settings) -> Iterator[Record]:
     interactive_seconds: from the navigation's start until the object is drawn and can be excited, three and spark from
     this machine's disk, headless Chromium without a graphics processor, fresh browser profiles. click_to_sample_ms:
     from the pointer's release to the message that carries the impact to the sound's thread, and from there to its first
-    sample, by the sound's own clock, the 1.5 ms by which the limiter looks ahead counted: our own code, without the
+    sample, by the sound's own clock, the 1.5 ms that the limiter delays it counted: our own code, without the
     browser's way through its mixer and the loudspeaker; different contacts.
     """
     with tempfile.TemporaryDirectory() as scratch:

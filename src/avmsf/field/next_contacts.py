@@ -69,10 +69,9 @@ def suggest(
     Args:
         field: A field whose gains have a posterior.
         count: Number of contacts; fewer come where fewer candidates have no recording.
-        candidates: Places to choose from [candidates, 3], meters, on the surface; contacts of the fit are passed over.
-            By default points spread over the surface that a hammer can strike from outside (`hammer_access`).
-        directions: Unit vectors [candidates, 3] of their impacts; straight into the surface by default and where they
-            are zero.
+        candidates: Places on the surface [candidates, 3], meters; contacts of the fit are passed over. By default
+            points that a hammer can strike from outside (`hammer_access`).
+        directions: Unit vectors [candidates, 3] of their impacts; zeros, as the default, are straight into the surface.
         unseen: Use all of the surface of the field's body, also where no photograph shows the object.
         progress: Whether a terminal shows that it works.
 
@@ -81,15 +80,14 @@ def suggest(
 
     Raises:
         ArrayError: For candidates and directions of other shapes, or with values that are not finite.
-        FitError: For gains without a posterior, unfit arguments, no candidate without a recording, places none of which
-            a hammer gets to, and `unseen` without a body.
+        FitError: For gains without a posterior, no candidate that has no recording and can be struck, other unfit
+            arguments, and `unseen` without a body.
     """
     count = as_count(count, "count", raising=FitError)
     given = None if candidates is None else as_vectors(candidates, "candidates").double()
     gains = _mixture_of(field, unseen)
-    ways = None
-    if directions is not None:
-        ways = as_directions(directions, "directions", count=0 if given is None else len(given))
+    known = 0 if given is None else len(given)
+    ways = None if directions is None else as_directions(directions, "directions", count=known)
     with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points

@@ -82,9 +82,8 @@ def fit(
     """Fit a sound field to the recordings of a capture, as `avmsf fit` does.
 
     The recordings are aligned and their modes found. The object's shape is its mesh, otherwise what photographs, a
-    video or Gaussians in the folder show. Its elastic modes are computed, and the gain model is fitted and compared
-    with the recordings by leave-one-out (`SoundField.quality`). It takes seconds to minutes with a mesh, minutes with
-    photographs. Without any shape the field knows the contacts' positions alone.
+    video or Gaussians in the folder show; without any the field knows the contacts' positions alone. Elastic modes are
+    computed, and the gain model is fitted and judged by leave-one-out (`SoundField.quality`), in seconds to minutes.
 
     Args:
         capture: A folder, or what `avmsf.read` made of it. With `material`, a mesh (a file or a Surface), or a folder

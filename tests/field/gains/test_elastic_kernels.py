@@ -101,7 +101,7 @@ def test_a_factor_on_all_frequencies_is_found(factor):
     assert abs(math.log(elastic.factor / factor)) <= 0.01
 
 
-def test_weak_modes_tell_the_factor_beside_strong_ones_that_are_no_shapes():
+def test_weak_modes_tell_the_factor_next_to_strong_ones_that_are_no_shapes():
     """Sixteen modes of a hundred times the gains, which follow no shape at frequencies far apart, say nothing of it."""
     sites = impacts(12, seed=1)
     weak, frequency = measured(sites, factor=0.75), torch.linspace(2500.0, 9000.0, 16, dtype=torch.float64)
