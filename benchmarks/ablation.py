@@ -1,4 +1,4 @@
-"""Parts of the gain model: what each contributes, supports found or invented, and labels that are called wrong."""
+"""Parts of the gain model: what each contributes, whether supports are found, and labels that are called wrong."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -149,8 +149,7 @@ def free(settings: Settings) -> Iterator[Record]:
     mistakes = []
     for name in settings.some(tuple(counts)):
         capture = objects.measured(name) if name in objects.COUNTS else objects.simulated(name, settings)[0]
-        config = BodyConfig(supports="try", shapes=12, dofs=5000) if settings.quick else BodyConfig(supports="try")
-        bodies = candidate_bodies(objects.surface_of(capture), config)
+        bodies = objects.bodies_of(objects.surface_of(capture), settings, supports="try")
         for count in counts[name]:
             case = objects.SplitCase.of(*split(capture.impacts, count), capture, bodies)
             field = case.fit(MixtureEstimator(bodies=bodies), quick=True)

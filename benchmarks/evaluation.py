@@ -25,7 +25,6 @@ from benchmarks.records import Measurement, Record, Settings, code_commit
 
 SIMPLE = "nearest,knn3,knn-gains,spline-gains"
 DIFFSOUND = "diffsound,diffsound-weighted"
-LOCALIZED = "rmed"
 
 
 def _evaluate(
@@ -84,7 +83,7 @@ def _evaluate(
     for group, of in (("ratio", "ratio_to_knn3"), ("median", "medians")):
         for method, values in summary[of].items():
             yield from _records(values, f"{group}.{method}")
-    metric = LOCALIZED if protocol == "localize" else "relative_stft"
+    metric = "rmed" if protocol == "localize" else "relative_stft"
     for method, found in values_of(results, summary["main_case"]).items():
         for name, value in found.get(metric, {}).items():
             yield Record(f"{metric}.{method}", value, object=name)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from statistics import NormalDist
+from typing import Literal
 
 import numpy as np
 import torch
@@ -213,9 +214,12 @@ def features_of(capture: Capture) -> FeatureField:
     return FeatureField.from_mesh(capture.surface, seed=0, count=_POINTS)
 
 
-def bodies_of(surface: Surface | ObjectShape, settings: Settings) -> CandidateBodies:
+def bodies_of(
+    surface: Surface | ObjectShape, settings: Settings, supports: Literal["auto", "try"] = "auto"
+) -> CandidateBodies:
     """Return the bodies of unknown thickness behind a surface, coarse for a quick look."""
-    return candidate_bodies(surface, BodyConfig(shapes=12, dofs=5000) if settings.quick else BodyConfig())
+    config = BodyConfig(shapes=12, dofs=5000) if settings.quick else BodyConfig()
+    return candidate_bodies(surface, replace(config, supports=supports))
 
 
 def solid_estimator(surface: Surface, settings: Settings) -> MixtureEstimator:

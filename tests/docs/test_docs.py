@@ -147,3 +147,4 @@ def test_a_number_has_three_digits_and_a_column_that_no_shown_row_has_is_of_dash
     assert {value: pages.in_digits(value) for value in numbers} == numbers
     table = pages.markdown([pages.Record("gains.sim20.mean.error", 0.5, "", "lower")], ["error", "gone"])
     assert table.splitlines() == ["|  | error ↓ | gone |", "|---|---|---|", "| mean | .500 | – |"]
+    assert pages.markdown([pages.Record("gains.sim20.mean.error", 0.5, "", "lower")], ["gone"]) == ""
