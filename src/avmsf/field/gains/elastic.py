@@ -29,7 +29,7 @@ from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import factor_range
-from avmsf.field.gains.kernels import MEMORY, KernelFamily, Sites, scaled, squared_exponential
+from avmsf.field.gains.kernels import KernelFamily, Sites, scaled, squared_exponential
 
 PERTURBATIONS = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Relative perturbations tau of stiffness and mass."""
@@ -58,6 +58,8 @@ _EXCEPTIONS = 0.5
 _IMPROBABLE = 1e-6
 """Probability of a factor, over the most probable one's, below which it is left out: all of them together change
 probabilities by less than a thousandth."""
+_AT_ONCE = 400_000
+"""Numbers that are worked on at a time: few enough for a processor's cache."""
 _MARGIN = 0.1
 """Log frequency by which the range of measured modes is widened at both ends."""
 _NARROWEST = 0.1
@@ -163,10 +165,9 @@ class Elastic(KernelFamily):
         weights = (1.0 - _EXCEPTIONS) * weights + _EXCEPTIONS * weights.mean(1, keepdim=True)
         probable = torch.nonzero(weights.amax(1) > _IMPROBABLE * weights.max()).flatten()
         found = torch.full((len(self.modes), len(log_frequency)), -torch.inf, dtype=torch.float64)
-        for rows in torch.split(probable, max(1, MEMORY // found.numel())):
-            densities = self._densities(self.frequency_factors[rows], log_frequency, log_frequency)
-            for logs, weight in zip(densities, weights[rows].T, strict=True):
-                found = torch.logaddexp(found, torch.logsumexp(logs + weight.log()[:, None, None], dim=0))
+        for rows, error, densities in self._densities(probable, log_frequency):
+            weighed = densities.add_(weights[rows, error].log()[:, None, None])
+            found = torch.logaddexp(found, torch.logsumexp(weighed, dim=0))
         return found
 
     def shape_evidence(self, evidence: Float64[Tensor, "kernels noises series"]) -> Float64[Tensor, "shapes series"]:
@@ -192,21 +193,16 @@ class Elastic(KernelFamily):
         return float(FACTORS[self._factor_weights[self.unit].argmax()])
 
     def match(
-        self, log_frequency: Float64[Tensor, " modes"], modes: Int[Tensor, " some"] | None = None
-    ) -> Float64[Tensor, "pairs rows some"]:
-        """Return the density of all or some modes for each pair of a factor and an error and each shape, as a log.
+        self, log_frequency: Float64[Tensor, " modes"], shape: Float64[Tensor, "shapes modes"]
+    ) -> Float64[Tensor, "pairs modes"]:
+        """Return the log density of each mode's frequency and gains for each pair of a factor and an error.
 
-        A mode may also be a shape above the computed ones, which share the last row: without them a factor that brings
-        all computed shapes below the modes would cost nothing. All shapes within the range of the measured modes,
-        computed or not, are equally probable. Densities are over that of modes that are no shapes: like the shapes
-        above, these are as dense at a frequency as the body's shapes, by a power law. `log_frequency` is that of
-        frequencies in Hz.
+        `shape` is the log evidence of each shape over that of a mode that is no shape. A mode may also be a shape above
+        the computed ones, whose gains say nothing: without them a factor that brings all computed shapes below the
+        modes would cost nothing. All shapes within the range of the measured modes, computed or not, are equally
+        probable. Densities are over that of modes that are no shapes: like the shapes above, these are as dense at a
+        frequency as the body's shapes, by a power law. `log_frequency` is that of frequencies in Hz.
         """
-        chosen = log_frequency if modes is None else log_frequency[modes]
-        densities = torch.stack(list(self._densities(self.frequency_factors, chosen, log_frequency)), dim=1)
-        # A mode has its body's error or, as an exception, any.
-        exception = torch.logsumexp(densities, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
-        known = torch.logaddexp(densities + math.log(1.0 - _EXCEPTIONS), exception)
         low, high = _range(log_frequency)
         nominal = torch.log(self.frequency_factors[:, None] * self.modes.frequency)
         top, inside = nominal[:, -1:], _inside(nominal, low, high)[:, None]
@@ -214,25 +210,31 @@ class Elastic(KernelFamily):
         counts = len(self.modes) * torch.exp(self._growth * (torch.tensor([low, high], dtype=torch.float64) - top))
         total = (inside + counts.clamp_min(len(self.modes)).diff(dim=1)).clamp_min(1.0)
         reach = self._growth * (high - low)
-        law = self._growth * (chosen - high) + math.log(reach / -math.expm1(-reach))
-        beyond = torch.where(chosen > top, (counts.diff(dim=1) / total).log(), -torch.inf)[:, None, None]
-        rows = [known - law + (inside / total).log()[..., None, None], beyond.expand(-1, len(FREQUENCY_ERRORS), -1, -1)]
-        return torch.cat(rows, dim=2).flatten(0, 1)
+        law = self._growth * (log_frequency - high) + math.log(reach / -math.expm1(-reach))
+        beyond = torch.where(log_frequency > top, (counts.diff(dim=1) / total).log(), -torch.inf)
+        found = torch.empty(len(nominal), len(FREQUENCY_ERRORS), len(log_frequency), dtype=torch.float64)
+        for rows, error, densities in self._densities(torch.arange(len(nominal)), log_frequency):
+            found[rows, error] = torch.logsumexp(densities.add_(shape), dim=1)
+        # A mode has its body's error or, as an exception, any.
+        exception = torch.logsumexp(found, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
+        known = torch.logaddexp(found + math.log(1.0 - _EXCEPTIONS), exception)
+        return torch.logaddexp(known - law + (inside / total).log()[..., None], beyond[:, None]).flatten(0, 1)
 
     def _densities(
-        self,
-        factors: Float64[Tensor, " factors"],
-        log_frequency: Float64[Tensor, " some"],
-        measured: Float64[Tensor, " modes"],
-    ) -> Iterator[Float64[Tensor, "factors shapes some"]]:
-        """Yield for each error the log probability of each shape times the density of a log frequency if it is that."""
+        self, factors: Int[Tensor, " some"], log_frequency: Float64[Tensor, " modes"]
+    ) -> Iterator[tuple[Int[Tensor, " factors"], int, Float64[Tensor, "factors shapes modes"]]]:
+        """Yield rows of a few factors, one of an error, and log probabilities of shapes times densities of modes.
+
+        The density of a mode's log frequency is that if it is the shape.
+        """
         # Shapes within the range of the measured modes are equally probable.
-        low, high = _range(measured)
-        nominal = torch.log(factors[:, None] * self.modes.frequency)
-        constant = (math.log(high - low) - _inside(nominal, low, high).clamp_min(1.0).log())[:, None, None]
-        square = (log_frequency - nominal[..., None]).square_()
-        for error in FREQUENCY_ERRORS:
-            yield square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
+        low, high = _range(log_frequency)
+        for rows in torch.split(factors, max(1, _AT_ONCE // (len(self.modes) * len(log_frequency)))):
+            nominal = torch.log(self.frequency_factors[rows][:, None] * self.modes.frequency)
+            constant = (math.log(high - low) - _inside(nominal, low, high).clamp_min(1.0).log())[:, None, None]
+            square = (log_frequency - nominal[..., None]).square_()
+            for row, error in enumerate(FREQUENCY_ERRORS):
+                yield rows, row, square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
 
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:

@@ -22,8 +22,6 @@ from avmsf.field.gains.mixture import (
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
 
-_AT_ONCE = 16
-"""Modes that are matched with shapes at a time, for want of memory."""
 _ALL_NOISE = 1e12
 """Variance of the noise over the mean square of a part at most: far beyond what leaves anything of the gains."""
 _NEAR = 0.3
@@ -182,15 +180,12 @@ def weigh_factors(families: Sequence[WeighedFamily], measured: MeasuredGains) ->
     A mode is a perturbed shape of the body with some frequency, or no shape of it; both parts of its gains share the
     shape. Given factor and error the modes are independent of each other.
     """
-    unknown, distinct = _no_shape(families), torch.nonzero(measured.distinct).flatten()
+    unknown, log_frequency = _no_shape(families), torch.log(measured.frequency)
     for each in families:
         if isinstance(each.family, Elastic):
-            shape, total = torch.cat([_shape(each, each.family), unknown[None]]), each.family.factor_log_prior
-            for rows in torch.split(distinct, _AT_ONCE):
-                density = each.family.match(torch.log(measured.frequency), rows)
-                single = torch.logsumexp(density.add_(shape[:, rows]), dim=1)
-                total = total + torch.logaddexp(single, unknown[rows]).sum(1)
-            each.family.frequency_weights = torch.softmax(total, dim=0)
+            density = each.family.match(log_frequency, _shape(each, each.family) - unknown)
+            either = torch.logaddexp(density, torch.zeros(()))[:, measured.distinct].sum(1)
+            each.family.frequency_weights = torch.softmax(each.family.factor_log_prior + either, dim=0)
 
 
 def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: MeasuredGains) -> Matched:
