@@ -12,9 +12,9 @@ broader profile serves, g_kj = exp(-log(f_k / f_j)^2 / 2 w^2) + 1/1000: whatever
 
 Which shape a mode is follows from its gains and from its frequency f: given shape k and a factor c on all nominal
 frequencies (the body's material and scale are not known), log f is normal about log(c f_k); under all other families it
-is uniform over the measured range, except in weighing the factor (`Elastic.match`). Its standard deviation is the same
-for half of the modes of a body, one of several, and the others have any of these: so all modes together tell how exact
-the body's frequencies are, and with one or two impacts these tell which shape each mode is.
+is as dense as the body's shapes, by a power law. Its standard deviation is the same for half of the modes of a body,
+one of several, and the others have any of these: so all modes together tell how exact the body's frequencies are, and
+with one or two impacts these tell which shape each mode is.
 """
 
 import math
@@ -157,8 +157,8 @@ class Elastic(KernelFamily):
     def shape_log_prior(self, log_frequency: Float64[Tensor, " modes"]) -> Float64[Tensor, "shapes modes"]:
         """Return the log probability that a mode is each shape, times the density of its frequency if it is.
 
-        Over the density of a frequency of which nothing is known; averaged over factors and errors by
-        `frequency_weights`. `log_frequency` is that of frequencies in Hz.
+        Over the density of a mode that is no shape; averaged over factors and errors by `frequency_weights`.
+        `log_frequency` is that of frequencies in Hz.
         """
         weights = self.frequency_weights.reshape(len(self.frequency_factors), -1)
         # A mode has its body's error or, as an exception, any.
@@ -200,7 +200,7 @@ class Elastic(KernelFamily):
         `shape` is the log evidence of each shape over that of a mode that is no shape. A mode may also be a shape above
         the computed ones, whose gains say nothing: without them a factor that brings all computed shapes below the
         modes would cost nothing. All shapes within the range of the measured modes, computed or not, are equally
-        probable. Densities are over that of modes that are no shapes: like the shapes above, these are as dense at a
+        probable. Densities are over that of a mode that is no shape: like the shapes above, these are as dense at a
         frequency as the body's shapes, by a power law. `log_frequency` is that of frequencies in Hz.
         """
         low, high = _range(log_frequency)
@@ -209,8 +209,6 @@ class Elastic(KernelFamily):
         # Numbers of shapes below the ends by the law; only those above the computed ones follow it.
         counts = len(self.modes) * torch.exp(self._growth * (torch.tensor([low, high], dtype=torch.float64) - top))
         total = (inside + counts.clamp_min(len(self.modes)).diff(dim=1)).clamp_min(1.0)
-        reach = self._growth * (high - low)
-        law = self._growth * (log_frequency - high) + math.log(reach / -math.expm1(-reach))
         beyond = torch.where(log_frequency > top, (counts.diff(dim=1) / total).log(), -torch.inf)
         found = torch.empty(len(nominal), len(FREQUENCY_ERRORS), len(log_frequency), dtype=torch.float64)
         for rows, error, densities in self._densities(torch.arange(len(nominal)), log_frequency):
@@ -218,23 +216,25 @@ class Elastic(KernelFamily):
         # A mode has its body's error or, as an exception, any.
         exception = torch.logsumexp(found, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
         known = torch.logaddexp(found + math.log(1.0 - _EXCEPTIONS), exception)
-        return torch.logaddexp(known - law + (inside / total).log()[..., None], beyond[:, None]).flatten(0, 1)
+        return torch.logaddexp(known + (inside / total).log()[..., None], beyond[:, None]).flatten(0, 1)
 
     def _densities(
         self, factors: Int[Tensor, " some"], log_frequency: Float64[Tensor, " modes"]
     ) -> Iterator[tuple[Int[Tensor, " factors"], int, Float64[Tensor, "factors shapes modes"]]]:
         """Yield rows of a few factors, one of an error, and log probabilities of shapes times densities of modes.
 
-        The density of a mode's log frequency is that if it is the shape.
+        The density of a mode's log frequency is that if it is the shape, over that of a mode that is no shape.
         """
         # Shapes within the range of the measured modes are equally probable.
         low, high = _range(log_frequency)
+        reach = self._growth * (high - low)
+        law = self._growth * (log_frequency - high) + math.log(reach / -math.expm1(-reach) / (high - low))
         for rows in torch.split(factors, max(1, _AT_ONCE // (len(self.modes) * len(log_frequency)))):
             nominal = torch.log(self.frequency_factors[rows][:, None] * self.modes.frequency)
-            constant = (math.log(high - low) - _inside(nominal, low, high).clamp_min(1.0).log())[:, None, None]
+            prior = law + _inside(nominal, low, high).clamp_min(1.0).log()[:, None, None]
             square = (log_frequency - nominal[..., None]).square_()
             for row, error in enumerate(FREQUENCY_ERRORS):
-                yield rows, row, square * (-0.5 / error**2) + (constant - math.log(error * math.sqrt(2.0 * math.pi)))
+                yield rows, row, square * (-0.5 / error**2) - (prior + math.log(error * math.sqrt(2.0 * math.pi)))
 
     @property
     def _factor_weights(self) -> Float64[Tensor, "units factors"]:
