@@ -42,6 +42,8 @@ _IMPACTS = (8, 4, 2, 1)
 """Training contacts of the simulated objects."""
 _SETS = {"sim20": SET, "held-out": "held-out", "scans": "scans"}
 """Sets of simulated objects by the names of their parts."""
+_BESIDE = ("coverage", "own", "held", "shifting")
+"""What is told of the mixture beside its error."""
 _SHIFTS = {"none": {}, "sensor": {"sensor": 0.0005}, "warming": {"warming": 0.002}}
 _POINTS = 1000
 """Points of the surface among which recordings are located."""
@@ -53,7 +55,8 @@ def _captures(settings: Settings) -> Iterator[Record]:
     families: the Gaussian process over the unstructured and this family alone, one end-to-end step; mixture, not
     refined: all families, one step; mixture: as `avmsf fit` has it. best simple: the mean waveform of 1 to 4 nearest
     recordings, by distance or by distance and direction, whichever is best on the held-out contacts of each split.
-    coverage: part of the held-out gains, by energy, in their intervals of 90 %. worst: of the splits.
+    coverage: part of the held-out gains, by energy, in their intervals of 90 %. own: as in the part drift. held,
+    shifting: part of the splits in which the object is taken for held, its modes for shifting. worst: of the splits.
     """
     to_simple, to_best = [], []
     for name, counts in objects.COUNTS.items():
@@ -64,7 +67,7 @@ def _captures(settings: Settings) -> Iterator[Record]:
             for run in runs:
                 run["best simple"] = min(run[method] for method in SIMPLE if method in run)
                 to_simple.append(run[MIXTURE] / run["best simple"])
-                to_best.append(run[MIXTURE] / min(value for key, value in run.items() if key != "coverage"))
+                to_best.append(run[MIXTURE] / min(value for key, value in run.items() if key not in _BESIDE))
             yield from records(means(runs), group=str(count), object=name)
             shown = ("mean of 3", "best simple", *FAMILIES, UNREFINED, MIXTURE)
             worst = {key: max(run[key] for run in runs) for key in shown if key in runs[0]}
@@ -87,7 +90,14 @@ def _errors(case: objects.SplitCase, settings: Settings) -> dict[str, float]:
     mixture = MixtureEstimator(bodies=case.bodies)
     single[UNREFINED] = case.error(case.fit(mixture, quick=True))
     field = case.fit(mixture, quick=settings.quick)
-    return single | {MIXTURE: case.error(field), "coverage": case.coverage(field)[1]}
+    report = field.origin.report
+    return single | {
+        MIXTURE: case.error(field),
+        "coverage": case.coverage(field)[1],
+        "own": _own_error(field, case.test),
+        "held": float(case.bodies is not None and report["bodies"][0]["support"] != "free"),
+        "shifting": float("frequency_shift" in report),
+    }
 
 
 def _simulated(settings: Settings, condition: str = "", of: str = SET) -> Iterator[Record]:
@@ -147,19 +157,24 @@ def _drift(settings: Settings) -> Iterator[Record]:
             capture, _ = objects.simulated(name, settings, imperfections)
             bodies = bodies or objects.bodies_of(objects.surface_of(capture), settings)
             case = objects.SplitCase.of(*split(capture.impacts, 8), capture, bodies)
-            field, test = case.fit(MixtureEstimator(bodies=bodies), quick=settings.quick), case.test
-            own = fit_gains(test.sounds, field.bank, sample_rate=test.sample_rate)
-            made = synthesize(
-                own.to(torch.complex64),
-                field.bank.frequency,
-                field.bank.damping,
-                samples=test.sounds.shape[1],
-                sample_rate=test.sample_rate,
-            )
-            row |= {kind: case.error(field), f"{kind}.own": score(made, test).mean()["relative_stft"]}
+            field = case.fit(MixtureEstimator(bodies=bodies), quick=settings.quick)
+            row |= {kind: case.error(field), f"{kind}.own": _own_error(field, case.test)}
         yield from records(row, object=name)
         rows.append(row)
     yield from records(means(rows), group="mean")
+
+
+def _own_error(field: SoundField, test: Impacts) -> float:
+    """Return the error of each held-out recording's own gains at the field's poles, without noise."""
+    own = fit_gains(test.sounds, field.bank, sample_rate=test.sample_rate)
+    made = synthesize(
+        own.to(torch.complex64),
+        field.bank.frequency,
+        field.bank.damping,
+        samples=test.sounds.shape[1],
+        sample_rate=test.sample_rate,
+    )
+    return score(made, test).mean()["relative_stft"]
 
 
 def _moved(impacts: Impacts) -> Impacts:
