@@ -218,7 +218,7 @@ def bodies_of(
     surface: Surface | ObjectShape, settings: Settings, supports: Literal["auto", "try"] = "auto"
 ) -> CandidateBodies:
     """Return the bodies of unknown thickness behind a surface, coarse for a quick look."""
-    config = BodyConfig(shapes=12, dofs=5000) if settings.quick else BodyConfig()
+    config = BodyConfig(shapes=12, dofs=7000) if settings.quick else BodyConfig()
     return candidate_bodies(surface, replace(config, supports=supports))
 
 

@@ -90,7 +90,8 @@ class ProbableBody:
         if self.unit:
             return (
                 f"The unit of the mesh is probably {self.unit}, by the frequencies of the modes: write "
-                f'unit = "{self.unit}" in capture.toml, or state the present unit there as surface_unit.'
+                f'unit = "{self.unit}" in capture.toml (and views_unit, for photographs), or state the present unit '
+                "there as surface_unit."
             )
         # No larger factor is allowed: one that is within a step of the grid would have been larger.
         if math.sqrt(self.stiffness_ratio) * (1.0 + FREQUENCY_ERRORS[0]) <= factor_range()[1]:

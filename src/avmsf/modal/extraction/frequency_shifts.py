@@ -43,7 +43,7 @@ Poles = Complex128[Tensor, "*contacts modes"]
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Numbers of the search, chosen on simulated objects with sensors of up to .2 % of their mass."""
+    """Numbers of the search, chosen on two simulated objects with sensors of up to .2 % of their mass, and two real."""
 
     shift: float = 0.002
     """Relative frequency shift between recordings, standard deviation, before any is known; and distance within which
