@@ -86,11 +86,9 @@ class Solid:
         """Number of the part that each cell belongs to; cells that share a side are of one part, largest first."""
         owners = np.repeat(np.arange(len(self.cells)), 4)
         belongs = scipy.sparse.csr_array((np.ones(len(owners)), (owners, self._sides[0])))
-        number, label = scipy.sparse.csgraph.connected_components(belongs @ belongs.T, directed=False)
-        size = np.bincount(label, weights=self.volumes.numpy(), minlength=number)
-        rank = np.empty(number, dtype=np.int64)
-        rank[np.argsort(-size, kind="stable")] = np.arange(number)
-        return torch.from_numpy(rank[label])
+        label = scipy.sparse.csgraph.connected_components(belongs @ belongs.T, directed=False)[1]
+        order = np.argsort(-np.bincount(label, weights=self.volumes.numpy()), kind="stable")
+        return torch.from_numpy(np.argsort(order)[label])
 
     def expect_volume(self, *, advice: str = "make the tetrahedra with another detail") -> None:
         """Raise SimulationError where a tetrahedron is flat or inside out, naming the first."""
