@@ -74,56 +74,50 @@ def measure_quality(
     scaled = ((sounds - sounds.mean(1, keepdim=True))[audible] / level[audible, None]).double()
     system = NormalEquations.of(scaled, poles_of(bank, sample_rate), weighted=True)
     explained, _ = system.lost_without()
-    moves = _OwnMoves(*system.own_step(sample_rate))
+    unexplained, spread, explained_left_out = _own_moves(*system.own_step(sample_rate), explained)
     amplitudes = extraction.gains.to(torch.complex128)
     energy = (amplitudes.abs().square() / bank.damping).sum(0)
     # Loud recordings count no more than others for phases and shapes.
     amplitudes = amplitudes[audible] / level[audible, None]
     pitched, noise = bank.damping < bank.frequency, background_power(scaled, bank, sample_rate)
-    standing = torch.nonzero(pitched & _stands_out(explained, moves.unexplained(), noise)).flatten()
+    standing = torch.nonzero(pitched & _stands_out(explained, unexplained, noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
     part = bank.take(standing)
     double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_MAX_FALSE_MODES / len(bank))
     is_mode = torch.zeros(len(bank), dtype=torch.bool)
     is_mode[standing[~double]] = True
-    spread = moves.spread()
     return ModeQuality(
         frequency_spread=spread[:, 0],
         damping_spread=spread[:, 1],
         stable_orders=stable_orders(scaled, bank, sample_rate=sample_rate),
         coherence=amplitudes.square().sum(0).abs() / amplitudes.abs().square().sum(0),
         energy_share=energy / energy.sum(),
-        explained_left_out=moves.explained_left_out(explained),
+        explained_left_out=explained_left_out,
         is_mode=is_mode,
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _OwnMoves:
-    """How each recording alone would move each pole, (frequency Hz, damping 1/s), by one Gauss-Newton step."""
+def _own_moves(
+    hessian: Float64[Tensor, "contacts modes 2 2"],
+    slope: Float64[Tensor, "contacts modes 2"],
+    explained: Float64[Tensor, "contacts modes"],
+) -> tuple[Float64[Tensor, "contacts modes"], Float64[Tensor, "modes 2"], Float64[Tensor, " modes"]]:
+    """Return what one Gauss-Newton step of each pole, (frequency Hz, damping 1/s), in each recording alone says.
 
-    hessian: Float64[Tensor, "contacts modes 2 2"]
-    slope: Float64[Tensor, "contacts modes 2"]
-
-    def unexplained(self) -> Float64[Tensor, "contacts modes"]:
-        """Return the energy that each recording gains by its own move."""
-        return (self.slope * _times(_inverse(self.hessian), self.slope)).sum(-1)
-
-    def spread(self) -> Float64[Tensor, "modes 2"]:
-        """Return the root mean square of the moves, weighted by the information about each coordinate."""
-        move = _times(_inverse(self.hessian), self.slope)
-        weight = torch.diagonal(self.hessian, dim1=-2, dim2=-1)
-        return ((weight * move.square()).sum(0) / weight.sum(0)).sqrt()
-
-    def explained_left_out(self, explained: Float64[Tensor, "contacts modes"]) -> Float64[Tensor, " modes"]:
-        """Return the part that poles without a recording's influence explain there, of what its own pole explains."""
-        common = _times(_inverse(self.hessian.sum(0)), self.slope.sum(0))
-        alone = self.slope - _times(self.hessian, common)
-        others = _times(_inverse(self.hessian.sum(0) - self.hessian), -alone)
-        bent = (others * _times(self.hessian, others)).sum(-1)
-        # Never less than nothing: a recording may give the mode no amplitude.
-        left_out = (explained + 2 * (alone * others).sum(-1) - bent).clamp_min(0)
-        return left_out.sum(0) / (explained + self.unexplained()).sum(0)
+    First the energy that the recording gains by it, then the root mean square of the steps, weighted by the information
+    about each coordinate, and the part that poles without a recording's influence explain there, of what its own pole
+    explains.
+    """
+    move = _times(_inverse(hessian), slope)
+    unexplained, weight = (slope * move).sum(-1), torch.diagonal(hessian, dim1=-2, dim2=-1)
+    spread = ((weight * move.square()).sum(0) / weight.sum(0)).sqrt()
+    common = _times(_inverse(hessian.sum(0)), slope.sum(0))
+    alone = slope - _times(hessian, common)
+    others = _times(_inverse(hessian.sum(0) - hessian), -alone)
+    bent = (others * _times(hessian, others)).sum(-1)
+    # Never less than nothing: a recording may give the mode no amplitude.
+    left_out = (explained + 2 * (alone * others).sum(-1) - bent).clamp_min(0)
+    return unexplained, spread, left_out.sum(0) / (explained + unexplained).sum(0)
 
 
 def _stands_out(
