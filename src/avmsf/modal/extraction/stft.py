@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Complex, Float, Float64, Int
+from jaxtyping import Complex, Float, Float64, Int
 from scipy.special import bdtrc
 from torch import Tensor
 
@@ -28,19 +28,16 @@ _CONSENSUS = 0.5
 
 
 def narrow_band(
-    sounds: Float[Tensor, "contacts samples"], *, fft_size: int, hop: int, bins: Int[Tensor, " bins"] | None = None
+    sounds: Float[Tensor, "contacts samples"], *, fft_size: int, hop: int, bins: Int[Tensor, " bins"]
 ) -> Complex[Tensor, "contacts bins frames"]:
-    """Return the analytic signal of every bin's own inverse transform, or of some bins', sampled once a hop.
+    """Return the analytic signal of some bins' own inverse transforms, sampled once a hop.
 
     `fft_size` and `hop` in samples, hop a divisor of fft_size. A steady sine of amplitude a at a bin's center has
     modulus 2a/3 there and a/6 in each of the two bins beside it: together they make up the sound (Hann window).
     """
     window = torch.hann_window(fft_size, dtype=sounds.dtype)
     frames = torch.stft(sounds, fft_size, hop, window=window, center=True, pad_mode="constant", return_complex=True)
-    if bins is None:
-        bins = torch.arange(fft_size // 2 + 1)
-    else:
-        frames = frames[:, bins]
+    frames = frames[:, bins]
     reach = fft_size // hop // 2
     lags = torch.arange(-reach, reach + 1)
     weights = torch.nn.functional.pad(window, (0, 1))[fft_size // 2 + lags * hop]
@@ -78,15 +75,11 @@ class Lines:
         them anywhere (`_expected_by_chance`). Its damping is the mean over the recordings that show it, its frequency
         likewise. Strength is the sum of the fitted gains.
         """
-        gain = self.gain
-        adjacent = torch.nn.functional.pad(gain, (1, 1))
-        candidate = (gain >= adjacent[:, :-2]) & (gain > adjacent[:, 2:])
-        candidate &= gain > gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
+        adjacent = torch.nn.functional.pad(self.gain, (1, 1))
+        candidate = (self.gain >= adjacent[:, :-2]) & (self.gain > adjacent[:, 2:])
+        candidate &= self.gain > self.gain.amax(1, keepdim=True) * 10 ** (-_PEAK_DB / 20)
         # The lowest bin holds the recorder's offset and the room's rumble; at half the rate a sine's samples are zero.
         candidate[:, [0, -1]] = False
-        return self._agreed(candidate, count)
-
-    def _agreed(self, candidate: Bool[Tensor, "contacts bins"], count: int) -> ModalBank:
         contacts, bins = torch.nonzero(candidate, as_tuple=True)
         pitch, decay, gain = (each[contacts, bins] for each in (self.frequency, self.damping, self.gain))
         nearest, distance = _nearest(pitch, contacts, len(candidate))
@@ -151,6 +144,7 @@ class ShortTime(ModeFinder):
         """Return the lines of all bins, or of some."""
         fft_size = self._fft_size(sample_rate)
         hop = min(_power_of_two(self.hop_seconds * sample_rate, least=1), fft_size // 4)
+        bins = torch.arange(fft_size // 2 + 1) if bins is None else bins
         signals = (narrow_band(sound[None], fft_size=fft_size, hop=hop, bins=bins)[0] for sound in sounds)
         lines = [_regress(each, hop / sample_rate, fft_size // hop) for each in signals]
         gain, damping, advance, peak = (torch.stack(part) for part in zip(*lines, strict=True))
@@ -158,8 +152,7 @@ class ShortTime(ModeFinder):
         # ranking. An envelope that falls as fast as the window itself is the window's, not a mode's.
         ringing = (damping >= self.least_damping) & (damping < _WINDOW_FALL * sample_rate / fft_size)
         # The phase is known up to whole turns from one hop to the next: those that bring it nearest to the center.
-        numbers = torch.arange(gain.shape[1]) if bins is None else bins
-        center, turns = numbers.double() * (sample_rate / fft_size), sample_rate / hop
+        center, turns = bins.double() * (sample_rate / fft_size), sample_rate / hop
         frequency = center + torch.remainder(advance - center + turns / 2, turns) - turns / 2
         gain = torch.where((peak <= self.latest_peak) & ringing, gain, 0.0)
         return Lines(gain, damping, frequency, sample_rate, sample_rate / fft_size)
