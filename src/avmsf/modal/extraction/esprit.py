@@ -170,8 +170,13 @@ def _poles(band: Complex[Tensor, "contacts times"]) -> Complex128[Tensor, " pole
 def _subspace(
     band: Complex[Tensor, "contacts times"], span: int
 ) -> tuple[Float64[Tensor, " span"], Complex128[Tensor, "span span"]]:
-    """Return eigenvalues and eigenvectors of the signals' correlation, greatest first."""
-    values, vectors = torch.linalg.eigh(_correlation(band.to(torch.complex128), span))
+    """Return eigenvalues and eigenvectors of the signals' correlation, greatest first.
+
+    It is the sum of x x^H over all runs x of `span` samples: H^T H* of the signals' Hankel matrices H.
+    """
+    signals, correlation = band.to(torch.complex128), torch.zeros(span, span, dtype=torch.complex128)
+    _correlate(signals.numpy(), signals.conj().resolve_conj().numpy(), correlation.numpy())
+    values, vectors = torch.linalg.eigh(correlation)
     return values.flip(0), vectors.flip(1)
 
 
@@ -184,17 +189,10 @@ def _rotation(subspace: Complex128[Tensor, "span order"]) -> Complex128[Tensor, 
     return poles[torch.isfinite(poles.abs()) & (poles != 0)]
 
 
-def _correlation(band: Complex128[Tensor, "contacts times"], span: int) -> Complex128[Tensor, "span span"]:
-    """Return the sum of x x^H over all runs x of `span` samples: H^T H* of the signals' Hankel matrices H."""
-    whole = torch.zeros(span, span, dtype=band.dtype)
-    _correlate(band.numpy(), band.conj().resolve_conj().numpy(), whole.numpy())
-    return whole
-
-
 @compiled(error_model="numpy", nogil=True, fastmath={"reassoc", "contract"})
 @no_type_check
 def _correlate(band, conjugate, whole):
-    """Write what `_correlation` returns into zeros.
+    """Write the correlation of signals into zeros.
 
     From one entry to the next along a diagonal one product leaves the sum and one enters it, so that only the first
     row is summed in full.
