@@ -7,6 +7,7 @@ work that goes on after an interruption needs the very ones it began with.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -109,9 +110,8 @@ def extract_sounds(
     """
     if not bool(torch.isfinite(sounds).all()):
         row = int(torch.nonzero(~torch.isfinite(sounds))[0, 0])
-        raise ExtractionError.expected(
-            "finite samples", got="NaN or infinity", row=row, name="sounds", advice="record or export it again"
-        )
+        got, advice = "NaN or infinity", "record or export it again"
+        raise ExtractionError.expected("finite samples", got=got, row=row, name="sounds", advice=advice)
     finder = HighResolution() if method is None else method
     bank = finder.find(sounds, sample_rate)
     if len(bank) == 0:
@@ -176,9 +176,7 @@ def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool
     if found.alignment is not None:
         tensors |= {_ALIGNMENT + name: each for name, each in found.alignment.tensors().items()}
 
-    def write() -> None:
-        write_tensors(path, tensors, digest, _KIND)
-
+    write = partial(write_tensors, path, tensors, digest, _KIND)
     if needed:
         write()
     else:
