@@ -68,16 +68,11 @@ def remeshed(mesh: Trimesh, length: float) -> Trimesh:
     """Return a mesh with edges of about `length` meters, shorter ones only where the surface bends sharply."""
     # In this order, for what is coarsened next to long edges would keep them. A right-angled triangle with sides of
     # 1.2 and .75 lengths has none longer than the 1.5 lengths that coarsening allows, so short edges can go.
-    return coarsened(_refined(mesh, 1.2 * length), 0.75 * length, turn=_MIN_CREASE_COSINE)
-
-
-def _refined(mesh: Trimesh, longest: float) -> Trimesh:
-    """Return a mesh with all longer edges halved, again and again."""
     points, faces, count = np.asarray(mesh.vertices), np.asarray(mesh.faces), 0
     while len(faces) > count:
         count = len(faces)
-        points, faces = halved(points, faces, longest)
-    return Trimesh(points, faces, process=False)
+        points, faces = halved(points, faces, 1.2 * length)
+    return coarsened(Trimesh(points, faces, process=False), 0.75 * length, turn=_MIN_CREASE_COSINE)
 
 
 def halved(
@@ -159,14 +154,16 @@ class _EdgeCollapse:
     def _may_move(self, gone: int, stays: int) -> bool:
         """Return whether the surface stays one of much the same form."""
         shared = self._around[gone] & self._around[stays]
+        neighbors = self._neighbors(gone)
         # Two vertices that have more neighbors in common than triangles would fold the surface onto itself.
-        if len(self._neighbors(gone) & self._neighbors(stays)) != len(shared):
+        if len(neighbors & self._neighbors(stays)) != len(shared):
             return False
-        for near in self._neighbors(gone) - {stays}:
+        for near in neighbors - {stays}:
             length = self._length(stays, near)
             if length > 2.0 * self._shortest and length > self._length(gone, near):
                 return False
-        if self._on_rim(gone) and not (len(shared) == 1 and self._straight_rim(gone, stays)):
+        on_rim = len(neighbors) != len(self._around[gone])
+        if on_rim and not (len(shared) == 1 and self._straight_rim(gone, stays)):
             return False
         for row in self._around[gone] - shared:
             face = self.faces[row]
@@ -202,9 +199,6 @@ class _EdgeCollapse:
 
     def _neighbors(self, vertex: int) -> set[int]:
         return {corner for row in self._around[vertex] for corner in self.faces[row]} - {vertex}
-
-    def _on_rim(self, vertex: int) -> bool:
-        return len(self._neighbors(vertex)) != len(self._around[vertex])
 
     def _straight_rim(self, gone: int, stays: int) -> bool:
         """Return whether the rim runs on from `stays` over `gone` without a corner."""
