@@ -94,9 +94,7 @@ _FAR_FIELD_RATIO = 100.0
 """Distance of the microphones over the body's size. Pressures go with 1/distance from there on."""
 
 
-def radiated_pressure(
-    modes: ElasticModes, vibration: Vibration, *, directions: int = DIRECTIONS
-) -> Float64[Tensor, " modes"]:
+def radiated_pressure(modes: ElasticModes, vibration: Vibration) -> Float64[Tensor, " modes"]:
     """Return the pressure of each damped mode for a push of one newton second on it alone, pascals.
 
     The root mean square over directions of its amplitude in the far field, stated for a distance of `DISTANCE`.
@@ -104,6 +102,6 @@ def radiated_pressure(
     middle = 0.5 * (modes.nodes.amax(0) + modes.nodes.amin(0))
     reach = _FAR_FIELD_RATIO * float((modes.nodes.amax(0) - modes.nodes.amin(0)).norm())
     power = torch.zeros(len(vibration.poles), dtype=torch.float64)
-    for way in fibonacci_sphere(directions):
+    for way in fibonacci_sphere(DIRECTIONS):
         power += radiated(modes, vibration, middle + reach * way).abs().square()
-    return reach / DISTANCE * (power / directions).sqrt()
+    return reach / DISTANCE * (power / DIRECTIONS).sqrt()
