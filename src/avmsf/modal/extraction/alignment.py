@@ -151,13 +151,8 @@ class Alignment:
     def skeleton(cls, recordings: int, modes: int) -> dict[str, Tensor]:
         """Return tensors on the device `meta`, of the names, shapes and types that `tensors` has for these sizes."""
         each, mode = (torch.empty(size, dtype=torch.float64, device="meta") for size in (recordings, modes))
-        empty = {
-            "delays": each,
-            "agrees": each.bool(),
-            "numbers": each.new_empty(4),
-            "doubled": mode.new_empty(modes, 2),
-        }
-        return empty | dict.fromkeys(("frequency", "damping", "power", "spread"), mode)
+        empty = cls((), each, each, 0.0, 0.0, (), ModalBank(mode, mode), mode + 0j, mode, mode, 0.0, 0.0)
+        return {name: tensor.to("meta") for name, tensor in empty.tensors().items()}
 
     @classmethod
     def restore(cls, tensors: Mapping[str, Tensor], names: Sequence[str], keys: Sequence[str]) -> "Alignment":
