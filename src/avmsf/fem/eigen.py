@@ -38,8 +38,7 @@ def rigid_motions(nodes: Float64[np.ndarray, "nodes 3"], mass: scipy.sparse.csr_
     arms = nodes - (mass @ nodes).sum(axis=0) / total
     motions = np.zeros((len(nodes), 3, _RIGID))
     motions[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    for axis in range(3):
-        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], arms)
+    motions[:, :, 3:] = np.cross(np.eye(3)[:, None], arms).transpose(1, 2, 0)
     flat = motions.reshape(-1, _RIGID)
     # The turns are lengths and the shifts are not, so each is scaled before they are made orthogonal.
     flat /= np.sqrt((flat * times(mass, flat)).sum(axis=0))
@@ -104,10 +103,8 @@ def factorize(
             options={"SymmetricMode": True},
         )  # fmt: skip
     except RuntimeError as error:
-        advice = "make the tetrahedra with another detail"
-        raise SimulationError.expected(
-            "an invertible matrix", got=str(error), name="stiffness", advice=advice
-        ) from error
+        wanted, advice = "an invertible matrix", "make the tetrahedra with another detail"
+        raise SimulationError.expected(wanted, got=str(error), name="stiffness", advice=advice) from error
 
     def solve(forces: np.ndarray) -> np.ndarray:
         # Two halves side by side, which is the same on any number of processors: it releases the interpreter's lock.
