@@ -63,8 +63,8 @@ class Common:
 
     @classmethod
     def parse(cls: type[C], words: Sequence[str]) -> C:
-        """Return the options that the words spell, see `parse_options`; the module has the verb's name."""
-        return parse_options(cls, cls.__module__.rpartition(".")[2], words)
+        """Return the options that the words spell, see `parse_options`."""
+        return parse_options(cls, words)
 
     def check_inputs(self) -> None:
         """Raise the package's errors for paths and other options that cannot be used, before torch is loaded."""
@@ -89,11 +89,12 @@ class Common:
         """Raise for other options that cannot be used."""
 
 
-def parse_options(kind: type[T], verb: str, words: Sequence[str], default: T | None = None) -> T:
-    """Return the options that the words spell; leaves by SystemExit for help.
+def parse_options(kind: type[T], words: Sequence[str], default: T | None = None) -> T:
+    """Return the options that the words spell; leaves by SystemExit for help. The module of `kind` has the verb's name.
 
     Raises `InputError` for what cannot be understood.
     """
+    verb = kind.__module__.rpartition(".")[2]
     given: dict[str, Any] = {} if default is None else {"default": default}
     try:
         with redirect_stderr(io.StringIO()) as box:
@@ -154,8 +155,7 @@ class Configured(Common, ABC):
             for each in fields(cls)
             if each.default is MISSING and each.default_factory is MISSING
         }
-        verb = cls.__module__.rpartition(".")[2]
-        print(as_toml(parse_options(cls, verb, words, default=cls(**needed)).all_settings))
+        print(as_toml(parse_options(cls, words, default=cls(**needed)).all_settings))
         raise SystemExit(0)
 
 
