@@ -197,10 +197,6 @@ def _fit_shape(
     def estimator() -> GainEstimator:
         return estimator_for(config.gain_model, bodies, shape.symmetries, log=listener.note if shape.known else None)
 
-    def expect_usable_shape() -> None:
-        """Raise what is wrong with the object's shape, which shows in less time than the modes take."""
-        estimator()
-
     def find_modes(path: Path) -> None:
         listener.log(f"modes: {counted(len(train), 'recording')}, {train.duration:.3g} s at {train.sample_rate:g} Hz")
         extract_once(train, method, path, needed=True)
@@ -226,7 +222,8 @@ def _fit_shape(
         return {**recorded, **values, "surface": shape.surface_digest}
 
     if not pipeline.folder.path(MODES).exists():
-        expect_usable_shape()
+        # What is wrong with the object's shape shows in less time than the modes take.
+        estimator()
     found = pipeline.add(Stage(MODES, find_modes, recipe=lambda: recorded))
     field = pipeline.add(Stage(FIELD, train_field, (MODES,), recipe, lambda path: _is_final(path, config, bodies)))
     return StagedFit(field.path, pipeline.made, shape.report, extract_once(train, method, found.path))
