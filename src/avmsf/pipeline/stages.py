@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,6 @@ from avmsf._utils.processes import WAIT, write_lock
 from avmsf._utils.progress import ProgressListener
 from avmsf._utils.text import read_json
 from avmsf.errors import CaptureError
-
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -170,8 +167,8 @@ def digest_files(paths: Iterable[Path], *, root: Path) -> str:
     for path in sorted(paths):
         digest.update(f"{path.relative_to(root).as_posix()}\0{path.stat().st_size}\0".encode())
         with open(path, "rb") as file:
-            for block in iter(partial(file.read, _BLOCK), b""):
-                digest.update(block)
+            # The digest of all goes on with each file, as the function returns it in place of a new one.
+            hashlib.file_digest(file, lambda: digest)
     return digest.hexdigest()
 
 
