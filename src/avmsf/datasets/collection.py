@@ -14,7 +14,7 @@ from avmsf.capture.settings import TABLE, settings_of
 from avmsf.capture.table import present_impacts, read_impacts
 from avmsf.datasets.dataset import Dataset, DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.detect import detect_dataset
-from avmsf.datasets.numbering import refuse_unknown
+from avmsf.datasets.numbering import expect_known
 from avmsf.datasets.objectfolder import ObjectFolderRaw
 from avmsf.datasets.realimpact import RealImpact
 from avmsf.errors import CaptureError, DatasetError
@@ -98,8 +98,7 @@ class CaptureCollection:
         return {name: found[name] for name in in_order(found)}
 
     def _folder_of(self, identifier: str) -> Path:
-        if identifier not in self._folders:
-            refuse_unknown(identifier, self._folders, str(self.folder))
+        expect_known(identifier, self._folders, str(self.folder))
         return self._folders[identifier]
 
     def _report(self, identifier: str) -> ObjectReport:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Collection
 from difflib import get_close_matches
-from typing import NoReturn
 
 from avmsf._utils.text import in_order
 from avmsf.errors import DatasetError
@@ -76,8 +75,10 @@ def material_in(name: str) -> str | None:
     return words[-1] if words[-1] in _LAST_WORDS else None
 
 
-def refuse_unknown(identifier: str, known: Collection[str], dataset: str) -> NoReturn:
-    """Raise `DatasetError` with the objects that may have been meant."""
+def expect_known(identifier: str, known: Collection[str], dataset: str) -> None:
+    """Raise `DatasetError` for an object that is not known, with those that may have been meant."""
+    if identifier in known:
+        return
     number = number_of(identifier)
     near = [name for name in known if number is not None and number_of(name) == number]
     near += [name for name in get_close_matches(identifier, known, n=3, cutoff=0.5) if name not in near]

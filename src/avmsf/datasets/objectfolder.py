@@ -17,14 +17,7 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
-from avmsf.datasets.numbering import (
-    REALIMPACT_NAMES,
-    in_words,
-    material_in,
-    number_of,
-    refuse_unknown,
-    shared_remarks,
-)
+from avmsf.datasets.numbering import REALIMPACT_NAMES, expect_known, in_words, material_in, number_of, shared_remarks
 from avmsf.datasets.recordings import build_capture, check_wav, refuse_few
 from avmsf.errors import CaptureError, DatasetError
 
@@ -75,7 +68,7 @@ class ObjectFolderRaw:
 
         Raises DatasetError for an unknown object.
         """
-        self._check_known(identifier)
+        expect_known(identifier, self._folders, self.name)
         name = next((each for each in REALIMPACT_NAMES if number_of(each) == int(identifier)), None)
         if name is None:
             return ObjectFacts(identifier, identifier)
@@ -84,7 +77,7 @@ class ObjectFolderRaw:
     def capture(self, identifier: str) -> Capture:
         """Read one object's recordings, in the order of their numbers. Raises DatasetError for an unknown object, and
         where fewer than two recordings can be used; a warning names those that were left out."""
-        self._check_known(identifier)
+        expect_known(identifier, self._folders, self.name)
         impacts, problems = self._examine(identifier)
         origin = f"{self.name}, object {identifier}"
         refuse_few(len(impacts), origin=origin, reasons=problems or [self._no_contacts])
@@ -104,7 +97,7 @@ class ObjectFolderRaw:
 
     def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the object's scanned mesh; None where the meshes' archive was not unpacked here."""
-        self._check_known(identifier)
+        expect_known(identifier, self._folders, self.name)
         return find_mesh(self.folder, identifier)
 
     def check(self) -> DatasetReport:
@@ -144,10 +137,6 @@ class ObjectFolderRaw:
             "contact coordinates, which the audio archives do not hold: put SonicGauss's "
             f"{' and '.join(CONTACT_LISTS)} into {self.folder} or its parent"
         )
-
-    def _check_known(self, identifier: str) -> None:
-        if identifier not in self._folders:
-            refuse_unknown(identifier, self._folders, self.name)
 
     def _examine(self, identifier: str) -> tuple[list[Impact], list[str]]:
         """Return the usable recordings' impacts, and a message for each problem or assumption."""

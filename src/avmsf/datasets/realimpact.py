@@ -15,14 +15,7 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
-from avmsf.datasets.numbering import (
-    REALIMPACT_NAMES,
-    in_words,
-    material_in,
-    number_of,
-    refuse_unknown,
-    shared_remarks,
-)
+from avmsf.datasets.numbering import REALIMPACT_NAMES, expect_known, in_words, material_in, number_of, shared_remarks
 from avmsf.datasets.recordings import build_capture
 from avmsf.errors import CaptureError, DatasetError
 from avmsf.mesh.surface import Surface
@@ -75,7 +68,7 @@ class RealImpact:
     def facts(self, identifier: str) -> ObjectFacts:
         """Return what is known of an object; its material is inferred from its name. Raises DatasetError for an unknown
         one."""
-        self._check_known(identifier)
+        expect_known(identifier, self.objects(), self.name)
         material = material_in(identifier)
         return ObjectFacts(identifier, in_words(identifier), material, inferred=material is not None)
 
@@ -84,10 +77,9 @@ class RealImpact:
 
         Raises DatasetError for an unknown object, and for files that are missing, cut short or of another form.
         """
-        self._check_known(identifier)
-        origin = f"{self.name}, {identifier}"
+        folder, origin = self._folder_of(identifier), f"{self.name}, {identifier}"
         surface = self._mesh(identifier)
-        vertices, positions, microphones = (self._array(identifier, name) for name in POINTS)
+        vertices, positions, microphones = (open_array(folder / name) for name in POINTS)
         corners = surface.vertices.double().numpy()
         rows, common = closest_rows(vertices, microphones, corners)
         contacts = torch.from_numpy(positions[rows])
@@ -97,7 +89,7 @@ class RealImpact:
             wanted = f"vertexXYZ.npy within {MAX_MESH_DISTANCE_M:g} m of the vertices of {MESH}"
             raise DatasetError(
                 f"{origin}: expected {wanted}, got {farthest:.3g} m; unpack the archive again",
-                file=self.folder / identifier / FOLDER / "vertexXYZ.npy",
+                file=folder / "vertexXYZ.npy",
                 row=rows[int(off.argmax())],
                 value=farthest,
             )
@@ -114,8 +106,7 @@ class RealImpact:
 
     def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the object's textured mesh; None where it is missing."""
-        self._check_known(identifier)
-        folder = self.folder / identifier / FOLDER
+        folder = self._folder_of(identifier)
         return VisualSource(folder, CaptureSettings(surface=MESH)) if (folder / MESH).is_file() else None
 
     def check(self) -> DatasetReport:
@@ -135,15 +126,12 @@ class RealImpact:
             remarks.append(f"the meshes of {', '.join(knotted)} are self-intersecting")
         return DatasetReport(self.name, reports, tuple(missing), tuple(remarks))
 
-    def _check_known(self, identifier: str) -> None:
-        if identifier not in self.objects():
-            refuse_unknown(identifier, self.objects(), self.name)
-
-    def _array(self, identifier: str, name: str) -> np.ndarray:
-        return open_array(self.folder / identifier / FOLDER / name)
+    def _folder_of(self, identifier: str) -> Path:
+        expect_known(identifier, self.objects(), self.name)
+        return self.folder / identifier / FOLDER
 
     def _mesh(self, identifier: str) -> Surface:
-        path = self.folder / identifier / FOLDER / MESH
+        path = self._folder_of(identifier) / MESH
         if not path.is_file():
             raise DatasetError.expected("a file", file=path, advice=f"unpack {identifier}.zip again")
         try:
@@ -154,29 +142,28 @@ class RealImpact:
     def _recordings(
         self, identifier: str, rows: list[int], *, vertices: np.ndarray, positions: np.ndarray
     ) -> Iterator[tuple[Impact, Recording]]:
-        sounds = self._array(identifier, SOUNDS)
+        path = self._folder_of(identifier) / SOUNDS
+        sounds = open_array(path)
         for row in rows:
             name = f"{identifier}/{FOLDER}/{SOUNDS}, row {row}"
             sound = np.array(sounds[row], dtype=np.float64)
             if not np.isfinite(sound).all():
-                got, file = "NaN or inf", self.folder / identifier / FOLDER / SOUNDS
                 advice = f"unpack {identifier}.zip again"
-                raise DatasetError.expected("finite samples", got=got, file=file, row=row, advice=advice)
+                raise DatasetError.expected("finite samples", got="NaN or inf", file=path, row=row, advice=advice)
             recording = Recording(name, sound[None], SAMPLE_RATE_HZ, "FLOAT")
             yield Impact(f"vertex_{vertices[row]}.wav", positions[row].tolist()), recording
 
     def _report(self, identifier: str) -> ObjectReport:
-        folder = self.folder / identifier / FOLDER
-        problems = []
+        folder, problems = self._folder_of(identifier), []
         for name in FORMS:
             try:
-                self._array(identifier, name)
+                open_array(folder / name)
             except DatasetError as error:
                 problems.append(str(error))
         if not (folder / MESH).is_file():
             wanted = "a file to find the closest microphone"
             problems.append(f"{FOLDER}/{MESH}: expected {wanted}, got none; unpack it again")
-        count = 0 if problems else len(np.unique(self._array(identifier, "vertexID.npy")))
+        count = 0 if problems else len(np.unique(open_array(folder / "vertexID.npy")))
         return ObjectReport(self.facts(identifier), count, tuple(problems))
 
 
