@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import soundfile
 
 from avmsf._utils.text import in_order, parse_json, read_text
 from avmsf.capture.audio import Recording, read_recording
@@ -18,13 +19,13 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
 from avmsf.datasets.dataset import DatasetReport, ObjectFacts, ObjectReport, VisualSource
 from avmsf.datasets.numbering import REALIMPACT_NAMES, expect_known, in_words, material_in, number_of, shared_remarks
-from avmsf.datasets.recordings import build_capture, check_wav, refuse_few
+from avmsf.datasets.recordings import build_capture, refuse_few
 from avmsf.errors import CaptureError, DatasetError
 
-SAMPLE_RATE_HZ = 48_000.0
+SAMPLE_RATE_HZ = 48_000
 """Of all recordings of ObjectFolder Real."""
 FRAMES = 288_000
-"""Of each recording: 6 s, one of them before the impact."""
+"""Of each recording, at least: 6 s, one of them before the impact."""
 PAD_DB = 20.0
 """What the recorder's pad switch takes away."""
 DOWNLOAD = "https://download.cs.stanford.edu/viscam/ObjectFolder_Real"
@@ -177,10 +178,7 @@ class ObjectFolderRaw:
     def _check_folder(self, identifier: str, contact: str, folder: Path) -> tuple[list[str], float, float | None]:
         """Return why a contact's recording cannot be used, a message for each reason; its force, N, and gain, dB."""
         shown = f"{identifier}/audio/{contact}"
-        found = [
-            check_wav(folder / name, shown=f"{shown}/{name}", rate=SAMPLE_RATE_HZ, frames=FRAMES)
-            for name in ("mic.wav", "Force.wav")
-        ]
+        found = [check_wav(folder / name, shown=f"{shown}/{name}") for name in ("mic.wav", "Force.wav")]
         wrong = [str(error) for error in found if error is not None]
         newtons, gain_db = math.nan, None
         try:
@@ -294,6 +292,27 @@ def _parse_record(record: Any, path: Path, row: int) -> tuple[tuple[str, str], P
         raise DatasetError.expected("a contact of three numbers, meters", contact, file=path, row=row, name="contact")
     x, y, z = map(float, contact)
     return (str(int(found[1])), str(int(found[2]))), (x, y, z)
+
+
+def check_wav(path: Path, *, shown: str) -> DatasetError | None:
+    """Return the error of a sound file, which it calls `shown`, from its header alone; or None."""
+    advice = "unpack or download it again"
+    if not path.is_file():
+        return DatasetError.expected("a sound file", file=shown, advice=advice)
+    try:
+        header = soundfile.info(str(path))
+    except (soundfile.LibsndfileError, OSError) as error:
+        reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
+        return DatasetError.expected("a sound file", got=repr(reason), file=shown, advice=advice)
+    for name, found, expected in (
+        ("sample rate", header.samplerate, SAMPLE_RATE_HZ),
+        ("number of channels", header.channels, 1),
+        ("length in frames", header.frames, max(FRAMES, header.frames)),
+    ):
+        if found != expected:
+            advice = "take the published file"
+            return DatasetError.expected(f"a {name} of {expected}", found, file=shown, name=name, advice=advice)
+    return None
 
 
 def read_gain_db(path: Path) -> float:

@@ -2,9 +2,6 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
-from pathlib import Path
-
-import soundfile
 
 from avmsf._utils.text import listed
 from avmsf.capture.audio import Recording
@@ -63,30 +60,6 @@ def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:
     if count < MIN_RECORDINGS:
         wanted, advice = f"at least {MIN_RECORDINGS} usable recordings with contacts", listed(reasons, separator="; ")
         raise DatasetError.expected(wanted, count, name=origin, advice=advice)
-
-
-def check_wav(path: Path, *, shown: str, rate: float, frames: int) -> DatasetError | None:
-    """Return the error of a sound file, which it calls `shown`, from its header alone; or None.
-
-    Expected is one channel of at least so many frames at the rate, Hz.
-    """
-    advice = "unpack or download it again"
-    if not path.is_file():
-        return DatasetError.expected("a sound file", file=shown, advice=advice)
-    try:
-        header = soundfile.info(str(path))
-    except (soundfile.LibsndfileError, OSError) as error:
-        reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
-        return DatasetError.expected("a sound file", got=repr(reason), file=shown, advice=advice)
-    for name, found, expected in (
-        ("sample rate", header.samplerate, int(rate)),
-        ("number of channels", header.channels, 1),
-        ("length in frames", header.frames, max(frames, header.frames)),
-    ):
-        if found != expected:
-            advice = "take the published file"
-            return DatasetError.expected(f"a {name} of {expected}", found, file=shown, name=name, advice=advice)
-    return None
 
 
 def _repeated(impacts: Impacts) -> list[str]:
