@@ -148,12 +148,6 @@ class Turned:
         """Distance of each ring's first point from the axis, meters."""
         return np.hypot(*self.middle[self.rings.starts[:-1], :2].T)
 
-    def side_patch(self, rings: range, half: int, *, falling: bool = False) -> Patch:
-        """Return the outside of these rings within `half` points of angle 0, ring by ring, from below or from above."""
-        places = np.arange(-half, half + 1)
-        rows = [self.rings.rows(ring, places) for ring in (reversed(rings) if falling else rings)]
-        return self.lower.part(np.concatenate(rows))
-
     def add_foot(self, radius: float, height: float) -> None:
         """Add a foot of about this radius and this height below the lowest point, under a band of two equal rings."""
         counts = np.diff(self.rings.starts)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from avmsf.simulate.shapes.body import MIRRORED, Draft, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import MIRRORED, Draft, Patch, Symmetry, drawn_wall
 from avmsf.simulate.shapes.revolution import Profile, Turned, spline
 
 _MELT_RATIO = 0.16
@@ -113,7 +113,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     corners = [(0.0, 0.0, 1.2), (0.8, 0.0, 1.2), (0.9, 0.15, 1.0), (1.0, 1.0, 1.0)]
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=760, crowd=_CROWDING)
     ring = _ring_at(turned, 0.6 * height)
-    patch = turned.side_patch(range(ring, ring + _BANDS + 1), _HALF_WIDTH)
+    patch = _handle_patch(turned, ring)
     middle = patch.places.mean(axis=0)
     far = length * radius
     curve = smooth_curve(
@@ -139,8 +139,7 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
     if (above + below + _BANDS) % 2:
         # The diagonals of the upper patch, upside down, are the lower one's only every second band.
         below += 1
-    leaving = turned.side_patch(range(above, above + _BANDS + 1), _HALF_WIDTH)
-    arriving = turned.side_patch(range(below, below + _BANDS + 1), _HALF_WIDTH, falling=True)
+    leaving, arriving = _handle_patch(turned, above), _handle_patch(turned, below, falling=True)
     (x, _, z), (x_end, _, z_end) = leaving.places.mean(axis=0), arriving.places.mean(axis=0)
     far = max(x, x_end) + reach
     curve = smooth_curve(
@@ -159,6 +158,13 @@ def _add_handle(turned: Turned, low: float, high: float, reach: float, random: n
     widths = random.uniform(0.012, 0.015) * (1.0 - 0.15 * np.sin(math.pi * part))
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.0075, 0.0095))
     leaving.grow(swept(curve, widths, heights, leaving.places, arriving.places), end=arriving)
+
+
+def _handle_patch(turned: Turned, ring: int, *, falling: bool = False) -> Patch:
+    """Return the outside about angle 0 from a ring on, ring by ring, from below or from above."""
+    places, rings = np.arange(-_HALF_WIDTH, _HALF_WIDTH + 1), range(ring, ring + _BANDS + 1)
+    rows = [turned.rings.rows(each, places) for each in (reversed(rings) if falling else rings)]
+    return turned.lower.part(np.concatenate(rows))
 
 
 def _ring_at(turned: Turned, height: float) -> int:
