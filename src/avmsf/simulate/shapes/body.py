@@ -46,7 +46,6 @@ class SolidBuilder:
     def __init__(self) -> None:
         self._points: list[np.ndarray] = []
         self._cells: list[np.ndarray] = []
-        self._count = 0
 
     def lay(
         self,
@@ -69,9 +68,9 @@ class SolidBuilder:
 
     def place(self, places: Float64[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
         """Add points; return their rows."""
+        first = sum(map(len, self._points))
         self._points.append(places)
-        self._count += len(places)
-        return np.arange(self._count - len(places), self._count)
+        return np.arange(first, first + len(places))
 
     def fill(self, cells: Int[np.ndarray, "cells 4"]) -> None:
         """Add tetrahedra over points that are there, of positive volume."""
@@ -199,7 +198,7 @@ class Rings:
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """Rotations about one axis and mirror planes that are symmetries of a shape; compositions are not listed."""
+    """Rotations about an axis and mirror planes, through the origin, of a shape; compositions are not listed."""
 
     axis: Float64[Tensor, " 3"] | None = None
     """Direction of the axis, a unit vector; None where no turn is a symmetry."""
@@ -208,8 +207,6 @@ class Symmetry:
     approximate), and every plane that contains the axis."""
     mirrors: Float64[Tensor, "planes 3"] = field(default_factory=lambda: torch.zeros(0, 3).double())
     """Unit normals of mirror planes, apart from those that contain an axis of every angle."""
-    point: Float64[Tensor, " 3"] = field(default_factory=lambda: torch.zeros(3).double())
-    """A point of the axis and of all planes, object frame, meters."""
 
 
 ROUND = Symmetry(UP, None)
