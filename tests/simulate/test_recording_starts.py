@@ -20,8 +20,9 @@ from avmsf.photographs import read_views
 from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.simulate.ground_truth import read_truth
 from avmsf.simulate.hammer import contact_times, pulse_spectrum
-from avmsf.simulate.imperfections import recording_starts, stream
+from avmsf.simulate.imperfections import recording_starts
 from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER, Hammer, Imperfections, ObjectRecipe
+from avmsf.simulate.shapes.body import stream
 from avmsf.simulate.simulation import Simulation, recorded, simulate_object
 from avmsf.simulate.simulation_folder import example_mesh
 from factories.made_modes import breathing_sphere

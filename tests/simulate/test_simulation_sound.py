@@ -15,8 +15,9 @@ from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.material import CERAMIC, STEEL
 from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
-from avmsf.simulate.imperfections import damping_matrix, frequency_factors, smooth_field, stream, support_places
+from avmsf.simulate.imperfections import damping_matrix, frequency_factors, smooth_field, support_places
 from avmsf.simulate.recipe import Hammer, Imperfections
+from avmsf.simulate.shapes.body import stream
 from avmsf.simulate.simulation import SoundingBody, room_noise
 from factories.made_modes import breathing_sphere, sliding_plate
 from factories.raising import raises

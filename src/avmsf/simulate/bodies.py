@@ -19,9 +19,10 @@ from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import shell
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
-from avmsf.simulate.imperfections import smooth_field, stream, support_places, vary_thickness
+from avmsf.simulate.imperfections import smooth_field, support_places, vary_thickness
 from avmsf.simulate.recipe import AXES, ObjectRecipe
 from avmsf.simulate.shapes import make_shape, textured
+from avmsf.simulate.shapes.body import stream
 
 _MAX_EXTENT_M = 10.0
 """Meters along its longest side beyond which a mesh is likelier to count millimeters."""

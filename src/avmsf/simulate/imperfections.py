@@ -4,7 +4,6 @@ All random numbers of one thing come from a stream of its own, so that switching
 """
 
 import math
-import zlib
 
 import numpy as np
 import scipy.sparse
@@ -19,7 +18,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.solid import Solid
 from avmsf.mesh.rays import RayCaster
 from avmsf.simulate.recipe import Imperfections
-from avmsf.simulate.shapes.body import mitred_normals
+from avmsf.simulate.shapes.body import mitred_normals, stream
 
 _LEGS = 3
 _PATCHES = 16
@@ -33,11 +32,6 @@ _MIN_VOLUME_RATIO = 0.02
 _MAX_REPAIRS = 30
 _RAY_LEAD = 1e-4
 """How far inside of the surface rays start, in object diagonals."""
-
-
-def stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random numbers of one thing."""
-    return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def recording_starts(

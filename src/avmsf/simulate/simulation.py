@@ -25,8 +25,9 @@ from avmsf.modal.synthesis import synthesize
 from avmsf.simulate.bodies import Body, make_body, up_of
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
-from avmsf.simulate.imperfections import damping_matrix, frequency_factors, recording_starts, stream
+from avmsf.simulate.imperfections import damping_matrix, frequency_factors, recording_starts
 from avmsf.simulate.recipe import Hammer, ObjectRecipe
+from avmsf.simulate.shapes.body import stream
 from avmsf.simulate.strikes import Strikes, draw_strikes
 
 

@@ -15,8 +15,8 @@ from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.points import farthest_points
 from avmsf.mesh.rays import RayCaster
 from avmsf.mesh.surface import Surface
-from avmsf.simulate.imperfections import stream
 from avmsf.simulate.recipe import Imperfections
+from avmsf.simulate.shapes.body import stream
 
 MIN_NORMAL_HEIGHT = -0.35
 """Least height of a unit normal where a hammer gets beneath: 20 degrees of overhang above a table."""

@@ -1,6 +1,7 @@
 """What all shapes are made of: prisms laid side by side and end to end, cut into tetrahedra that fit together."""
 
 import itertools
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -227,6 +228,11 @@ class Draft:
 
 Maker = Callable[[np.random.Generator, float | None], Draft]
 """Draws the proportions of one individual; walls as thick as given, meters, or drawn too."""
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """Return the random numbers of one thing."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def drawn_wall(random: np.random.Generator, low: float, high: float, wall: float | None) -> float:

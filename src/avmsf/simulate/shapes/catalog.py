@@ -1,7 +1,6 @@
 """All kinds of shapes by name: individuals of a size and a wall, with their surface, tetrahedra and colors."""
 
 import math
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -16,7 +15,7 @@ from avmsf.fem.remeshing import halved
 from avmsf.fem.solid import Solid
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
-from avmsf.simulate.shapes.body import Draft, Maker, Symmetry
+from avmsf.simulate.shapes.body import Draft, Maker, Symmetry, stream
 from avmsf.simulate.shapes.freeform import blob
 from avmsf.simulate.shapes.revolution import bell, bottle, bowl, dish, fluted, goblet, lid, plate, pot, tube
 from avmsf.simulate.shapes.sheet import boomerang, bracket, channel, platter, scallop, spoon, tray
@@ -76,7 +75,7 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
         ) from error
     points, faces = _skin(solid)
     # The name is part of the seed: with another one, all objects have other colors.
-    colors = glaze(points, _chance(kind, seed, "colours"))
+    colors = glaze(points, stream(seed, f"{kind} colours"))
     return Shape(
         name=f"{kind}-{seed}",
         surface=Surface(torch.from_numpy(points).float(), torch.from_numpy(faces)),
@@ -89,18 +88,13 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
 
 def _sized(kind: str, seed: int, size: float | None, wall: float | None) -> tuple[Draft, float]:
     """Return a draft and the factor that brings it to its size and walls."""
-    draft = KINDS[kind](_chance(kind, seed, "form"), wall if size is None else None)
+    draft = KINDS[kind](stream(seed, f"{kind} form"), wall if size is None else None)
     if size is None or wall is None:
         return draft, 1.0 if size is None else size / draft.body.extent
     for _ in range(_MAX_DRAFTS):
         # Walls are drawn to the scale of the draft, whose size they change a little.
-        draft = KINDS[kind](_chance(kind, seed, "form"), wall / (size / draft.body.extent))
+        draft = KINDS[kind](stream(seed, f"{kind} form"), wall / (size / draft.body.extent))
     return draft, size / draft.body.extent
-
-
-def _chance(kind: str, seed: int, name: str) -> np.random.Generator:
-    """Return the random numbers of one thing about an individual."""
-    return np.random.default_rng([seed, zlib.crc32(f"{kind} {name}".encode())])
 
 
 def _skin(solid: Solid) -> tuple[Float64[np.ndarray, "points 3"], Int[np.ndarray, "faces 3"]]:
