@@ -8,12 +8,12 @@ from pathlib import Path
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, SceneError
 
-SURFACE_FILES = ("surface.obj", "surface.ply", "surface.glb", "surface.stl")
+SHAPE_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
+"""Of shapes that are read, the preferred first."""
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 SPLATS = ("splats.ply", "point_cloud.ply")
 """Names under which a folder may hold Gaussians that were made elsewhere."""
-_READ_SHAPES = (".obj", ".ply", ".glb", ".stl")
 _OTHER_NAMES = {
     **dict.fromkeys((".gltf", ".usdz", ".usd", ".fbx", ".dae", ".off", ".3mf", ".gz", ".zip"), "export surface.obj"),
     **dict.fromkeys((".spz", ".splat", ".ksplat", ".sog"), "export the Gaussians as splats.ply"),
@@ -55,7 +55,8 @@ def find_surface_file(folder: Path, settings: CaptureSettings) -> Path | None:
             wanted, advice = "a file in the capture folder", "copy it there"
             raise CaptureError.expected(wanted, settings.surface, file=folder, name="surface", advice=advice)
         return folder / named
-    return next((folder / name for name in SURFACE_FILES if (folder / name).is_file()), None)
+    usual = (folder / f"surface{suffix}" for suffix in SHAPE_SUFFIXES)
+    return next((path for path in usual if path.is_file()), None)
 
 
 def unused_files(folder: Path, settings: CaptureSettings) -> list[str]:
@@ -71,7 +72,7 @@ def unused_files(folder: Path, settings: CaptureSettings) -> list[str]:
         top, within = name.partition("/")[0], "/" in name
         if suffix in _OTHER_NAMES:
             advice[name] = _OTHER_NAMES[suffix]
-        elif suffix in _READ_SHAPES and path != surface and top not in ("sparse", *SPLATS):
+        elif suffix in SHAPE_SUFFIXES and path != surface and top not in ("sparse", *SPLATS):
             gaussians = path.name in SPLATS
             advice[name] = "copy it to splats.ply" if gaussians else f'write surface = "{name}" in capture.toml'
         elif path.name.startswith("transforms_") and suffix == ".json" and not cameras:

@@ -14,6 +14,7 @@ import soundfile
 from avmsf._utils.text import in_order, parse_json, read_text
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.checks import find_surface
+from avmsf.capture.filenames import SHAPE_SUFFIXES
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
@@ -35,7 +36,6 @@ CONTACT_LISTS = ("objectfolder_real_train.json", "objectfolder_real_val.json")
 MESH_FOLDERS = ("mesh_16k", "mesh_64k", "mesh_full")
 """The same scans in three resolutions, preferred in this order: about 16,000 faces are plenty to see where an impact
 was and to render pictures, and are read the fastest."""
-_MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _LISTED = re.compile(r"(?:^|/)(\d+)_(\d+)_[^/]*\.wav$")
 
@@ -219,8 +219,8 @@ def find_mesh(folder: Path, identifier: str) -> VisualSource | None:
     mesh in a folder `<object>`, however deep.
     """
     for place in mesh_folders(folder):
-        flat = [place / f"{identifier}{suffix}" for suffix in _MESH_SUFFIXES]
-        deep = sorted(path for path in (place / identifier).rglob("*") if path.suffix.lower() in _MESH_SUFFIXES)
+        flat = [place / f"{identifier}{suffix}" for suffix in SHAPE_SUFFIXES]
+        deep = sorted(path for path in (place / identifier).rglob("*") if path.suffix.lower() in SHAPE_SUFFIXES)
         for path in (*flat, *deep):
             if path.is_file():
                 return VisualSource(path.parent, CaptureSettings(surface=path.name))
