@@ -103,11 +103,6 @@ class Options(Many):
 
     alone = ("object", *_CONTACTS)
 
-    @property
-    def field(self) -> Path:
-        """The field, where there is one."""
-        return self.inputs[0]
-
     def of(self, given: Path, output: Path) -> "Options":
         """Return the options for one of many fields."""
         capture = None if self.capture is None else self.capture / output.name
@@ -158,7 +153,7 @@ def run(options: Options) -> int:
         users = [name for name, used in _USED.items() if each.name in used]
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
-    field = load(options.field)
+    field = load(options.inputs[0])
     source, settings = _for_format(field, options)
     written = write(
         source, options.output, to=options.to, contacts=options.contacts, noise=not options.no_noise,
@@ -272,7 +267,7 @@ def _note_size(field: "SoundField", path: Path) -> None:
 
 def _reconstructed(options: Options) -> Path | None:
     """Return the surface, in meters, that `fit` left in a cache or `demo` next to the field; print if none."""
-    field, capture = options.field, options.capture
+    field, capture = options.inputs[0], options.capture
     if capture is None:
         note("only the field's points are shown; --object or --capture adds the surface")
         return None
