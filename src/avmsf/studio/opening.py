@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from avmsf._utils.files import copy_whole
-from avmsf.capture.filenames import SPLATS, find_surface_file
+from avmsf.capture.filenames import SHAPE_SUFFIXES, SPLATS, find_surface_file
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
 from avmsf.errors import StudioError
 from avmsf.gaussians.ply import holds_gaussians
@@ -15,8 +15,6 @@ from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.pipeline.views import find_source, find_splats
 
-MESHES = (".obj", ".ply", ".glb", ".stl")
-"""Suffixes of the meshes that a capture may have as its surface."""
 MAX_MESH_BYTES = 512 << 20
 """Bytes; what a browser shows has far fewer."""
 _MATERIALS = re.compile(r"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
@@ -50,14 +48,14 @@ def open_target(target: Path, *, object: Path | None = None, capture: Path | Non
     """
     if object is not None and not object.is_file():
         raise StudioError.expected("a mesh or Gaussians", file=object, name="object", advice="check --object")
-    if capture is not None and target.suffix.lower() not in MESHES and not capture.is_dir():
+    if capture is not None and target.suffix.lower() not in SHAPE_SUFFIXES and not capture.is_dir():
         raise StudioError.expected("a capture folder", file=capture, name="capture", advice="check --capture")
     if target.is_dir():
         return _open_folder(target, object)
     if not target.is_file():
         wanted = "a field, a capture folder, a folder of images or a mesh"
         raise StudioError.expected(wanted, file=target, name="target", advice="check the path")
-    if target.suffix.lower() in MESHES:
+    if target.suffix.lower() in SHAPE_SUFFIXES:
         return _open_mesh(target, object, capture)
     home = target.resolve().parent
     if home.name == CACHE:
@@ -98,7 +96,7 @@ def _open_folder(folder: Path, object: Path | None) -> Opened:
     field = folder / CACHE / CACHED_FIELD
     opened = Opened(folder.name, folder, field if field.is_file() else None, folder, object)
     if not ((folder / TABLE).is_file() or find_object(opened) is not None or shows_more(opened)):
-        surfaces = ", ".join(f"surface{suffix}" for suffix in MESHES)
+        surfaces = ", ".join(f"surface{suffix}" for suffix in SHAPE_SUFFIXES)
         wanted = f"a capture folder with {TABLE}, images/, a video, {surfaces} or splats.ply"
         raise StudioError.expected(wanted, got="none of these", file=folder, name=TABLE, advice="add one")
     return opened
@@ -116,7 +114,7 @@ def _open_mesh(mesh: Path, object: Path | None, capture: Path | None) -> Opened:
         wanted, advice = "a capture folder or none", "name a folder by --capture"
         raise StudioError.expected(wanted, got="a file", file=folder, name="capture", advice=advice)
     surface = folder / (SPLATS[0] if holds_gaussians(mesh) else f"surface{mesh.suffix.lower()}")
-    names = (*(f"surface{suffix}" for suffix in MESHES), *SPLATS)
+    names = (*(f"surface{suffix}" for suffix in SHAPE_SUFFIXES), *SPLATS)
     others = [folder / name for name in names if (folder / name).is_file()]
     if others and not (surface in others and _same(surface, mesh)):
         wanted, advice = "a capture of this mesh", "open the folder, or name another by --capture"

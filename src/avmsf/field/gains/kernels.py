@@ -25,7 +25,7 @@ FEATURE_LENGTHS = (0.25, 0.5, 1.0)
 """Lengths of the visual kernels over the root mean square distance between the features of points."""
 VISUAL_LENGTHS = (0.2, 0.4, 0.8)
 """Lengths over the object's size of the positions' kernels that multiply the visual ones."""
-MEMORY = 4_000_000
+_MEMORY = 4_000_000
 """Numbers of a basis held at once."""
 _BLOCK = 32
 """Impacts whose basis among each other is computed for its diagonal."""
@@ -178,7 +178,7 @@ class KernelFamily:
 
     def between(self, sites: Sites, others: Sites) -> Float64[Tensor, "kernels sites others"]:
         """Return the kernels between two sets of impacts."""
-        size = max(1, MEMORY // max(1, self.shares.shape[1] * len(others)))
+        size = max(1, _MEMORY // max(1, self.shares.shape[1] * len(others)))
         rows = torch.split(torch.arange(len(sites)), size)
         parts = [sites] if len(rows) == 1 else [sites.take(each) for each in rows]
         return torch.cat([torch.einsum("hb,bso->hso", self.shares, self.basis(part, others)) for part in parts], dim=1)
