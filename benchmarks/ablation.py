@@ -118,9 +118,9 @@ def supports(settings: Settings) -> Iterator[Record]:
     held: rigidly, softly: by springs of 200 kN/m. free: taken for free; auto: the default; try: supports tried, and
     what is found; no body: by positions alone.
     """
-    plate, base = block((0.24, 0.16, 0.003), (16, 10, 1)), EndPatch("its base", (0.0, 0.0, -1.0))
+    base = EndPatch("its base", (0.0, 0.0, -1.0))
     cases = (
-        ("plate", plate, STEEL, EndPatch("a short side", (-1.0, 0.0, 0.0))),
+        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, EndPatch("a short side", (-1.0, 0.0, 0.0))),
         ("mug", make_shape("mug", size=0.1, wall=0.003).solid, CERAMIC, base),
         ("steel mug", make_shape("mug", size=0.08, wall=0.0015).solid, STEEL, base),
     )
