@@ -42,6 +42,7 @@ KINDS: dict[str, tuple[str, Better]] = {
     **dict.fromkeys(("clap", "accuracy", "read", "refused", "agreement"), ("", "higher")),
     **dict.fromkeys(("coverage", "modes", "poles", "dofs", "count", "gaussians", "inputs", "steps", "axes"), ("", "")),
     **dict.fromkeys(("coverage90", "planes", "triangles", "true", "known", "uncertainty", "named"), ("", "")),
+    **dict.fromkeys(("held", "shifting"), ("", "")),
 }
 """Unit, and which way is better, by a word of a value's name; of a name without any: no unit, the lower the better."""
 DASH = "–"
