@@ -110,7 +110,7 @@ def test_kernels_are_covariances_of_mean_one_at_the_contacts(kind, count):
 def test_kernels_do_not_depend_on_the_memory(kind, monkeypatch):
     family, others = made(kind, impacts(12, seed=1)), impacts(9, seed=2)
     whole = family.between(others, family.reference)
-    monkeypatch.setattr(kernels, "MEMORY", 1)
+    monkeypatch.setattr(kernels, "_MEMORY", 1)
     torch.testing.assert_close(family.between(others, family.reference), whole, rtol=1e-12, atol=1e-12)
 
 
