@@ -150,9 +150,11 @@ class Alignment:
     @classmethod
     def skeleton(cls, recordings: int, modes: int) -> dict[str, Tensor]:
         """Return tensors on the device `meta`, of the names, shapes and types that `tensors` has for these sizes."""
-        each, mode = (torch.empty(size, dtype=torch.float64, device="meta") for size in (recordings, modes))
-        empty = cls((), each, each, 0.0, 0.0, (), ModalBank(mode, mode), mode + 0j, mode, mode, 0.0, 0.0)
-        return {name: tensor.to("meta") for name, tensor in empty.tensors().items()}
+        # Stated one by one, since the first computation on this device takes a second.
+        sizes = {"delays": (recordings,), "agrees": (recordings,), "numbers": (4,), "doubled": (modes, 2)}
+        sizes |= dict.fromkeys(("frequency", "damping", "power", "spread"), (modes,))
+        types = {"agrees": torch.bool}
+        return {n: torch.empty(size, dtype=types.get(n, torch.float64), device="meta") for n, size in sizes.items()}
 
     @classmethod
     def restore(cls, tensors: Mapping[str, Tensor], names: Sequence[str], keys: Sequence[str]) -> "Alignment":
