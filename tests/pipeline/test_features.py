@@ -1,7 +1,5 @@
 """Features, outlines and clouds of an object's photographs or mesh."""
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,25 +16,21 @@ from avmsf.errors import CaptureError, SceneError
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.lift import Lifted
-from avmsf.field.store import load
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from avmsf.mesh import Surface
-from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.photographs.folder import write_frames
-from avmsf.pipeline.config import CACHE, PRESETS, SURFACE, LiftConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig
 from avmsf.pipeline.features import finish_features
 from avmsf.pipeline.scene import shape_of_cloud, without_far
 from avmsf.pipeline.shape import OFF_MESH, moved_onto
 from avmsf.pipeline.visual_checks import expect_contacts_in_views, expect_mesh_in_views
-from avmsf.simulate.recipe import EXAMPLE, EXAMPLE_FOLDER
 from factories.ball_views import MIDDLE, RADIUS
 from factories.clouds import cloud, random_cloud
 from factories.plate_capture import fill_plate
 from factories.raising import raises
 from factories.small_scene import slab, slab_views
-from factories.verbs import sets
 
 
 def lifted(features: torch.Tensor) -> Lifted:
@@ -232,26 +226,3 @@ def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tm
     assert torch.equal(looks.cloud("shown", views=12).centers, given.centers)
     with pytest.raises(SceneError):
         looks.cloud("hidden")
-
-
-Streams = pytest.CaptureFixture[str]
-
-
-@pytest.mark.slow
-def test_the_thickness_of_a_wall_reaches_the_report(tmp_path: Path, capsys: Streams) -> None:
-    folder = tmp_path / "mug"
-    shutil.copytree(EXAMPLE_FOLDER, folder)
-    words = [*sets("splat.steps=400 splat.start_points=3000 lift.encoder=descriptors")]
-    words += [*sets("lift.symmetry=false fit.steps=2 modes=32"), "--train-count", "12"]
-    bodies = [*sets("body.shapes=16 body.dofs=8000 body.supports=free")]
-    assert main(["fit", str(folder), *words, *bodies, "--json"]) == 0
-    made = json.loads(capsys.readouterr().out)
-    found = made["report"]["thickness"]
-    assert found["low"] < found["median"] < found["high"]
-    assert found["median"] == pytest.approx(EXAMPLE.thickness, rel=0.4)
-    field = load(made["field"])
-    assert field.origin.report["thickness"] == found
-    # Gaussians lie below the surface; the field's points are on it.
-    surface = Surface.read(folder / CACHE / SURFACE)
-    nearest = ClosestPoints(surface.vertices.double().numpy()[surface.faces.numpy()])
-    assert nearest(field.gain_field.points.double().numpy()).distances.max() < 1e-6
