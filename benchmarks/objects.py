@@ -194,7 +194,7 @@ def views_and_gaussians(name: str, settings: Settings) -> tuple[tuple[View, ...]
     views = read_views(simulated_folder(name, settings))
     if settings.clouds is None:
         return tuple(views), splat(views, config)
-    path = settings.clouds / f"{name}{'-200-steps' * settings.quick}.ply"
+    path = settings.clouds / f"{name}-{config.steps}-steps.ply"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_splats(splat(views, config), path)
