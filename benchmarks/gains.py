@@ -16,6 +16,7 @@ from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.sound_field import SoundField
+from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.locator import Locator
 from avmsf.mesh import Surface
 from avmsf.mesh.points import farthest_points
@@ -55,8 +56,9 @@ def _captures(settings: Settings) -> Iterator[Record]:
     families: the Gaussian process over the unstructured and this family alone, one end-to-end step; mixture, not
     refined: all families, one step; mixture: as `avmsf fit` has it. best simple: the mean waveform of 1 to 4 nearest
     recordings, by distance or by distance and direction, whichever is best on the held-out contacts of each split.
-    coverage: part of the held-out gains, by energy, in their intervals of 90 %. own: as in the part drift. held,
-    shifting: part of the splits in which the object is taken for held, its modes for shifting. worst: of the splits.
+    coverage: part of the held-out gains, by energy, in their intervals of 90 %. own: as in the part drift,
+    without stretching. held, shifting: part of the splits in which the object is taken for held, its modes for
+    shifting. worst: of the splits.
     """
     to_simple, to_best = [], []
     for name, counts in objects.COUNTS.items():
@@ -147,7 +149,8 @@ def _drift(settings: Settings) -> Iterator[Record]:
 
     none: all have the same frequencies. sensor: a sensor of .05 % of the object's mass is moved with the contact.
     warming: frequencies fall by .2 % from the first to the last of 40 recordings. own: of gains by least squares in
-    each held-out recording itself, at the field's frequencies and without noise.
+    each held-out recording itself, stretched to the field's frequencies, without noise. located_millimeters: median
+    distance of held-out contacts from where their recordings are located.
     """
     rows = []
     for name in settings.objects or settings.some(ABLATED):
@@ -158,7 +161,14 @@ def _drift(settings: Settings) -> Iterator[Record]:
             bodies = bodies or objects.bodies_of(objects.surface_of(capture), settings)
             case = objects.SplitCase.of(*split(capture.impacts, 8), capture, bodies)
             field = case.fit(MixtureEstimator(bodies=bodies), quick=settings.quick)
-            row |= {kind: case.error(field), f"{kind}.own": _own_error(field, case.test)}
+            test = case.test
+            prepared = Extractor(field.bank, sample_rate=test.sample_rate, samples=test.sounds.shape[1])
+            sounds = [prepared.retimed(sound) for sound in test.sounds]
+            row |= {
+                kind: case.error(field),
+                f"{kind}.own": _own_error(field, replace(test, sounds=torch.stack(sounds))),
+            }
+            row[f"{kind}.located_millimeters"] = 1000.0 * _located(field, test)[0]
         yield from records(row, object=name)
         rows.append(row)
     yield from records(means(rows), group="mean")

@@ -13,6 +13,7 @@ from avmsf.localization.likelihood import Force, Likelihood, PredictedGains
 from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate, locate_impacts
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import distinct_contacts
+from avmsf.modal.modes import ModalBank
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.located_plate import (
     PLATE,
@@ -61,6 +62,18 @@ def test_force_polarity_and_onset_do_not_matter():
     assert missed(late, late.most_probable, impacts.contacts[0]) < 0.02
     assert late.explained_energy > 0.9
     assert float(late.distance.min()) < 0.1
+
+
+@pytest.mark.parametrize("factor", [0.997, 1.002])
+def test_an_object_that_has_warmed_or_cooled_is_located_alike(factor: float) -> None:
+    field = true_field()
+    locator = Locator.of(field)
+    tuned = replace(field, bank=ModalBank(factor * field.bank.frequency, field.bank.damping))
+    for row in (3, 123, 400):
+        known, warmed = (
+            each.modal_sounds(each.known(field.gain_field.points[row, None]), 7200) for each in (field, tuned)
+        )
+        assert locator.locate(warmed[0]).most_probable == locator.locate(known[0]).most_probable
 
 
 def test_complex_gains_and_phases_are_what_the_field_renders():

@@ -9,10 +9,13 @@ them into mixtures whose errors have nothing to do with one another.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 import torch
 from jaxtyping import Complex128, Float, Float64
+from scipy.fft import next_fast_len
+from scipy.signal import resample
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
@@ -29,6 +32,16 @@ _COHERENT = 0.5
 """Correlation between the errors of two modes from which on they are looked at together."""
 _BAND = 512
 """Samples of the frames that the noise's power is measured in, at most."""
+_MAX_STRETCH = 0.004
+"""Of time, relative: steel that has warmed by 16 K."""
+_STRETCH_DEVIATION = 0.001
+"""Its standard deviation, before the sound is known."""
+_PARTS = (1 / 16, 17), (1 / 4, 9)
+"""Beginnings of a sound, as parts of it, in which it is searched for, and numbers of factors."""
+_LAST_STEPS = 5
+"""Number of factors in the whole sound."""
+_BAND_BINS = 256
+"""Bins of the bands whose evidence for a factor is added up, at most."""
 _NOISE_QUANTILE = 0.25
 """Part of the bands, and of their frames, that count as quiet."""
 
@@ -92,22 +105,59 @@ class Extractor:
         noise = torch.lerp(power[left], power[left + 1], place - left)
         return Amplitudes(values, noise, products[0], max(energy - self.samples * floor, 0.0))
 
+    def retimed(self, sound: Float[Tensor, " samples"]) -> Float[Tensor, " samples"]:
+        """Return the sound with its time stretched, by .4 % at most, so that its modes have these frequencies.
+
+        An object that has warmed or cooled sounds higher or lower by one factor. The most probable one is searched for
+        in the sound's beginning, where the likelihood is broad, then in longer parts around it.
+        """
+        factor, reach = 1.0, _MAX_STRETCH
+        for extractor, steps in self._beginnings:
+            tried = np.linspace(factor - reach, factor + reach, steps).tolist()
+            factor = max(tried, key=partial(extractor._log_probability, sound))
+            reach *= 2.0 / (steps - 1)
+        return _stretched(sound, factor, self.samples)
+
+    @cached_property
+    def _beginnings(self) -> list[tuple["Extractor", int]]:
+        """What the beginnings of sounds need that are looked at one after the other, and numbers of factors there."""
+        about = {"sample_rate": self.sample_rate, "highest": self.highest}
+        parts = [(Extractor(self.bank, samples=math.ceil(part * self.samples), **about), n) for part, n in _PARTS]
+        return [*parts, (self, _LAST_STEPS)]
+
+    def _log_probability(self, sound: Float[Tensor, " samples"], factor: float) -> float:
+        """Return the log probability of a factor on time, up to a constant: the modes' evidence band by band.
+
+        Zellner's prior of the amplitudes in a band, with the variance that is most probable there: modes beneath the
+        noise tell nothing, and noise of one band nothing of another.
+        """
+        begin = _stretched(sound, factor, self.samples).double()
+        values = self.extract(begin, color=None).values
+        left = torch.fft.rfft(begin - self._sound(values)).abs().square()
+        bands = max(2, math.ceil(len(left) / _BAND_BINS))
+        rows = torch.arange(len(left)) * bands // len(left)
+        places = (self.bank.frequency / (0.5 * self.sample_rate) * bands).long().clamp_max(bands - 1)
+        bins, modes = 2.0 * torch.bincount(rows, minlength=bands), 2.0 * torch.bincount(places, minlength=bands)
+        power = [torch.bincount(rows, each) for each in (torch.fft.rfft(begin).abs().square(), left)]
+        unexplained = (power[1] / power[0].clamp_min(1e-300)).clamp(1e-12, 1.0)
+        ratio = ((1.0 / unexplained - 1.0) * (bins - modes) / modes).nan_to_num().clamp_min(1.0) - 1.0
+        evidence = 0.5 * (bins - modes) * torch.log1p(ratio) - 0.5 * bins * torch.log1p(ratio * unexplained)
+        return float(evidence.sum()) - 0.5 * ((factor - 1.0) / _STRETCH_DEVIATION) ** 2
+
     def explained(self, sound: Float[Tensor, " samples"]) -> float:
         """Return the energy of a sound that the modes explain, noise included."""
         products = project(sound[None], poles_of(self.bank, self.sample_rate))[0][0]
         return float(products @ self.inverse @ products)
 
+    def _sound(self, values: Complex128[Tensor, " modes"]) -> Float64[Tensor, " samples"]:
+        bank, rate = self.bank, self.sample_rate
+        return synthesize(values[None], bank.frequency, bank.damping, samples=self.samples, sample_rate=rate)[0]
+
     def _noise(
         self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], color: Residual
     ) -> tuple[Float64[Tensor, " bands"], float]:
         """Return the noise's power in bands up to half the sample rate, and on the mean what is there throughout."""
-        modelled = synthesize(
-            values[None],
-            self.bank.frequency,
-            self.bank.damping,
-            samples=self.samples,
-            sample_rate=self.sample_rate,
-        )[0]
+        modelled = self._sound(values)
         # Each amplitude takes its share of the noise away.
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
         cells = free * _cell_power(sound.double() - modelled)
@@ -122,6 +172,17 @@ class Extractor:
         level = shape * torch.quantile((own / shape)[:held], _NOISE_QUANTILE)
         floor = float(shape[:held].sum()) / len(shape) * _steady((cells / shape)[:, :held])
         return torch.maximum(own, level), floor
+
+
+def _stretched(sound: Float[Tensor, " samples"], factor: float, samples: int) -> Float[Tensor, " stretched"]:
+    """Return the first samples of a sound with its time times a factor, zeros after its end."""
+    if factor == 1.0:
+        return sound[:samples]
+    # The silence keeps the end, which follows the beginning in the discrete Fourier transform, apart from it.
+    used = sound[: math.ceil((1.0 + _MAX_STRETCH) * samples)]
+    padded = torch.nn.functional.pad(used.double(), (0, next_fast_len(len(used) + _BAND) - len(used)))
+    longer = torch.from_numpy(resample(padded.numpy(), round(factor * len(padded))))[:samples]
+    return torch.nn.functional.pad(longer, (0, samples - len(longer))).to(sound)
 
 
 def _separate(

@@ -111,6 +111,7 @@ class Locator:
             used = as_samples(sound, "sound")[: self.field.samples]
         check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)
+        used = length.extractor.retimed(used)
         amplitudes = length.extractor.extract(used, color=self.field.residual)
         detuned = [each.explained(used) for each in length.detuned]
         # The energy without loud noise is uncertain, but no less than what modes explain, detuned or not.
