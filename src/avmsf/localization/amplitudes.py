@@ -112,14 +112,14 @@ class Extractor:
         in the sound's beginning, where the likelihood is broad, then in longer parts around it.
         """
         factor, reach = 1.0, _MAX_STRETCH
-        for extractor, steps in self._beginnings:
+        for extractor, steps in self.beginnings:
             tried = np.linspace(factor - reach, factor + reach, steps).tolist()
             factor = max(tried, key=partial(extractor._log_probability, sound))
             reach *= 2.0 / (steps - 1)
         return _stretched(sound, factor, self.samples)
 
     @cached_property
-    def _beginnings(self) -> list[tuple["Extractor", int]]:
+    def beginnings(self) -> list[tuple["Extractor", int]]:
         """What the beginnings of sounds need that are looked at one after the other, and numbers of factors there."""
         about = {"sample_rate": self.sample_rate, "highest": self.highest}
         parts = [(Extractor(self.bank, samples=math.ceil(part * self.samples), **about), n) for part, n in _PARTS]

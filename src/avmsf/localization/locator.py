@@ -145,7 +145,7 @@ class Locator:
     def prepare(self, *samples: int) -> None:
         """Compute now what the first sound of each of these lengths, in samples, needs."""
         for length in samples:
-            self._length(min(length, self.field.samples), float("inf"))
+            _ = self._length(min(length, self.field.samples), float("inf")).extractor.beginnings
 
     @cached_property
     def tempering_factor(self) -> float:
