@@ -163,7 +163,7 @@ def _drift(settings: Settings) -> Iterator[Record]:
             field = case.fit(MixtureEstimator(bodies=bodies), quick=settings.quick)
             test = case.test
             prepared = Extractor(field.bank, sample_rate=test.sample_rate, samples=test.sounds.shape[1])
-            sounds = [prepared.retimed(sound) for sound in test.sounds]
+            sounds = [prepared.stretched_to_modes(sound) for sound in test.sounds]
             row |= {
                 kind: case.error(field),
                 f"{kind}.own": _own_error(field, replace(test, sounds=torch.stack(sounds))),

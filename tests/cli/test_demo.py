@@ -26,7 +26,7 @@ Streams = pytest.CaptureFixture[str]
 
 
 @pytest.mark.slow
-def test_the_demo_goes_all_the_way_errs_by_half_of_the_nearest_recording_and_finds_the_wall(
+def test_the_demo_goes_all_the_way_and_errs_by_half_of_the_nearest_recording(
     tmp_path: Path, capsys: Streams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     check, fit, *_ = demo.COMMANDS
@@ -35,7 +35,7 @@ def test_the_demo_goes_all_the_way_errs_by_half_of_the_nearest_recording_and_fin
     out = capsys.readouterr().out
     printed = [shlex.split(line[2:]) for line in out.splitlines() if line.startswith("$ ")]
     assert printed == [["avmsf", *shlex.split(each.format(shlex.quote(str(folder))))] for each in demo.COMMANDS]
-    field = load(folder / "mug.safetensors")
+    made, field = (folder / "mug.safetensors").read_bytes(), load(folder / "mug.safetensors")
     assert len(field.origin.trained_on) == 12
     assert len(read_splats(folder / "mug.ply")) > 100
     assert {"mug.html", "mug-surface.ply", "capture"} < {each.name for each in folder.iterdir()}
@@ -47,13 +47,12 @@ def test_the_demo_goes_all_the_way_errs_by_half_of_the_nearest_recording_and_fin
     assert errors["field"] < 0.5 * errors["nearest recording"]
     wall = found["report"]["thickness"]
     assert wall["low"] < wall["median"] < wall["high"]
-    assert 0.6 < found["body"]["wall_thickness"] / (demo.EXAMPLE.thickness or 0.0) < 1.2
+    assert wall["median"] == pytest.approx(demo.EXAMPLE.thickness, rel=0.4)
     assert field.origin.report["thickness"] == wall
     # Gaussians lie below the surface; the field's points are on it.
     surface = Surface.read(folder / "mug-surface.ply")
     nearest = ClosestPoints(surface.vertices.double().numpy()[surface.faces.numpy()])
     assert nearest(field.gain_field.points.double().numpy()).distances.max() < 1e-6
-    made = (folder / "mug.safetensors").read_bytes()
     (folder / "capture" / "notes.txt").touch()
     assert main(["demo", str(folder), "--quiet"]) == 0
     assert (folder / "mug.safetensors").read_bytes() == made

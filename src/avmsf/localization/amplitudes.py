@@ -3,7 +3,7 @@
 With B the modes' sines and cosines, sampled, the amplitudes that fit a sound y best are c = G^-1 B' y, G = B' B, and
 noise of variance s^2 in every sample errs them by the covariance s^2 G^-1. Both matrices are known in closed form
 (`avmsf.modal.inner_products`), so that an answer costs the products B' y alone. A mode's two amplitudes are one complex
-number, sine + i cosine. Modes that the sound is too short to tell apart err together, and strongly: `mixing` turns
+number, sine + i cosine. Modes that the sound is too short to tell apart err together, and strongly: `separated` turns
 them into mixtures whose errors have nothing to do with one another.
 """
 
@@ -33,15 +33,17 @@ _COHERENT = 0.5
 _BAND = 512
 """Samples of the frames that the noise's power is measured in, at most."""
 _MAX_STRETCH = 0.004
-"""Of time, relative: steel that has warmed by 16 K."""
+"""Largest change of time, relative. Frequencies of steel fall by .01 % per kelvin, plastics' several times as fast."""
 _STRETCH_DEVIATION = 0.001
-"""Its standard deviation, before the sound is known."""
-_PARTS = (1 / 16, 17), (1 / 4, 9)
-"""Beginnings of a sound, as parts of it, in which it is searched for, and numbers of factors."""
-_LAST_STEPS = 5
-"""Number of factors in the whole sound."""
+"""Its prior standard deviation."""
+_SHORTEST = 0.1
+"""Seconds of the shortest beginning in which it is searched for; four samples per amplitude are the least, too."""
+_FIRST_STEPS, _STEPS = 33, 9
+"""Factors that are tried in the first beginning over the whole range, and in each later one between two of those."""
 _BAND_BINS = 256
-"""Bins of the bands whose evidence for a factor is added up, at most."""
+"""Bins of the bands whose evidence for it is added up, at most."""
+_FINER = 8
+"""Samples that a sound is interpolated between linearly, for each of its own: .1 % is lost at a tenth of its rate."""
 _NOISE_QUANTILE = 0.25
 """Part of the bands, and of their frames, that count as quiet."""
 
@@ -83,9 +85,14 @@ class Extractor:
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(self.gram / (scale[:, None] * scale) + ridge))
         self.inverse = inverse / (scale[:, None] * scale)
         """Its inverse: the covariance of the amplitudes' errors where the noise has variance one."""
-        self.mixing, self.spread = _separate(self.inverse)
-        """Unitary, [modes, modes]: `mixing.mH` makes mixtures of amplitudes whose errors are uncorrelated; and the
-        variance of each mixture's error where the noise has variance one."""
+
+    @cached_property
+    def separated(self) -> tuple[Complex128[Tensor, "modes modes"], Float64[Tensor, " modes"]]:
+        """Mixing, unitary, whose conjugate transpose makes mixtures of amplitudes with uncorrelated errors; and spread.
+
+        Spread is the variance of each mixture's error where the noise has variance one.
+        """
+        return _separate(self.inverse)
 
     def extract(self, sound: Float[Tensor, " samples"], *, color: Residual | None) -> Amplitudes:
         """Return the amplitudes in a sound; `color` is the noise to expect, of which the shape alone counts.
@@ -105,43 +112,52 @@ class Extractor:
         noise = torch.lerp(power[left], power[left + 1], place - left)
         return Amplitudes(values, noise, products[0], max(energy - self.samples * floor, 0.0))
 
-    def retimed(self, sound: Float[Tensor, " samples"]) -> Float[Tensor, " samples"]:
-        """Return the sound with its time stretched, by .4 % at most, so that its modes have these frequencies.
+    def stretched_to_modes(self, sound: Float[Tensor, " samples"]) -> Float[Tensor, " samples"]:
+        """Return a sound of any length as long as prepared for, with its time stretched so that it has these modes.
 
-        An object that has warmed or cooled sounds higher or lower by one factor. The most probable one is searched for
-        in the sound's beginning, where the likelihood is broad, then in longer parts around it.
+        An object that has warmed or cooled sounds higher or lower by one factor, taken as .4 % at most. The most
+        probable one is searched for in the sound's beginning, where the probability is broad, then around it in longer
+        ones.
         """
-        factor, reach = 1.0, _MAX_STRETCH
-        for extractor, steps in self.beginnings:
-            tried = np.linspace(factor - reach, factor + reach, steps).tolist()
-            factor = max(tried, key=partial(extractor._log_probability, sound))
-            reach *= 2.0 / (steps - 1)
-        return _stretched(sound, factor, self.samples)
+        used = sound[: math.ceil((1.0 + _MAX_STRETCH) * self.samples)].double().numpy()
+        # Silence after the end, which is the beginning's neighbor in the discrete Fourier transform.
+        padded = np.pad(used, (0, next_fast_len(max(len(used), self.samples) + _BAND) - len(used)))
+        finer = resample(padded, _FINER * len(padded))
+        factor, reach, steps = 1.0, _MAX_STRETCH, _FIRST_STEPS
+        for extractor in self.beginnings:
+            tried = np.linspace(factor - reach, factor + reach, steps).clip(1.0 - _MAX_STRETCH, 1.0 + _MAX_STRETCH)
+            factor = max([1.0, *tried.tolist()], key=partial(extractor._log_probability, finer))
+            reach, steps = 2.0 * reach / (steps - 1), _STEPS
+        return _stretched(finer, factor, self.samples).to(sound)
 
     @cached_property
-    def beginnings(self) -> list[tuple["Extractor", int]]:
-        """What the beginnings of sounds need that are looked at one after the other, and numbers of factors there."""
+    def beginnings(self) -> list["Extractor"]:
+        """Extractors for the first sixteenth of a sound, its first quarter and all of it, without too short ones."""
+        lengths = [math.ceil(part * self.samples) for part in (1 / 16, 1 / 4)]
+        shortest = max(_SHORTEST * self.sample_rate, 8 * len(self.bank))
         about = {"sample_rate": self.sample_rate, "highest": self.highest}
-        parts = [(Extractor(self.bank, samples=math.ceil(part * self.samples), **about), n) for part, n in _PARTS]
-        return [*parts, (self, _LAST_STEPS)]
+        return [*(Extractor(self.bank, samples=each, **about) for each in lengths if each >= shortest), self]
 
-    def _log_probability(self, sound: Float[Tensor, " samples"], factor: float) -> float:
-        """Return the log probability of a factor on time, up to a constant: the modes' evidence band by band.
+    def _log_probability(self, finer: Float64[np.ndarray, " finer"], factor: float) -> float:
+        """Return the log probability of a factor on time, up to a constant: the sum of all bands' evidence of modes.
 
-        Zellner's prior of the amplitudes in a band, with the variance that is most probable there: modes beneath the
-        noise tell nothing, and noise of one band nothing of another.
+        By Zellner's g-prior, with g by maximum likelihood in each band: modes beneath the noise tell nothing, and noise
+        of one band nothing of another.
         """
-        begin = _stretched(sound, factor, self.samples).double()
-        values = self.extract(begin, color=None).values
-        left = torch.fft.rfft(begin - self._sound(values)).abs().square()
-        bands = max(2, math.ceil(len(left) / _BAND_BINS))
-        rows = torch.arange(len(left)) * bands // len(left)
+        begin = _stretched(finer, factor, self.samples)
+        left = begin - self._sound(self.extract(begin, color=None).values)
+        whole, rest = (torch.fft.rfft(each).abs().square() for each in (begin, left))
+        bands = max(2, math.ceil(len(whole) / _BAND_BINS))
+        rows = torch.arange(len(whole)) * bands // len(whole)
         places = (self.bank.frequency / (0.5 * self.sample_rate) * bands).long().clamp_max(bands - 1)
-        bins, modes = 2.0 * torch.bincount(rows, minlength=bands), 2.0 * torch.bincount(places, minlength=bands)
-        power = [torch.bincount(rows, each) for each in (torch.fft.rfft(begin).abs().square(), left)]
-        unexplained = (power[1] / power[0].clamp_min(1e-300)).clamp(1e-12, 1.0)
-        ratio = ((1.0 / unexplained - 1.0) * (bins - modes) / modes).nan_to_num().clamp_min(1.0) - 1.0
-        evidence = 0.5 * (bins - modes) * torch.log1p(ratio) - 0.5 * bins * torch.log1p(ratio * unexplained)
+        counts = torch.bincount(places)
+        used = torch.nonzero(counts).flatten()
+        bins, amplitudes = 2.0 * torch.bincount(rows)[used], 2.0 * counts[used]
+        unexplained = torch.bincount(rows, rest)[used] / torch.bincount(rows, whole)[used].clamp_min(1e-300)
+        unexplained = unexplained.clamp(1e-12, 1.0)
+        free = bins - amplitudes
+        g = ((1.0 / unexplained - 1.0) * free / amplitudes - 1.0).clamp_min(0.0)
+        evidence = 0.5 * free * torch.log1p(g) - 0.5 * bins * torch.log1p(g * unexplained)
         return float(evidence.sum()) - 0.5 * ((factor - 1.0) / _STRETCH_DEVIATION) ** 2
 
     def explained(self, sound: Float[Tensor, " samples"]) -> float:
@@ -174,15 +190,9 @@ class Extractor:
         return torch.maximum(own, level), floor
 
 
-def _stretched(sound: Float[Tensor, " samples"], factor: float, samples: int) -> Float[Tensor, " stretched"]:
-    """Return the first samples of a sound with its time times a factor, zeros after its end."""
-    if factor == 1.0:
-        return sound[:samples]
-    # The silence keeps the end, which follows the beginning in the discrete Fourier transform, apart from it.
-    used = sound[: math.ceil((1.0 + _MAX_STRETCH) * samples)]
-    padded = torch.nn.functional.pad(used.double(), (0, next_fast_len(len(used) + _BAND) - len(used)))
-    longer = torch.from_numpy(resample(padded.numpy(), round(factor * len(padded))))[:samples]
-    return torch.nn.functional.pad(longer, (0, samples - len(longer))).to(sound)
+def _stretched(finer: Float64[np.ndarray, " finer"], factor: float, samples: int) -> Float64[Tensor, " samples"]:
+    """Return the first samples of a sound with its time times a factor, of its values at `_FINER` times the rate."""
+    return torch.from_numpy(np.interp(np.arange(samples) * (_FINER / factor), np.arange(len(finer)), finer))
 
 
 def _separate(

@@ -95,8 +95,9 @@ class Locator:
         """Return the posterior of the contact for a sound [samples] that starts at its onset, at the field's rate.
 
         The sound has 20 ms or more; what is longer than the training sounds is cut off. Modes above `highest` Hz are
-        left out, for a recording of a lower sample rate. Fields whose dampings vary with the contact are compared by
-        their mean dampings, and their gains corrected for that.
+        left out, for a recording of a lower sample rate. Time is stretched by up to .4 % where that makes the modes
+        more probable, as an object sounds that has warmed or cooled. Fields whose dampings vary with the contact are
+        compared by their mean dampings, and their gains corrected for that.
 
         `force`, where it is known, is the peak force of the impact: in newtons for a field that was fitted to sounds
         per newton (`Origin.per_newton`), and 1 for a sound that was divided by its force already; for another field,
@@ -111,7 +112,7 @@ class Locator:
             used = as_samples(sound, "sound")[: self.field.samples]
         check_sound(used.numpy()[None], self.field.sample_rate)
         length = self._length(len(used), float("inf") if highest is None else highest)
-        used = length.extractor.retimed(used)
+        used = length.extractor.stretched_to_modes(used)
         amplitudes = length.extractor.extract(used, color=self.field.residual)
         detuned = [each.explained(used) for each in length.detuned]
         # The energy without loud noise is uncertain, but no less than what modes explain, detuned or not.
@@ -145,7 +146,7 @@ class Locator:
     def prepare(self, *samples: int) -> None:
         """Compute now what the first sound of each of these lengths, in samples, needs."""
         for length in samples:
-            _ = self._length(min(length, self.field.samples), float("inf")).extractor.beginnings
+            self._length(min(length, self.field.samples), float("inf"))
 
     @cached_property
     def tempering_factor(self) -> float:
@@ -159,7 +160,9 @@ class Locator:
     def _length(self, samples: int, highest: float) -> "_Length":
         with self._lock:
             _ = self.tempering_factor
-            return self._lengths(samples, highest)
+            length = self._lengths(samples, highest)
+            _ = length.extractor.beginnings
+            return length
 
 
 class _Length:
@@ -194,11 +197,11 @@ class _Length:
 
     def separate(self, amplitudes: Amplitudes) -> tuple[Complex128[Tensor, " modes"], Float64[Tensor, " modes"]]:
         """Return the amplitudes of decorrelated mixtures of modes, and the variances of their errors."""
-        mixing = self.extractor.mixing
+        mixing, spread = self.extractor.separated
         noise = mixing.abs().square().T @ amplitudes.noise
         # Above zero, for rounding in float32.
         least = 1e-10 * float(amplitudes.values.abs().max()) ** 2
-        return mixing.mH @ amplitudes.values, noise * self.extractor.spread + least
+        return mixing.mH @ amplitudes.values, noise * spread + least
 
     def distance(
         self, values: Complex128[Tensor, " modes"], noise: Float64[Tensor, " modes"]
@@ -206,7 +209,7 @@ class _Length:
         """Return the cosine distance of each point's gains from the recorded ones without their expected noise."""
         power = values.abs().square()
         kept = ((power - noise) / power.clamp_min(1e-300)).clamp_min(0.0)
-        recorded = self.extractor.mixing @ (kept * values)
+        recorded = self.extractor.separated[0] @ (kept * values)
         return cosine_distance(self.gains, recorded, self.extractor.bank.frequency)
 
     def explained(self, amplitudes: Amplitudes, found: Likelihood, row: int) -> float:
@@ -216,7 +219,9 @@ class _Length:
             found.force[row].expand(len(extractor.bank)).abs(),
             2.0 * torch.pi * float(found.shift[row]) * extractor.bank.frequency,
         )
-        own = extractor.mixing @ self.predicted.gains[row].to(torch.complex128) * rotated * found.force[row].sign()
+        own = (
+            extractor.separated[0] @ self.predicted.gains[row].to(torch.complex128) * rotated * found.force[row].sign()
+        )
         both = torch.cat([own.real, own.imag])
         return amplitudes.part(float(2.0 * both @ amplitudes.products - both @ extractor.gram @ both))
 
@@ -234,7 +239,7 @@ def _decorrelated(
     gains: Complex64[Tensor, "points modes"], variance: Float32[Tensor, "points modes"], extractor: Extractor
 ) -> PredictedGains:
     """Return the predicted amplitudes of the decorrelated mixtures of modes."""
-    mixing = extractor.mixing
+    mixing, _ = extractor.separated
     shares = mixing.abs().square()
     correlated = torch.nonzero(torch.diagonal(shares) < 1.0 - 1e-9).flatten()
     if len(correlated):
