@@ -73,7 +73,7 @@ def test_an_object_that_has_warmed_or_cooled_is_located_alike(factor: float) -> 
     tuned = replace(field, bank=ModalBank(factor * field.bank.frequency, field.bank.damping))
     for contact in field.gain_field.points[[3, 123, 400]]:
         found = locator.locate(tuned.modal_sounds(tuned.known(contact[None]), 7200)[0])
-        assert missed(found, found.most_probable, contact) < 0.01
+        assert missed(found, found.most_probable, contact) < 0.02
         assert found.explained_energy > 0.95
 
 
