@@ -9,7 +9,7 @@ them into mixtures whose errors have nothing to do with one another.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -125,8 +125,9 @@ class Extractor:
         finer = resample(padded, _FINER * len(padded))
         factor, reach, steps = 1.0, _MAX_STRETCH, _FIRST_STEPS
         for extractor in self.beginnings:
-            tried = np.linspace(factor - reach, factor + reach, steps).clip(1.0 - _MAX_STRETCH, 1.0 + _MAX_STRETCH)
-            factor = max([1.0, *tried.tolist()], key=partial(extractor._log_probability, finer))
+            tried = np.append(np.linspace(factor - reach, factor + reach, steps), 1.0)
+            tried = tried.clip(1.0 - _MAX_STRETCH, 1.0 + _MAX_STRETCH)
+            factor = float(tried[int(extractor._log_probability(finer, tried).argmax())])
             reach, steps = 2.0 * reach / (steps - 1), _STEPS
         return _stretched(finer, factor, self.samples).to(sound)
 
@@ -138,42 +139,46 @@ class Extractor:
         about = {"sample_rate": self.sample_rate, "highest": self.highest}
         return [*(Extractor(self.bank, samples=each, **about) for each in lengths if each >= shortest), self]
 
-    def _log_probability(self, finer: Float64[np.ndarray, " finer"], factor: float) -> float:
-        """Return the log probability of a factor on time, up to a constant: the sum of all bands' evidence of modes.
+    def _log_probability(
+        self, finer: Float64[np.ndarray, " finer"], factors: Float64[np.ndarray, " factors"]
+    ) -> Float64[Tensor, " factors"]:
+        """Return the log probability of factors on time, up to a constant: the sum of all bands' evidence of modes.
 
         By Zellner's g-prior, with g by maximum likelihood in each band: modes beneath the noise tell nothing, and noise
         of one band nothing of another.
         """
-        begin = _stretched(finer, factor, self.samples)
-        left = begin - self._sound(self.extract(begin, color=None).values)
-        whole, rest = (torch.fft.rfft(each).abs().square() for each in (begin, left))
-        bands = max(2, math.ceil(len(whole) / _BAND_BINS))
-        rows = torch.arange(len(whole)) * bands // len(whole)
+        begins = torch.stack([_stretched(finer, factor, self.samples) for factor in factors.tolist()])
+        both = project(begins, poles_of(self.bank, self.sample_rate))[0] @ self.inverse
+        spectra = [torch.fft.rfft(each).abs().square() for each in (begins, begins - self._sounds(both))]
+        bands = max(2, math.ceil(spectra[0].shape[1] / _BAND_BINS))
+        rows = torch.arange(spectra[0].shape[1]) * bands // spectra[0].shape[1]
         places = (self.bank.frequency / (0.5 * self.sample_rate) * bands).long().clamp_max(bands - 1)
         counts = torch.bincount(places)
         used = torch.nonzero(counts).flatten()
         bins, amplitudes = 2.0 * torch.bincount(rows)[used], 2.0 * counts[used]
-        unexplained = torch.bincount(rows, rest)[used] / torch.bincount(rows, whole)[used].clamp_min(1e-300)
-        unexplained = unexplained.clamp(1e-12, 1.0)
-        free = bins - amplitudes
+        whole, left = (
+            torch.zeros(len(each), bands, dtype=torch.float64).index_add_(1, rows, each)[:, used] for each in spectra
+        )
+        unexplained, free = (left / whole.clamp_min(1e-300)).clamp(1e-12, 1.0), bins - amplitudes
         g = ((1.0 / unexplained - 1.0) * free / amplitudes - 1.0).clamp_min(0.0)
         evidence = 0.5 * free * torch.log1p(g) - 0.5 * bins * torch.log1p(g * unexplained)
-        return float(evidence.sum()) - 0.5 * ((factor - 1.0) / _STRETCH_DEVIATION) ** 2
+        return evidence.sum(1) - 0.5 * ((torch.from_numpy(factors) - 1.0) / _STRETCH_DEVIATION).square()
 
     def explained(self, sound: Float[Tensor, " samples"]) -> float:
         """Return the energy of a sound that the modes explain, noise included."""
         products = project(sound[None], poles_of(self.bank, self.sample_rate))[0][0]
         return float(products @ self.inverse @ products)
 
-    def _sound(self, values: Complex128[Tensor, " modes"]) -> Float64[Tensor, " samples"]:
-        bank, rate = self.bank, self.sample_rate
-        return synthesize(values[None], bank.frequency, bank.damping, samples=self.samples, sample_rate=rate)[0]
+    def _sounds(self, both: Float64[Tensor, "sounds two_modes"]) -> Float64[Tensor, "sounds samples"]:
+        """Return the sounds that these amplitudes make, of all sines and then of all cosines."""
+        bank, rate, values = self.bank, self.sample_rate, torch.complex(*both.chunk(2, dim=1))
+        return synthesize(values, bank.frequency, bank.damping, samples=self.samples, sample_rate=rate)
 
     def _noise(
         self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], color: Residual
     ) -> tuple[Float64[Tensor, " bands"], float]:
         """Return the noise's power in bands up to half the sample rate, and on the mean what is there throughout."""
-        modelled = self._sound(values)
+        modelled = self._sounds(torch.cat([values.real, values.imag])[None])[0]
         # Each amplitude takes its share of the noise away.
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
         cells = free * _cell_power(sound.double() - modelled)
