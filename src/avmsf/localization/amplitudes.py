@@ -112,7 +112,7 @@ class Extractor:
         noise = torch.lerp(power[left], power[left + 1], place - left)
         return Amplitudes(values, noise, products[0], max(energy - self.samples * floor, 0.0))
 
-    def stretched_to_modes(self, sound: Float[Tensor, " samples"]) -> Float[Tensor, " samples"]:
+    def stretched_to_modes(self, sound: Float[Tensor, " sound"]) -> Float[Tensor, " samples"]:
         """Return a sound of any length as long as prepared for, with its time stretched so that it has these modes.
 
         An object that has warmed or cooled sounds higher or lower by one factor, taken as .4 % at most. The most
