@@ -97,7 +97,7 @@ def test_gains_are_the_papers_equations(bands, layers, projection):
     assert gains.damping is None
 
 
-def test_gains_are_those_of_the_nearest_point_wherever_the_object_lies_and_however_large_it_is():
+def test_gains_are_those_of_the_nearest_point_at_any_place_and_size_of_the_object():
     moved, nudge = 3 * points() + torch.tensor([1.0, 2.0, 3.0]), torch.tensor([1e-6, 0.0, 0.0])
     here, there = (network(field=FeatureField.from_points(each)) for each in (points(), moved))
     assert torch.equal(here.predict(points() + nudge).mean, here.read(torch.arange(60)).mean)
