@@ -92,11 +92,9 @@ def suggest(
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
         points = surface[farthest_points(surface, min(MAX_POINTS, len(surface)))].double()
-        if given is None:
-            pool, ways = _reachable(gains, points)
-        else:
-            pool = given
-            _expect_on_surface(pool, gains)
+        if given is not None:
+            _expect_on_surface(given, gains)
+        pool, ways = _reachable(gains, points) if given is None else (given, ways)
         same = _SAME_POSITION_RATIO * float((points.amax(0) - points.amin(0)).norm())
         allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
         if not bool(allowed.any()):
