@@ -48,6 +48,7 @@ def test_the_demo_goes_all_the_way_and_errs_by_half_of_the_nearest_recording(
     wall = found["report"]["thickness"]
     assert wall["low"] < wall["median"] < wall["high"]
     assert wall["median"] == pytest.approx(demo.EXAMPLE.thickness, rel=0.4)
+    assert 0.6 < found["body"]["wall_thickness"] / (demo.EXAMPLE.thickness or 0.0) < 1.2
     assert field.origin.report["thickness"] == wall
     # Gaussians lie below the surface; the field's points are on it.
     surface = Surface.read(folder / "mug-surface.ply")
