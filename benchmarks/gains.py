@@ -167,8 +167,8 @@ def _drift(settings: Settings) -> Iterator[Record]:
             row |= {
                 kind: case.error(field),
                 f"{kind}.own": _own_error(field, replace(test, sounds=torch.stack(sounds))),
+                f"{kind}.located_millimeters": 1000.0 * _located(field, test)[0],
             }
-            row[f"{kind}.located_millimeters"] = 1000.0 * _located(field, test)[0]
         yield from records(row, object=name)
         rows.append(row)
     yield from records(means(rows), group="mean")

@@ -149,7 +149,8 @@ class Extractor:
         """
         begins = torch.stack([_stretched(finer, factor, self.samples) for factor in factors.tolist()])
         both = project(begins, poles_of(self.bank, self.sample_rate))[0] @ self.inverse
-        spectra = [torch.fft.rfft(each).abs().square() for each in (begins, begins - self._sounds(both))]
+        made = self._sounds(torch.complex(*both.chunk(2, dim=1)))
+        spectra = [torch.fft.rfft(each).abs().square() for each in (begins, begins - made)]
         bands = max(2, math.ceil(spectra[0].shape[1] / _BAND_BINS))
         rows = torch.arange(spectra[0].shape[1]) * bands // spectra[0].shape[1]
         places = (self.bank.frequency / (0.5 * self.sample_rate) * bands).long().clamp_max(bands - 1)
@@ -169,16 +170,16 @@ class Extractor:
         products = project(sound[None], poles_of(self.bank, self.sample_rate))[0][0]
         return float(products @ self.inverse @ products)
 
-    def _sounds(self, both: Float64[Tensor, "sounds two_modes"]) -> Float64[Tensor, "sounds samples"]:
-        """Return the sounds that these amplitudes make, of all sines and then of all cosines."""
-        bank, rate, values = self.bank, self.sample_rate, torch.complex(*both.chunk(2, dim=1))
+    def _sounds(self, values: Complex128[Tensor, "sounds modes"]) -> Float64[Tensor, "sounds samples"]:
+        """Return the sounds that amplitudes make, without noise."""
+        bank, rate = self.bank, self.sample_rate
         return synthesize(values, bank.frequency, bank.damping, samples=self.samples, sample_rate=rate)
 
     def _noise(
         self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], color: Residual
     ) -> tuple[Float64[Tensor, " bands"], float]:
         """Return the noise's power in bands up to half the sample rate, and on the mean what is there throughout."""
-        modelled = self._sounds(torch.cat([values.real, values.imag])[None])[0]
+        modelled = self._sounds(values[None])[0]
         # Each amplitude takes its share of the noise away.
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
         cells = free * _cell_power(sound.double() - modelled)
