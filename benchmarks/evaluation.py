@@ -34,6 +34,7 @@ def _evaluate(
     names: tuple[str, ...] = tuple(SIM20),
     encoder: str = DESCRIPTORS,
     paper: bool = False,
+    counts: str = "",
 ) -> Iterator[Record]:
     """Means over objects of sim-20, exact meshes, seed 0, by `avmsf evaluate`.
 
@@ -48,7 +49,7 @@ def _evaluate(
         # Training with the paper's settings has no quick form.
         methods = ",".join(each for each in methods.split(",") if not each.startswith(("paper", "av-msf")))
         options += ["--set", "modes=8", "--set", "body.dofs=2000", "--set", "edit.guide.steps=5"]
-    options += ["--time-zero", "peak"] * paper
+    options += ["--time-zero", "peak"] * paper + ["--counts", counts] * bool(counts)
     with ExitStack() as stack:
         folder = settings.results or Path(stack.enter_context(TemporaryDirectory()))
         objects, (rate, seconds) = (folder / "short", (16000, 0.5)) if paper else (folder / "objects", (48000, 2.0))
@@ -62,7 +63,7 @@ def _evaluate(
             for each in chosen:
                 (objects / each).symlink_to(simulated_folder(each, settings).resolve())
         made = folder / code_commit()
-        output = made / f"{'quick-' * settings.quick}{'paper-' * paper}{protocol}-{encoder}"
+        output = made / f"{'quick-' * settings.quick}{'paper-' * paper}{protocol}{counts}-{encoder}"
         words = ["evaluate", protocol, str(objects), "--methods", methods, "--objects", ",".join(chosen), *options]
         # All parts share what is made of an object: bodies, Gaussians and features.
         words += ["--cache", str(made / f"features-{objects.name}"), "--output", str(output)]
@@ -104,6 +105,7 @@ PARTS: dict[str, Measurement] = {
     ),
     "closest": partial(_evaluate, protocol="closest", methods="knn3,field,field-auto"),
     "shots": partial(_evaluate, protocol="shots", methods=f"{SIMPLE},{DIFFSOUND},field-auto", names=ABLATED),
+    "one-impact": partial(_evaluate, protocol="shots", methods=f"knn3,{DIFFSOUND},field-auto", counts="1"),
     "vision": partial(_evaluate, protocol="farthest", methods="knn3,field", names=ABLATED, encoder=EFFICIENTNET),
     "localize": partial(
         _evaluate,
