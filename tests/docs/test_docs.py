@@ -21,7 +21,12 @@ from avmsf.cli import VERBS, options_of
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
 LINKED = [*PAGES, REPOSITORY / "CONTRIBUTING.md"]
-COMMANDS = {*re.findall(r"^    (avmsf .+?)(?: +#.*)?$", "\n".join(page.read_text() for page in PAGES), re.MULTILINE)}
+TEXT = "\n".join(page.read_text() for page in PAGES)
+ROWS = re.findall(r"^\|.*$", TEXT, re.MULTILINE)
+COMMANDS = {
+    *re.findall(r"^    (avmsf .+?)(?: +#.*)?$", TEXT, re.MULTILINE),
+    *(command for row in ROWS for command in re.findall(r"`(avmsf \w+ .+?)`", row)),
+}
 
 
 def _blocks(language: str) -> list[str]:
@@ -140,6 +145,12 @@ def test_the_page_has_every_part_and_no_records_are_of_none(pages: ModuleType) -
     marked = {part for found in pages.MARKED.finditer(text) for part in found[2].split(" | ")[0].split()}
     assert marked == {*pages.parts(), "overview", "results"}
     assert {path.stem for path in pages.STORED.iterdir()} <= set(pages.parts())
+
+
+def test_every_part_of_a_benchmark_that_the_docs_name_exists(pages: ModuleType) -> None:
+    named = re.findall(r"python -m benchmarks ([a-z]+) --parts((?: (?!--)[\w-]+)+)", TEXT)
+    assert len(named) > 50
+    assert {f"{name}.{part}" for name, parts in named for part in parts.split()} <= {*pages.parts()}
 
 
 def test_a_number_has_three_digits_and_a_column_that_no_shown_row_has_is_of_dashes(pages: ModuleType) -> None:
