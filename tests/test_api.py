@@ -3,8 +3,6 @@
 import inspect
 import math
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 from operator import attrgetter
@@ -17,7 +15,6 @@ import torch
 import avmsf
 from avmsf.capture import Impacts
 from avmsf.cli import main
-from avmsf.editing import adjust_modes, change_material
 from avmsf.errors import (
     ArrayError,
     AvmsfError,
@@ -74,11 +71,6 @@ def test_the_top_has_the_names_that_users_start_from_and_its_packages():
         assert all(getattr(module, name) is not None for name in getattr(module, "__all__", []))
 
 
-def test_importing_the_package_imports_no_torch():
-    code = "import sys, avmsf; assert 'torch' not in sys.modules and 'numpy' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 @pytest.mark.parametrize(("size", "positions"), [(0.75, 12), (12, 12), (1, 1), (0.5, 8)])
 def test_a_split_trains_on_a_part_of_the_positions_or_on_their_number(size, positions):
     whole = avmsf.Capture("plate", plate_impacts(16))
@@ -124,12 +116,6 @@ def test_lists_and_arrays_sound_like_tensors(kind):
     down = kind([[0.0, 0.0, -1.0]])
     found = avmsf.suggest(field(), 1, candidates=kind([CONTACT]), directions=down, progress=False)
     assert found.rows.tolist() == [0]
-
-
-def test_directions_count_as_unit_vectors_and_no_direction_as_none():
-    one, other = (field().render([CONTACT], [along]) for along in ([0.0, 0.6, -0.8], [0.0, 3.0, -4.0]))
-    torch.testing.assert_close(one, other)
-    assert torch.equal(field().render([CONTACT], [[0.0, 0.0, 0.0]]), field().render([CONTACT]))
 
 
 def test_scores_of_a_recording_against_itself_are_zero():
@@ -203,20 +189,16 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
 @pytest.mark.parametrize(
     ("call", "kind", "attributes"),
     [
-        *(
-            (lambda size=size: avmsf.split(capture(), size), EvaluationError, {})
-            for size in (0.0, 1.0, -0.5, 0, 1000, "a")
-        ),
+        (lambda: avmsf.split(capture(), "a"), EvaluationError, {}),
         (lambda: avmsf.split(np.zeros((3, 3))), EvaluationError, {"name": "recordings", "value": "ndarray"}),
         (lambda: avmsf.Capture(capture().impacts, "plate"), CaptureError, {"name": "impacts", "value": "str"}),
         *(
-            (lambda method=method, where=where: getattr(field(), method)(where), ArrayError, {"name": name, "row": row})
-            for method in ("render", "posterior", "gains", "relative_gain_std")
-            for where, name, row in (
-                (CONTACT, "positions", None),
-                ([[0.05, 0.06]], "positions", None),
-                ([["a", "b", "c"]], "positions", None),
-                ([CONTACT, [0.0, math.nan, 0.0]], "positions", 1),
+            (lambda where=where: field().render(where), ArrayError, {"name": "positions", "row": row})
+            for where, row in (
+                (CONTACT, None),
+                ([[0.05, 0.06]], None),
+                ([["a", "b", "c"]], None),
+                ([CONTACT, [0.0, math.nan, 0.0]], 1),
             )
         ),
         (lambda: field().render([CONTACT], directions=[[0, 0, 1.0]] * 2), ArrayError, {"name": "directions"}),
@@ -246,7 +228,6 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         (lambda: avmsf.suggest(field(), 1, candidates=[0.02, 0.03]), ArrayError, {"name": "candidates"}),
         (lambda: avmsf.suggest(field(), 2.5), AvmsfError, {"name": "count", "value": 2.5}),
         (lambda: avmsf.edit(field()), EditError, {}),
-        (lambda: change_material(field(), "ceramic", "paper"), AvmsfError, {"name": "material", "value": "paper"}),
         (lambda: avmsf.write(field(), "plate.xyz"), ExportError, {"name": "to", "value": ".xyz"}),
         *(
             (lambda given=given: avmsf.write(field(), "new.html", **given), ExportError, attributes)
@@ -280,13 +261,6 @@ def test_a_position_near_the_object_gives_a_warning():
     with warns(PositionWarning, name="positions", row=1, value=pytest.approx(0.3 * size, rel=0.05)):
         field().render(beside)
     field().render(points)
-
-
-def test_an_edit_is_the_material_first_and_then_the_modes():
-    edited = avmsf.edit(field(), material="wood", old_material="ceramic", pitch=1.2)
-    expected = adjust_modes(change_material(field(), "ceramic", "wood"), pitch=1.2)
-    assert torch.equal(edited.bank.frequency, expected.bank.frequency)
-    assert torch.equal(edited.render([CONTACT]), expected.render([CONTACT]))
 
 
 def test_a_field_is_written_in_the_format_of_its_ending(tmp_path):

@@ -11,16 +11,13 @@ import torch
 
 from avmsf._utils.progress import ProgressDisplay
 from avmsf.cli import demo, main
-from avmsf.cli.paths import OutputError
-from avmsf.errors import FitError
 from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.mesh.closest_point import ClosestPoints
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.plate_capture import TINY, fill_plate
-from factories.raising import raises
-from factories.verbs import results_of, run_verb
+from factories.verbs import results_of
 
 Streams = pytest.CaptureFixture[str]
 
@@ -83,15 +80,6 @@ def test_the_list_to_walk_by_is_what_is_printed(field: Path, tmp_path: Path, cap
     errors = [printed["error_before"], *(each["error_after"] for each in printed["suggestions"])]
     assert errors == sorted(errors, reverse=True)
     assert (tmp_path / "next" / "suggested.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_what_cannot_be_done_is_said_before_any_work(field: Path, tmp_path: Path) -> None:
-    with raises(FitError, name="count", value=0):
-        run_verb("suggest", str(field), "--count", "0")
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    with raises(OutputError, file=blocked, value="file"):
-        run_verb("suggest", str(field), "--output", str(blocked))
 
 
 NETWORK = ("--gain-model", "network", "--without-shape", *TINY)

@@ -312,11 +312,9 @@ def test_what_cannot_be_of_many_is_refused(captures: tuple[Path, ...], tmp_path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [("--workers", "2"), ("--ray", "local")])
-def test_fields_of_many_are_those_of_each(place, captures, tmp_path, capsys):
-    if place[0] == "--ray":
-        pytest.importorskip("ray")
-    results, _ = results_of(capsys, *fit(captures, tmp_path / "many", *SMOOTH, *place))
+def test_fields_of_many_on_a_cluster_are_those_of_each(captures, tmp_path, capsys):
+    pytest.importorskip("ray")
+    results, _ = results_of(capsys, *fit(captures, tmp_path / "many", *SMOOTH, "--ray", "local"))
     found, row = results["results"]["a"], table_of(tmp_path / "many")["a"]
     assert float(row["relative STFT error"]) == pytest.approx(found["scores"]["field"]["relative_stft"], rel=0.01)
     assert float(row["by leave-one-out"]) == pytest.approx(found["report"]["quality"]["error"], rel=0.01)

@@ -390,16 +390,3 @@ def test_others_sounds_that_do_not_fit_are_refused_by_name(tmp_path):
     path.write_bytes(b"no sound")
     with raises(EvaluationError, file=path, name="bytes", value=8):
         renderer.render(test.contacts[:1])
-
-
-def test_a_digest_is_of_the_wavs_of_one_object(tmp_path: Path) -> None:
-    method = RecordedMethod("recorded", tmp_path)
-    paths = [tmp_path / name / "001.wav" for name in ("bowl", "mug")]
-    for path in paths:
-        path.parent.mkdir()
-        path.write_bytes(b"one")
-    before = method.digest("bowl")
-    paths[1].write_bytes(b"two")
-    assert method.digest("bowl") == before
-    paths[0].write_bytes(b"two")
-    assert method.digest("bowl") != before

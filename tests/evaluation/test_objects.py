@@ -78,6 +78,13 @@ def test_features_and_positions_are_of_the_same_points_and_made_once(seen: Path,
     unpooled = replace(CONFIG, lift=replace(CONFIG.lift, symmetry=False))
     plain = ObjectInputs(OneObject(seen), tmp_path / "plain", unpooled).features("slab", "visual")
     assert torch.equal(plain.features, unaligned.features)
+    # The surface is that of the views where a mesh does not count.
+    meshless = ObjectInputs(OneObject(seen, slab()), tmp_path, CONFIG, geometry="gaussians")
+    assert torch.equal(meshless.features("slab", "surface").points, bare.points)
+    # Fewer views are kept apart from all.
+    assert not torch.allclose(inputs.features("slab", "unaligned", 6).features, unaligned.features)
+    images = {place.name: len(list(place.rglob("images/*.png"))) for place in (tmp_path / "slab").iterdir()}
+    assert images == {"6 views": 6, "all views": 72}
 
 
 @pytest.mark.slow
@@ -109,15 +116,6 @@ def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: P
     assert not torch.allclose(unaligned.features, aligned.features)
 
 
-@pytest.mark.slow
-def test_fewer_views_are_kept_apart_from_all(seen: Path, tmp_path: Path) -> None:
-    inputs = ObjectInputs(OneObject(seen), tmp_path, CONFIG)
-    few, every = inputs.features("slab", "unaligned", 6), inputs.features("slab", "unaligned")
-    assert not torch.allclose(few.features, every.features)
-    images = {place.name: len(list(place.rglob("images/*.png"))) for place in (tmp_path / "slab").iterdir()}
-    assert images == {"6 views": 6, "all views": 72}
-
-
 def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> None:
     inputs = ObjectInputs(OneObject(None), tmp_path, CONFIG)
     points = inputs.features("slab", "positions").points
@@ -146,12 +144,6 @@ def test_bodies_are_held_at_points_of_the_object_that_its_user_states(tmp_path: 
     dataset.contacts = slab().vertices[:3].double()
     with raises(CaptureError, name="held", value=pytest.approx(0.76, abs=0.01)):
         ObjectInputs(dataset, tmp_path, CONFIG).bodies("slab")
-
-
-@pytest.mark.slow
-def test_the_surface_is_that_of_the_views_where_a_mesh_does_not_count(seen: Path, tmp_path: Path) -> None:
-    inputs = ObjectInputs(OneObject(seen, slab()), tmp_path, CONFIG, geometry="gaussians")
-    assert torch.equal(inputs.features("slab", "surface").points, inputs.features("slab", "positions").points)
 
 
 def test_another_recording_is_of_another_object_at_this_ones_rate_and_length(tmp_path: Path) -> None:

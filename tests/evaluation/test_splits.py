@@ -32,7 +32,6 @@ from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import (
     Choosing,
     Closest,
-    DistinctContacts,
     Farthest,
     FewerViews,
     LeaveOneOut,
@@ -102,21 +101,6 @@ def test_recordings_of_one_contact_stay_on_one_side(choosing: Choosing, apart: f
     # The contacts are those that are chosen where each is struck once.
     once = [case.train for case in choosing.cases(grid(times=1))]
     assert [tuple(row for row in case.train if row < COUNT) for case in cases] == once
-
-
-@pytest.mark.parametrize("times", [1, 2, 5])
-def test_a_fraction_is_of_contacts(times: int) -> None:
-    for fraction, count in ((0.5, 10), (0.3, 6), (0.9, 18)):
-        train, test = split(grid(times=times), fraction)
-        assert (len(train), len(test)) == (count * times, (COUNT - count) * times)
-        for choosing in (Farthest(fraction), Closest(fraction)):
-            (case,) = choosing.cases(grid(times=times))
-            assert len(case.train) == count * times
-
-
-def test_contacts_farther_apart_than_measurement_errors_are_distinct() -> None:
-    assert len(DistinctContacts.of(grid(apart=0.02)).rows) == 3 * COUNT
-    assert len(DistinctContacts.of(grid(apart=0.002)).rows) == COUNT
 
 
 def test_a_split_trains_on_farthest_points_and_tests_on_the_rest() -> None:

@@ -169,23 +169,14 @@ def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> CandidateBody:
     return replace(body, elastic=replace(body.elastic, nodes=move(body.elastic.nodes)))
 
 
-ELSEWHERE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
-    'unit "mm"': lambda x: 1000.0 * x,
-    'unit "in"': lambda x: x / 0.0254,
-    "(x, y, z) taken as": lambda x: x[:, [0, 2, 1]] * x.new_tensor([1, -1, 1]),
-    "frame": lambda x: x @ torch.linalg.qr(torch.tensor([[1.0, 2, 3], [3, 1, -2], [1, -4, 1]]).double()).Q + 0.07,
-}
-
-
-@pytest.mark.parametrize("remedy", ELSEWHERE)
-def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_told(remedy: str) -> None:
-    body = moved_body(ELSEWHERE[remedy])
+def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_told() -> None:
+    body = moved_body(lambda x: 1000.0 * x)
     report = estimator(body).solve(case())[0].report
     assert report["bodies"] == []
     with raises(FitError, name="contacts") as caught:
         estimator(body, kinds=("elastic",)).solve(case())
     assert report["unavailable"]["elastic"] == str(caught.value)
-    assert remedy in str(caught.value)
+    assert 'unit "mm"' in str(caught.value)
 
 
 @pytest.mark.slow
@@ -282,21 +273,16 @@ class Cup:
 
 
 @pytest.mark.slow
-def test_walls_cover_the_range_and_thicker_ones_are_stiffer() -> None:
-    filled, *walls = CandidateBodies(Cup(), count=6, dofs=4000).bodies
+def test_walls_cover_the_range_thicker_ones_are_stiffer_and_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
+    found = CandidateBodies(Cup(opens=False), count=6, dofs=4000)
+    filled, *walls = found.bodies
     assert filled.thickness is None
-    assert [body.thickness for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)])
-    lowest = [float(body.elastic.frequency[0]) for body in walls]
+    assert [body.thickness for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)] * 2)
+    lowest = [float(body.elastic.frequency[0]) for body in walls[:5]]
     assert lowest == sorted(lowest)
     # Of panels that bend, frequencies go with the thickness, 1.32 here; panels between thicker walls are
     # smaller, and coarse elements too stiff, more so in thinner walls.
     assert 1.2 < lowest[1] / lowest[0] < 1.6
-
-
-@pytest.mark.slow
-def test_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
-    found = CandidateBodies(Cup(opens=False), count=6, dofs=4000)
-    walls = found.bodies[1:]
     assert [body.closed for body in walls] == 5 * [False] + 5 * [True]
     for cup, box in zip(walls[:5], walls[5:], strict=True):
         assert cup.thickness == box.thickness

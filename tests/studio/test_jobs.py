@@ -3,10 +3,8 @@
 import asyncio
 import gc
 import json
-import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,7 @@ from avmsf.studio.responses import RequestError
 from avmsf.studio.worker import EventWriter, lead, make_field
 from factories.capture_folder import fill
 from factories.raising import raises
-from factories.running import alive, gone
+from factories.running import gone
 from served import blow, plate_field, run_async
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
@@ -153,19 +151,6 @@ def test_cancelling_ends_all_processes_also_of_a_worker_that_does_not_end_itself
     first, last = run_async(cancel())
     assert last == {"stage": "cancelled", "words": "stopped"}
     assert gone(first["processes"])
-
-
-@in_proc
-def test_a_worker_and_its_processes_end_where_its_server_was_killed() -> None:
-    server = f"import subprocess, time\nsubprocess.Popen({pair(LIFELINE)!r}, stdin=subprocess.PIPE)\ntime.sleep(60)"
-    with subprocess.Popen([sys.executable, "-c", server], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        processes = json.loads(process.stdout.readline())["processes"]
-        # As long as the server lives nothing happens to them.
-        time.sleep(0.3)
-        assert all(map(alive, processes))
-        process.kill()
-    assert gone(processes)
 
 
 def test_one_job_runs_at_a_time() -> None:
