@@ -261,10 +261,6 @@ def of_scale(scale: float) -> BodyFamily:
 
 REFUSED: dict[str, tuple[type[AvmsfError], Callable[[], object]]] = {
     "an unknown material": (SimulationError, lambda: DiffSoundConfig("unobtainium")),
-    "points without triangles": (
-        SimulationError,
-        lambda: body_family(Surface(sheet().vertices, torch.zeros(0, 3, dtype=torch.int64)), count=3),
-    ),
     "silence": (EvaluationError, lambda: clip_spectra(struck(torch.zeros(1, 12)))),
     "silence to level": (
         EvaluationError,

@@ -7,11 +7,11 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from avmsf.errors import AvmsfWarning, SimulationError
+from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
-from avmsf.fem.elastic_store import load_modes, modes_once, save_modes
+from avmsf.fem.elastic_store import load_modes, save_modes
 from avmsf.fem.material import GLASS
-from factories.raising import raises, warns
+from factories.raising import raises
 from oracles.block import block
 
 
@@ -29,12 +29,6 @@ def test_what_is_read_is_what_was_written(modes, tmp_path):
         assert (getattr(back.perturbations, name) == getattr(modes.perturbations, name)).all()
     assert (back.material, back.mass) == (modes.material, modes.mass)
     assert torch.equal(back.at(modes.nodes[:5]), modes.at(modes.nodes[:5]))
-
-
-def test_modes_are_used_where_they_cannot_be_kept(modes, tmp_path):
-    (tmp_path / "blocked").touch()
-    with warns(AvmsfWarning, file=tmp_path / "blocked"):
-        assert modes_once(tmp_path / "blocked" / "modes.safetensors", lambda: modes, log=print) is modes
 
 
 @pytest.mark.parametrize(

@@ -133,11 +133,6 @@ def test_surfaces_of_no_body_are_refused_with_all_reasons(make, thicknesses, ref
     assert [reason.partition(": ")[0] for reason in caught.value.value] == refused
 
 
-def test_points_alone_have_no_body():
-    with raises(SimulationError, name="faces", value=0):
-        computed(Surface(sphere().vertices, torch.zeros((0, 3), dtype=torch.int64)))
-
-
 def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(body_meshes, "free_memory", lambda: 2 * 377e6)
     with raises(SimulationError, name="memory") as caught:

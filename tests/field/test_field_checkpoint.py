@@ -62,7 +62,9 @@ def test_an_interrupted_fit_goes_on_to_the_same_result(tmp_path, stage, step):
     checkpoint, keys = tmp_path / "fit.checkpoint", Interruption((stage, step))
     with pytest.raises(KeyboardInterrupt):
         fitted(checkpoint, keys)
-    assert checkpoint.exists()
+    # Of another fit it is refused, and kept.
+    with raises(FieldFileError, file="fit.checkpoint", value=["input, configuration or version"]):
+        fitted(checkpoint, config=replace(CONFIG, seed=1))
     done = len(keys.told)
     expect_same(fitted(checkpoint, keys), uninterrupted())
     # It went on from there: no step was taken twice.
@@ -142,13 +144,3 @@ def test_all_that_decides_a_fit_tells_its_checkpoint_from_others():
     keys = [fingerprint(gain_data(*each), Attention()) for each in fits]
     assert len(set(keys)) == len(fits)
     assert fingerprint(gain_data(impacts, features, modes, CONFIG), Attention()) == keys[0]
-
-
-def test_the_checkpoint_of_another_fit_is_refused_and_kept(tmp_path):
-    checkpoint = tmp_path / "fit.checkpoint"
-    with pytest.raises(KeyboardInterrupt):
-        fitted(checkpoint, Interruption((STAGES[0], 1)))
-    before = checkpoint.read_bytes()
-    with raises(FieldFileError, file="fit.checkpoint", value=["input, configuration or version"]):
-        fitted(checkpoint, config=replace(CONFIG, seed=1))
-    assert checkpoint.read_bytes() == before

@@ -11,7 +11,6 @@ import torch
 
 from avmsf.errors import FitError
 from avmsf.evaluation.metrics import relative_stft_error
-from avmsf.features.feature_field import FeatureField
 from avmsf.field.config import PAPER, FitConfig
 from avmsf.field.gains.estimator import MixtureEstimator
 from avmsf.field.losses import spectral_loss
@@ -242,13 +241,6 @@ def test_recordings_that_cannot_be_fitted_are_refused():
     empty = Extraction(ModalBank(none, none), torch.zeros(12, 0) + 0j, modes.residual)
     with raises(FitError, name="modes", value=0):
         plate_fit(SHORT, modes=empty)
-
-
-def test_too_many_clusters_are_refused():
-    few = FeatureField.from_points(plate_impacts().contacts)
-    with pytest.raises(FitError):
-        plate_fit(FitConfig(), features=few)
-    assert plate_fit(replace(SHORT, clusters=12), features=few).gain_field.shape.clusters == 12
 
 
 def test_a_fit_that_diverges_says_so():

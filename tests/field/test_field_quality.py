@@ -75,11 +75,6 @@ def test_a_contacts_sound_does_not_depend_on_its_company(rows):
     torch.testing.assert_close(field().render(CONTACTS[rows]), sounds[rows], rtol=0, atol=1e-6 * loudest)
 
 
-def test_force_scales_noise_that_is_no_background():
-    trained = replace(field(), residual=replace(field().residual, force=None))
-    assert torch.equal(trained.render(CONTACTS, forces=4.0), 4.0 * trained.render(CONTACTS))
-
-
 def test_force_scales_the_modes_and_leaves_the_background():
     assert field().residual.force == 2.0
     modes, noise = field().render(CONTACTS, noise=False), field().noise()
@@ -138,11 +133,6 @@ def test_repeats_at_a_position_do_not_count_as_independent():
     assert twice.standard_error == pytest.approx(once.standard_error, rel=0.1)
 
 
-def earlier(field):
-    """Return a field as versions wrote it that knew no background."""
-    return replace(field, residual=replace(field.residual, force=None))
-
-
 def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     train, test = parted(clicks=True)
     field = fitted(train, modes(clicks=True))
@@ -156,7 +146,8 @@ def test_what_recordings_have_in_common_beside_their_modes_is_kept(tmp_path):
     known = load(tmp_path / "field.safetensors")
     assert torch.equal(known.render(test.contacts), field.render(test.contacts))
     # What an impact adds grows with its force, as the modes do. A mean of three has a third of the background's power.
-    (plain, full), noise = ([each.render(test.contacts) for each in (earlier(field), field)]), field.noise()
+    earlier = replace(field, residual=replace(field.residual, force=None))
+    (plain, full), noise = ([each.render(test.contacts) for each in (earlier, field)]), field.noise()
     torch.testing.assert_close(full - plain, math.sqrt(2 / 3) * noise.expand(len(test), -1), rtol=0, atol=1e-6)
     expected = 0.5 * plain + math.sqrt(1 - 0.25 / 3) * noise
     torch.testing.assert_close(field.render(test.contacts, forces=0.5), expected, rtol=0, atol=1e-6)

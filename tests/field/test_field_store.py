@@ -119,7 +119,6 @@ def put(keys: str, *value: object) -> Change:
         (tensor("residual.magnitude", torch.neg), "residual.magnitude"),
         (tensor("residual.magnitude", lambda each: each + 1e38), "residual.magnitude"),
         *((put("background_force", force), "background_force") for force in (0.0, -1.0, "1", [])),
-        (put("sizes.modes", 13), "gains.modes"),
         (put("gains.shape.width", 10**7), "gains.head.0.weight"),
         (put("gains.modes", 10**30), ...),
         (put("gains.kind", "splines"), "gains.kind"),

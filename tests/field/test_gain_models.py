@@ -274,10 +274,3 @@ def test_damaged_tensors_are_refused_by_name(name, tmp_path):
             load(changed(name, tmp_path, {key: tensor.half()}, {}))
     with raises(FieldFileError, name="gains.more", value=[[], ["gains.more"]]):
         load(changed(name, tmp_path, {"more": torch.ones(3)}, {}))
-
-
-def test_gains_of_other_modes_than_the_banks_are_not_saved(tmp_path):
-    field = FIELDS["positional"]().take(torch.tensor([0, 1, 2]))
-    with raises(FieldFileError, name="gains.modes", value=3):
-        save(sound_field(field), tmp_path / "plate")
-    assert not list(tmp_path.iterdir())

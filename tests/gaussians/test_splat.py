@@ -237,12 +237,6 @@ def test_similarity_is_wangs_formula_window_by_window() -> None:
     assert float(ssim(*map(torch.from_numpy, (first, second)))) == pytest.approx(np.mean(values), abs=1e-12)
 
 
-def test_the_gradient_is_that_of_finite_differences() -> None:
-    first, second = _images(7, 8)
-    # gradcheck's own tolerances for float64: 1e-5 absolute, 1e-3 relative.
-    assert torch.autograd.gradcheck(lambda image: ssim(image, second), first.requires_grad_())
-
-
 def test_graphics_cards_get_the_same_value_and_gradient() -> None:
     first, second = _images()
     one, other = first.clone().requires_grad_(), first.clone().requires_grad_()

@@ -217,17 +217,6 @@ def test_gains_are_the_mean_at_the_contacts_of_the_model_of_the_moved_values(shi
     assert torch.allclose(gains.read(torch.arange(CONTACTS)).mean.detach(), expected, rtol=1e-4, atol=1e-3)
 
 
-def test_a_shift_of_one_six_hundredth_moves_a_value_by_its_standard_error():
-    gains = refined()
-    with torch.no_grad():
-        gains.shift[1, 6] = 1.0 / 600.0
-        gains.shift[MODES + 3, 2] = -1.0 / 600.0
-    moved = torch.view_as_real(gains.finished(torch.arange(MODES)).values - model().values)
-    expected = torch.zeros_like(moved)
-    expected[6, 1, 0], expected[2, 3, 1] = model().noise()[1, 0], -model().noise()[3, 1]
-    assert torch.allclose(moved, expected, rtol=1e-5, atol=1e-9)
-
-
 def test_a_shift_costs_its_squares_by_the_modes_energy():
     """A mode's energy is its mean square over its damping, as it sounds."""
     share = model().values.abs().square().sum(0) / DAMPING

@@ -190,15 +190,6 @@ def test_standard_error_is_the_root_of_the_mean_noise_variance():
         assert float(mixture().standard_error()[series]) == pytest.approx(np.sqrt(total), rel=1e-8)
 
 
-def test_smoother_takes_the_values_to_the_mean_at_the_contacts():
-    other = torch.randn(CONTACTS, SERIES, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
-    for given in (mixture(), replace(mixture(), values=other)):
-        own = torch.diagonal(given.kernels, dim1=1, dim2=2)
-        (mean,) = given.average(given.kernels, own, lambda mean, _: mean)
-        smoothed = torch.einsum("scd,ds->cs", mixture().smoother(), given.values)
-        assert torch.allclose(smoothed, mean, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("groups", [torch.arange(CONTACTS), GROUPS])
 def test_leave_out_is_what_the_other_groups_predict(groups):
     """By conditioning on the others alone: their evidence weighs the hypotheses, with the same prior."""

@@ -7,7 +7,6 @@ import scipy.stats
 import torch
 from torch import Tensor
 
-from avmsf.modal.extraction.esprit import candidates
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.extraction.selection import Selection, chance_ratio, choose, merge
 from avmsf.modal.inner_products import gram, poles_of
@@ -50,21 +49,6 @@ def with_others(frequency: list[float], damping: list[float]) -> ModalBank:
 def test_chance_is_the_tail_of_chi_squared(contacts: int):
     threshold = chance_ratio(contacts, trials=10_000)
     assert scipy.stats.chi2.sf(threshold * 2 * contacts, 2 * contacts) == pytest.approx(1e-5, rel=1e-6)
-
-
-@pytest.mark.parametrize("noise", [1e-5, 1e-2])
-def test_every_mode_is_among_the_candidates(noise: float):
-    sounds = record(TRUTH, noise=noise).float()
-    level = torch.full((4, 33), noise**2)
-    found = candidates(sounds, level, sample_rate=RATE, lowest=20.0, significance=3.0)
-    frequency, damping = found.frequency, found.damping
-    for pitch, decay in zip(TRUTH.frequency.tolist(), TRUTH.damping.tolist(), strict=True):
-        near = (frequency - pitch).abs() < 0.05 * decay
-        assert near.any()
-        assert ((damping[near] / decay - 1).abs() < 0.3).any()
-    assert (frequency >= 20.0).all()
-    assert (frequency < RATE / 2).all()
-    assert (damping > 0).all()
 
 
 def test_doubles_are_merged_and_neighbors_kept():
