@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -99,25 +98,19 @@ def test_sounds_and_prompts_that_cannot_be_scored_are_refused(clap):
     silent[1] = 0.0
     with raises(EvaluationError, name="sounds", row=1, value=0.0):
         clap.embed(silent, sample_rate=RATE)
-    with raises(EvaluationError, name="sample_rate", value=0.0):
-        clap.embed(strikes(), sample_rate=0.0)
 
 
 def test_folders_that_hold_something_else_are_named(saved, tmp_path):
-    with raises(EvaluationError, file="nowhere/at/all", name="source"):
-        Clap.load("nowhere/at/all")
     with raises(EvaluationError, file=tmp_path, name="source") as caught:
         Clap.load(tmp_path)
     assert "hf download laion" in str(caught.value)
     other = tmp_path / "other"
     shutil.copytree(saved, other)
-    (other / "model.safetensors").rename(other / "kept")
+    whole = (other / "model.safetensors").read_bytes()
+    (other / "model.safetensors").write_bytes(whole[:1000])
     with raises(EvaluationError, file=other, name="source"):
         Clap.load(other)
-    (other / "model.safetensors").write_bytes((other / "kept").read_bytes()[:1000])
-    with raises(EvaluationError, file=other, name="source"):
-        Clap.load(other)
-    (other / "model.safetensors").write_bytes((other / "kept").read_bytes())
+    (other / "model.safetensors").write_bytes(whole)
     (other / "config.json").write_text(json.dumps({"model_type": "bert"}), encoding="utf-8")
     with pytest.raises(EvaluationError):
         Clap.load(other)
@@ -133,20 +126,3 @@ def test_weights_that_are_not_there_are_not_made_up(saved, tmp_path):
     missing = ("audio_projection.linear1.weight",)
     with raises(EvaluationError, file=tmp_path, name="weights", value=missing):
         Clap.load(tmp_path)
-
-
-def test_a_model_that_is_neither_here_nor_there_says_how_to_get_it(tmp_path, monkeypatch):
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
-    with raises(EvaluationError, name="source", value="laion/clap-htsat-unfused") as caught:
-        Clap.load()
-    assert "hf download laion/clap-htsat-unfused --local-dir FOLDER" in str(caught.value)
-
-
-def test_a_missing_package_is_named_with_its_remedy(saved, monkeypatch):
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with raises(EvaluationError, name="transformers") as caught:
-        Clap.load(saved)
-    assert "pip install 'avmsf[eval]'" in str(caught.value)
