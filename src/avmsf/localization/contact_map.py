@@ -50,9 +50,7 @@ class ContactPosterior:
     """The posterior of one impact's contact over the points of a surface, and the paper's cosine distance.
 
     See the paper's section Contact Localization. Methods with a `level` raise LocationError for one that is not between
-    0 and 1. What depends on the position raises LocationError where the recording was rejected: `refusal` says why, and
-    is None for one that was located. `notes` are sentences on what is doubtful, and `force` is the impact's with its
-    sign, 1 for one that sounds as the field renders it.
+    0 and 1, and what depends on the position raises it where the recording was rejected, by `refusal`.
     """
 
     def __repr__(self) -> str:

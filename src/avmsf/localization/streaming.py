@@ -54,11 +54,7 @@ _MAX_HIGHPASS_HZ = 20.0
 
 @dataclass(frozen=True, eq=False)
 class LocatedImpact:
-    """One impact of a stream and the posterior of its contact, `map`, from `used_seconds` of its sound.
-
-    It began at `seconds`, counted from the stream's first sample. `latency` is what passed from then on until this
-    estimate: the time of the audio that had come by then, and of the computation. A better one follows if not `final`.
-    """
+    """One impact of a stream, and an estimate of where it was."""
 
     seconds: float
     """Its onset, from the stream's first sample on."""
