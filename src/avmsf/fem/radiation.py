@@ -86,8 +86,6 @@ def _patches(
     return modes.nodes[middles], outward, motion
 
 
-DISTANCE = 1.0
-"""Meters that pressures are stated for."""
 DIRECTIONS = 64
 """Directions that are averaged: levels of modes are .15 to .31 dB from those of 512 on average (mug, bowl, skillet)."""
 _FAR_FIELD_RATIO = 100.0
@@ -97,11 +95,11 @@ _FAR_FIELD_RATIO = 100.0
 def radiated_pressure(modes: ElasticModes, vibration: Vibration) -> Float64[Tensor, " modes"]:
     """Return the pressure of each damped mode for a push of one newton second on it alone, pascals.
 
-    The root mean square over directions of its amplitude in the far field, stated for a distance of `DISTANCE`.
+    The root mean square over directions of its amplitude in the far field, stated for a distance of one meter.
     """
     middle = 0.5 * (modes.nodes.amax(0) + modes.nodes.amin(0))
     reach = _FAR_FIELD_RATIO * float((modes.nodes.amax(0) - modes.nodes.amin(0)).norm())
     power = torch.zeros(len(vibration.poles), dtype=torch.float64)
     for way in fibonacci_sphere(DIRECTIONS):
         power += radiated(modes, vibration, middle + reach * way).abs().square()
-    return reach / DISTANCE * (power / DIRECTIONS).sqrt()
+    return reach * (power / DIRECTIONS).sqrt()

@@ -25,8 +25,6 @@ LOCATED, NOT_LOCATED = "located", "not located"
 """Status of a recording."""
 _LEAST_RESIDUAL = 0.01
 """Lower bound of the energy fraction that detuned modes leave: less is within rounding and noise."""
-_LINK_SPACINGS = 2.5
-_LINK_FRACTION = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +160,7 @@ class ContactPosterior:
         if len(positions) < 2:
             return diagonal
         spacing = float(np.median(cKDTree(positions).query(positions, k=2)[0][:, 1]))
-        return max(_LINK_SPACINGS * spacing, _LINK_FRACTION * diagonal)
+        return max(2.5 * spacing, 0.04 * diagonal)
 
     def peaks(self, level: float = LEVEL, *, least: float = MIN_PEAK_PROBABILITY) -> tuple[Peak, ...]:
         """Return the peaks of the credible region that hold a probability of `least` or more, the largest first.

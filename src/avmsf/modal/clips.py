@@ -9,8 +9,6 @@ from torch import Tensor
 
 Sounds = Float[Tensor, "contacts samples"]
 """One a row."""
-_ATTACK = 0.02
-"""Window of a sound's level, s: about the temporal integration of loudness for a click."""
 
 
 def resampled(sounds: Sounds, *, sample_rate: float, wanted: float) -> Float[Tensor, "contacts resampled"]:
@@ -35,9 +33,9 @@ def with_length(sounds: Sounds, samples: int) -> Float[Tensor, "contacts lasting
 def level(sounds: Sounds, *, sample_rate: float) -> Float[Tensor, " contacts"]:
     """Return each sound's root mean square over its loudest 20 ms, which does not depend on its decay time.
 
-    Differentiable; never zero, so that it can be a divisor.
+    That is about how long loudness integrates a click. Differentiable; never zero, so that it can be a divisor.
     """
-    window = min(sounds.shape[1], max(1, round(_ATTACK * sample_rate)))
+    window = min(sounds.shape[1], max(1, round(0.02 * sample_rate)))
     power = torch.nn.functional.avg_pool1d(sounds.square()[:, None], window, max(1, window // 4))[:, 0]
     return power.amax(dim=1).clamp_min(torch.finfo(sounds.dtype).tiny).sqrt()
 

@@ -15,8 +15,6 @@ from torch import Tensor
 from avmsf.modal.modes import ModalBank
 
 _BLOCK = 512
-_DEAD = 1e-12
-"""Part of its beginning below which a mode is no longer followed."""
 
 
 def poles_of(bank: ModalBank, sample_rate: float) -> Complex128[Tensor, " modes"]:
@@ -88,7 +86,7 @@ def project(
     long before the sound ends.
     """
     samples, wide = sounds.shape[1], sounds.to(torch.float64)
-    needed = math.log(_DEAD) / torch.log(poles.abs()).clamp_max(-1e-300)
+    needed = math.log(1e-12) / torch.log(poles.abs()).clamp_max(-1e-300)
     inner = torch.zeros(len(sounds), len(poles), dtype=torch.complex128)
     outer = torch.zeros_like(inner)
     upper, length = math.inf, samples

@@ -18,8 +18,6 @@ from avmsf.modal.modes import ModalBank
 
 PERIOD = 131_072
 """Samples after which the sequence repeats: 3 s at 44.1 kHz."""
-FILE = "low_fluctuation_noise.npy"
-"""The sequence that the package contains, in float16."""
 MEDIAN_LEVEL = 1.054
 """Factor on the sequence with which the median of its STFT magnitudes is that of Gaussian noise of variance one."""
 
@@ -36,18 +34,14 @@ def white_sequence() -> Float[Tensor, " samples"]:
     variance one; its root mean square is .78, because the median of a Rayleigh distribution is below its root mean
     square (sqrt(ln 2) = .83) and because the magnitudes are a little below it, by `MEDIAN_LEVEL` at their median.
     """
-    with files(__package__).joinpath(FILE).open("rb") as file:
+    with files(__package__).joinpath("low_fluctuation_noise.npy").open("rb") as file:
         return torch.from_numpy(np.load(file).astype(np.float32))
 
 
 _REFERENCE = 1 << 17
 """Least number of samples of the white noise that the search for the quietest segments is calibrated on."""
-_QUIETEST = 0.1
-"""Part of the segments of each bin that are its quietest."""
 _FINENESS = 8
 """Frequencies that each band of the residual is measured at."""
-_WEAKEST = 0.25
-"""Part of the frames that the residual is measured in."""
 _ROUNDS = 50
 """Most steps of the search for the noise's power, each by at most two nepers."""
 _CONVERGED = 1e-3
@@ -154,12 +148,13 @@ def background_power(
 
 
 def _quietest_power(sounds: Float[Tensor, "contacts samples"], *, bins: int) -> Float[Tensor, "contacts bins"]:
+    """Return the mean over the quietest tenth of the segments of each bin."""
     power = _frame_power(sounds, 2 * (bins - 1))
     count = max(1, power.shape[1] // 20)
     runs = power.shape[1] // count
     # Whole runs up to the end: the end is where a sound that dies away is quietest.
     segments = power[:, power.shape[1] - runs * count :].reshape(len(power), runs, count, -1).mean(2)
-    kept = max(1, round(_QUIETEST * runs))
+    kept = max(1, round(0.1 * runs))
     power = torch.sort(segments, dim=1).values[:, :kept].mean(1)
     # At 0 Hz and half the rate the spectrum is real and scatters twice as widely: its quietest lie too low.
     power[:, 0] = torch.maximum(power[:, 0], power[:, 1])
@@ -195,7 +190,7 @@ def estimate_residual(
 def _weakest_frames(
     sound: Float[Tensor, " samples"], mode: Float[Tensor, " samples"], fft_size: int
 ) -> tuple[Float64[Tensor, "frames bins"], Float64[Tensor, "frames bins"]]:
-    """Return the power of a recording and of its modes in the frames where these are weakest, bin by bin.
+    """Return the power of a recording and of its modes in the quarter of frames where these are weakest, bin by bin.
 
     Frames of digital silence, as after a noise gate or where a recording was padded, say nothing of the noise, nor do
     the frames next to them, which overlap them.
@@ -206,7 +201,7 @@ def _weakest_frames(
     sounding &= torch.nn.functional.pad(sounding[1:], (0, 1), value=True)
     sounding &= torch.nn.functional.pad(sounding[:-1], (1, 0), value=True)
     recorded, ringing = recorded[sounding].clamp_min(_ROUNDING * float(recorded.max())), ringing[sounding]
-    frames = min(len(ringing), max(1, round(_WEAKEST * len(ringing))))
+    frames = min(len(ringing), max(1, round(0.25 * len(ringing))))
     weakest = torch.sort(ringing, dim=0, stable=True).indices[:frames]
     return recorded.gather(0, weakest), ringing.gather(0, weakest)
 

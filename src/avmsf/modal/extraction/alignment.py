@@ -45,13 +45,9 @@ from avmsf.modal.extraction.phase_likelihood import (
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import background_power
 
-_MAX_MODES = 32
-"""Modes to align by, the strongest: more cost time and hardly narrow the posterior."""
 _MIN_SEARCHED_RECORDINGS, _MIN_SEARCHED_SAMPLES = 32, 1_400_000
 """Modes are looked for in so many recordings, or in as many as hold so many samples together, whichever is more. Where
 this leaves recordings out the delays differ by less than .02 samples."""
-_MODE_RANGE_DB = 40.0
-"""Modes this far below the strongest, in energy, are left out."""
 _MAX_REFERENCES = 6
 """Recordings to start from in turn, the most energetic in their modes first."""
 _MAX_ROUNDS = 40
@@ -205,7 +201,8 @@ def strongest_modes(impacts: Impacts) -> ModalBank:
     # Drawn at random: rows may be ordered by place, in which every third may lie on the same nodal lines.
     count = max(_MIN_SEARCHED_RECORDINGS, _MIN_SEARCHED_SAMPLES // impacts.sounds.shape[1])
     drawn = torch.randperm(len(impacts), generator=torch.Generator().manual_seed(0))[:count].sort().values
-    return HighResolution(modes=_MAX_MODES, range_db=_MODE_RANGE_DB).find(impacts.sounds[drawn], impacts.sample_rate)
+    # More modes cost time and hardly narrow the posterior.
+    return HighResolution(modes=32, range_db=40.0).find(impacts.sounds[drawn], impacts.sample_rate)
 
 
 def recording_keys(impacts: Impacts) -> tuple[str, ...]:

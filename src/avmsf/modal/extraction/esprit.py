@@ -21,13 +21,10 @@ _DEPTH = 512
 """Decimated samples in a band: enough to tell modes apart, few enough for small eigenproblems."""
 SHORTEST = 256
 """Samples of the shortest beginning that is still searched."""
-_SHORTENING = 4
 _EDGE = 0.2
 """Part of a band on either side over which its filter fades: what lies there belongs to the neighbors."""
 _RINGING = 5
 """Decimated samples after the onset in which the band filter itself still rings."""
-_LEAST_FALL = 0.1
-"""Nepers over its length by which a sound must fall for its damping to be measured at all."""
 _ABOVE_NOISE = 10.0
 """Eigenvalues this far above the noise's belong to the signal. Low, for what is wrongly let in is sifted later."""
 
@@ -53,20 +50,20 @@ def candidates(
 ) -> ModalBank:
     """Return everything that may be a mode between `lowest`, Hz, and half the rate.
 
-    More than the object has: one mode may appear at several lengths, noise may look like modes, and steady hum
-    appears as a mode that falls by a tenth of a neper over the whole sound. `noise` is its
-    power in evenly spaced bands up to half the rate; bands whose spectrum nowhere reaches `significance` times it,
-    mean over the sounds, are passed over.
+    More than the object has: one mode may appear at several lengths, noise may look like modes, and steady hum appears
+    as a mode that falls by a tenth of a neper over the whole sound, too little to measure a damping by. `noise` is its
+    power in evenly spaced bands up to half the rate; bands whose spectrum nowhere reaches `significance` times it, mean
+    over the sounds, are passed over.
     """
     found = [torch.zeros(0, dtype=torch.complex128)]
     samples = sounds.shape[1]
     while samples >= SHORTEST:
         exponents = _search(sounds[:, :samples], noise, sample_rate, lowest, significance)
-        slowest = _LEAST_FALL * sample_rate / samples
+        slowest = 0.1 * sample_rate / samples
         if samples == sounds.shape[1]:
             exponents = torch.complex(exponents.real.clamp_max(-slowest), exponents.imag)
         found.append(exponents[exponents.real <= -slowest])
-        samples //= _SHORTENING
+        samples //= 4
     exponents = torch.cat(found)
     return ModalBank(exponents.imag / (2 * math.pi), -exponents.real)
 

@@ -18,13 +18,9 @@ from avmsf.modal.modes import ModalBank
 
 _PEAK_DB = 60.0
 """A bin whose envelope peaks this far below the loudest bin's holds no mode."""
-_REGRESSED_DB = 30.0
-"""The line is fitted to the envelope's first fall by this much, or down to the bin's own noise."""
 _ABOVE_NOISE_DB = 6.0
 _WINDOW_FALL = 5.0
 """How many times e a Hann window's own flank falls over its length, about."""
-_CONSENSUS = 0.5
-"""A frequency belongs to the object when at least this part of the recordings shows it, one bin off at most."""
 
 
 def narrow_band(
@@ -188,7 +184,7 @@ def _expected_by_chance(
     candidates, count = distance.shape
     if count == 1 or not candidates:
         return torch.zeros(candidates, dtype=torch.float64), torch.zeros(candidates, dtype=torch.float64)
-    others = torch.arange(max(1, math.ceil(_CONSENSUS * count) - 1), count)
+    others = torch.arange(max(1, math.ceil(0.5 * count) - 1), count)
     # Each is at distance 0 of itself.
     reach = distance.sort(1).values[:, others]
     near = -torch.expm1(-2.0 * density * reach)
@@ -215,7 +211,7 @@ def _regress(
     later = torch.clamp(peak, min=min(settling, frames - 1))
     sustained = envelope.gather(-1, later[:, None])[:, 0] > 2 * noise
     begin = torch.where(sustained, later, peak)[:, None]
-    floor = torch.maximum(envelope.gather(-1, begin) * 10 ** (-_REGRESSED_DB / 20), noise[:, None])
+    floor = torch.maximum(envelope.gather(-1, begin) * 10 ** (-30 / 20), noise[:, None])
     after = torch.arange(frames) >= begin
     fallen = after & (envelope < floor)
     end = torch.where(fallen.any(-1), fallen.to(torch.int8).argmax(-1), frames)
