@@ -156,10 +156,11 @@ def _no_mode(sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> E
 def extract_once(train: Impacts, method: ModeFinder, path: Path, *, needed: bool = False) -> Extraction:
     """Return the modes that `path` keeps of these recordings and this method; find and keep them where it has none.
 
-    Where the file cannot be written, the modes are found again next time; it is
-    an error if the file is `needed`. Raises as `extract_modes`, and FieldFileError.
+    Where the file cannot be written, the modes are found again next time; it is an error if the file is `needed`.
+    Raises as `extract_modes`, and FieldFileError.
     """
-    digest = _digest(train, method)
+    words = [version("avmsf"), source_digest(__name__), repr(method), train.names, train.sample_rate]
+    digest = content_digest(words, train.sounds, train.before, train.after)
     kept = _read(path, digest, train)
     if kept is not None:
         return kept
@@ -202,8 +203,3 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
         )
     except (FieldFileError, KeyError):
         return None
-
-
-def _digest(train: Impacts, method: ModeFinder) -> str:
-    words = [version("avmsf"), source_digest(__name__), repr(method), train.names, train.sample_rate]
-    return content_digest(words, train.sounds, train.before, train.after)
