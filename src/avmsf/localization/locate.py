@@ -34,6 +34,7 @@ WARN_ABOVE = 0.3
 """The same, above which a note says that it may be."""
 MIN_EXPLAINED = 0.1
 """Part of a sound's energy that an impact at the most probable position explains, below which a note is given."""
+_locator_of = lru_cache(maxsize=1)(Locator.of)
 
 
 def locate(
@@ -76,11 +77,6 @@ def locate(
         finder = _locator_of(field) if locator is None else locator
         found = finder.locate(impact.sound, highest=impact.highest, force=force)
     return assess_match(replace(found, notes=(*impact.notes, *found.notes)))
-
-
-@lru_cache(maxsize=1)
-def _locator_of(field: SoundField) -> Locator:
-    return Locator.of(field)
 
 
 def assess_match(found: ContactPosterior) -> ContactPosterior:
