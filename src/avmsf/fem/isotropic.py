@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from avmsf.fem.eigen import lowest_vibrations, rigid_motions
+from avmsf.fem.eigen import lowest_vibrations, rigid_motions, times
 from avmsf.fem.elastic_modes import RELATIVE_SHIFT, ElasticModes
 from avmsf.fem.elements import SecondOrder, mass, stiffness
 from avmsf.fem.material import Material
@@ -95,8 +95,7 @@ def isotropic_modes(solid: Solid, *, count: int) -> IsotropicModes:
         _, shapes = lowest_vibrations(forces, weights, rigid, count=count + _SPARE, shift=shift, supported=False)
         found.append(shapes)
     spread = np.concatenate(found, axis=1)
-    heavy = (weights @ spread.reshape(len(mesh.nodes), -1)).reshape(spread.shape)
-    squares, turned = np.linalg.eigh(spread.T @ heavy)
+    squares, turned = np.linalg.eigh(spread.T @ times(weights, spread))
     kept = squares > _DEPENDENT * squares[-1]
     basis = spread @ (turned[:, kept] / np.sqrt(squares[kept]))
     outer, triangles = mesh.surface
