@@ -155,9 +155,7 @@ def patches_about(points: Sequence[Place]) -> list[Patch]:
 def _cells(places: Float64[np.ndarray, "nodes 3"], size: float) -> list[Int[np.ndarray, " some"]]:
     """Return the rows of places in each cell: those nearest to one of a few points far from each other."""
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
-    count = min(TOLERANCES.max_cells, math.ceil(extent / (TOLERANCES.cell_extent * size)), len(places))
-    if count < 2:
-        return [np.arange(len(places))]
+    count = max(1, min(TOLERANCES.max_cells, math.ceil(extent / (TOLERANCES.cell_extent * size)), len(places)))
     outermost = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())
     centers = places[farthest_points(torch.from_numpy(places), count, start=outermost).numpy()]
     label = cKDTree(centers).query(places)[1]
