@@ -49,7 +49,10 @@ def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
     found = [(_flips(lines[row : row + 1], signs[row : row + 1]), _SIGNS) for row in range(len(mirrors))]
     for each in turns:
         angles = each.angles(TURNS)
-        found.append((rotations(each.axis.double().numpy(), angles[1:]), _cyclic(len(angles))))
+        order = len(angles)
+        # The real characters of a turn's group: waves of each number around the axis.
+        waves = np.cos(2.0 * np.pi / order * np.outer(np.arange(order // 2 + 1), np.arange(order)))
+        found.append((rotations(each.axis.double().numpy(), angles[1:]), waves))
     flips = [True] * len(mirrors) + [len(each.angles(TURNS)) % 2 == 0 for each in turns]
     found += [(pair, np.kron(_SIGNS, _SIGNS)) for pair in _pairs(lines[flips], signs[flips])]
     groups = []
@@ -63,11 +66,6 @@ def groups_of(symmetries: Symmetries) -> tuple[Group, ...]:
 def _flips(lines: Points, signs: Float[np.ndarray, " points"]) -> Matrices:
     """Return the half turn about each line (sign 1), or the reflection along it (sign -1)."""
     return -signs[:, None, None] * reflections(lines)
-
-
-def _cyclic(order: int) -> Float[np.ndarray, "characters order"]:
-    """Return the real characters of a turn's group: waves of each number around the axis."""
-    return np.cos(2.0 * np.pi / order * np.outer(np.arange(order // 2 + 1), np.arange(order)))
 
 
 def _pairs(lines: Points, signs: Float[np.ndarray, " points"]) -> list[Matrices]:
