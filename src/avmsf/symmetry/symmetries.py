@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -132,8 +132,7 @@ def _numbers(values: Float[Tensor, " 3"]) -> str:
 
 
 def _stored(symmetry: RotationalSymmetry | MirrorSymmetry) -> dict[str, Any]:
-    values = {each.name: getattr(symmetry, each.name) for each in fields(symmetry)}
-    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in values.items()}
+    return {name: value.tolist() if isinstance(value, Tensor) else value for name, value in vars(symmetry).items()}
 
 
 def _read(stored: Mapping[str, Any]) -> dict[str, Any]:
