@@ -84,9 +84,8 @@ def location_errors(file: str | None = None) -> Iterator[None]:
     try:
         yield
     except (ArrayError, CaptureError) as error:
-        if error.file is not None or file is None:
-            raise LocationError(str(error), **error.attributes) from error
-        raise LocationError(f"{file}: {error}", **{**error.attributes, "file": file}) from error
+        known = error if error.file is not None or file is None else error.about(Path(file))
+        raise LocationError(str(known), **known.attributes) from error
 
 
 def open_recording(
