@@ -236,10 +236,8 @@ def _springs(mesh: SecondOrder, places: Float[Tensor, "springs 3"], strength: fl
     """Return the stiffness that springs at the nearest points of the surface add, spread over a triangle's nodes."""
     triangles = mesh.boundary
     found = ClosestPoints(mesh.nodes[triangles[:, :3]])(places.double().numpy())
-    begins = 6 * np.arange(len(places) + 1)
-    held = scipy.sparse.csr_array(
-        (_quadratic(found).ravel(), triangles[found.rows].ravel(), begins), shape=(len(places), len(mesh.nodes))
-    )
+    parts = _quadratic(found).ravel(), triangles[found.rows].ravel(), 6 * np.arange(len(places) + 1)
+    held = scipy.sparse.csr_array(parts, shape=(len(places), len(mesh.nodes)))
     return scipy.sparse.kron(strength * (held.T @ held), scipy.sparse.eye_array(3), format="csr")
 
 

@@ -63,14 +63,8 @@ class IsotropicModes:
         squares, mixed = torch.linalg.eigh(self._stiffness(torch.tensor(material.poisson, dtype=torch.float64)))
         shapes = torch.einsum("nbd,bm->nmd", self.shapes, mixed[:, : self.count]) / math.sqrt(material.density)
         frequency = (material.young / material.density * squares[: self.count]).sqrt() / (2.0 * math.pi)
-        return ElasticModes(
-            frequency=frequency,
-            nodes=self.nodes,
-            triangles=self.triangles,
-            shapes=shapes.contiguous(),
-            material=material,
-            mass=material.density * self.volume,
-        )
+        kilograms = material.density * self.volume
+        return ElasticModes(frequency, self.nodes, self.triangles, shapes.contiguous(), material, kilograms)
 
     def _stiffness(self, poisson: Float[Tensor, ""]) -> Float64[Tensor, "basis basis"]:
         nu = poisson.double()

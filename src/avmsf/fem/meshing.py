@@ -130,9 +130,8 @@ def denoised(mesh: Trimesh) -> tuple[Trimesh, float]:
     identity = scipy.sparse.eye_array(len(points), format="csc")
 
     def smooth(exponent: float) -> tuple[Float64[np.ndarray, "points 3"], float]:
-        solve = splu(
-            identity + 10.0**exponent * bending, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-        ).solve
+        balance = identity + 10.0**exponent * bending
+        solve = splu(balance, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
         return solve(points), float((probes * solve(probes)).sum(axis=0).mean() / len(probes))
 
     def error(exponent: float) -> float:

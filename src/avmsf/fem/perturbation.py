@@ -45,10 +45,8 @@ def perturbations(mesh: SecondOrder, shapes: Float64[np.ndarray, "nodes 3 modes"
     fields, slopes, volumes = smooth_fields(mesh), shape_gradients(mesh), mesh.solid.volumes.numpy()
     modes, young, poisson = shapes.shape[2], material.young, material.poisson
     shear, squeeze = young / (2.0 * (1.0 + poisson)), young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
-    by_poisson = (
-        -young / (2.0 * (1.0 + poisson) ** 2),
-        young * (1.0 + 2.0 * poisson**2) / ((1.0 + poisson) * (1.0 - 2.0 * poisson)) ** 2,
-    )
+    shear_slope = -young / (2.0 * (1.0 + poisson) ** 2)
+    squeeze_slope = young * (1.0 + 2.0 * poisson**2) / ((1.0 + poisson) * (1.0 - 2.0 * poisson)) ** 2
     stiff, heavy = np.zeros((len(fields), modes, modes)), np.zeros((len(fields), modes, modes))
     turned = np.zeros((modes, modes))
     root = np.linalg.cholesky(REFERENCE_MASS)
@@ -64,8 +62,8 @@ def perturbations(mesh: SecondOrder, shapes: Float64[np.ndarray, "nodes 3 modes"
         stiff += _products(flat, fields[:, part])
         heavy += _products(moving, fields[:, part])
         everywhere = np.ones((1, len(weight)))
-        turned += 2.0 * by_poisson[0] * _products(distortion.reshape(len(weight), -1, modes), everywhere)[0]
-        turned += by_poisson[1] * _products(dilation, everywhere)[0]
+        turned += 2.0 * shear_slope * _products(distortion.reshape(len(weight), -1, modes), everywhere)[0]
+        turned += squeeze_slope * _products(dilation, everywhere)[0]
     return Perturbations(stiff, heavy, turned)
 
 

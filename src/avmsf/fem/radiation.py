@@ -55,9 +55,8 @@ def radiated(
     pressures = []
     # A mode at a time: the table of all patches and modes would be larger than all else.
     for pole, accelerations in zip(vibration.poles, vibration.accelerations.T, strict=True):
-        kernel = (
-            strength * (1.0 + facing * (1.0 + SOUND_SPEED / (pole * distance))) * torch.exp(-1j * pole.imag * delay)
-        )
+        directed = 1.0 + facing * (1.0 + SOUND_SPEED / (pole * distance))
+        kernel = strength * directed * torch.exp(-1j * pole.imag * delay)
         sources = torch.complex(kernel.real @ motion, kernel.imag @ motion)
         pressures.append(sources @ accelerations)
     return torch.stack(pressures)

@@ -116,11 +116,10 @@ def _tetrahedralize(points: np.ndarray, faces: np.ndarray, detail: float, timeou
         )  # fmt: skip
         # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
         command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
+        variables = os.environ | {"OMP_NUM_THREADS": "1"}
         with open(log, "wb") as output:
             # fTetWild leaves a file of its own where it runs.
-            child = start_child(
-                command, stdout=output, stderr=output, env=os.environ | {"OMP_NUM_THREADS": "1"}, cwd=name
-            )
+            child = start_child(command, stdout=output, stderr=output, env=variables, cwd=name)
         try:
             child.wait()
         finally:

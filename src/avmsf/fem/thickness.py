@@ -65,10 +65,8 @@ def search_thickness(
         new = [body for body in made if body is not None]
         found |= zip(new, evidence(new), strict=True)
     best = max(found, key=found.__getitem__)
-    likely = sorted(
-        (body for body, each in found.items() if each > found[best] - TOLERANCES.max_evidence_gap),
-        key=found.__getitem__,
-    )
+    likely = [body for body, each in found.items() if each > found[best] - TOLERANCES.max_evidence_gap]
+    likely.sort(key=found.__getitem__)
     walls = _walls(found)
     return likely[::-1], None if best.thickness is None or len(walls) < 2 else _posterior(walls)
 

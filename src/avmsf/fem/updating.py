@@ -111,10 +111,8 @@ class _Problem:
         assert changes is not None
         self.forces = np.concatenate([changes.stiffness, TOLERANCES.poisson_step * changes.poisson[None]])
         self.masses = changes.mass
-        self.deviation = np.repeat(
-            [TOLERANCES.stiffness_std, TOLERANCES.poisson_std, TOLERANCES.density_std],
-            [len(self.forces) - 1, 1, len(self.masses)],
-        )
+        deviations = [TOLERANCES.stiffness_std, TOLERANCES.poisson_std, TOLERANCES.density_std]
+        self.deviation = np.repeat(deviations, [len(self.forces) - 1, 1, len(self.masses)])
 
     def solution(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the squared angular frequencies and the updated shapes over the nominal ones, [nominal, updated]."""
@@ -168,15 +166,13 @@ class _Problem:
         # Of the coefficients alone: the factor is not known of the nominal body either.
         alone = posterior[:-1, :-1] - np.outer(posterior[:-1, -1], posterior[-1, :-1]) / posterior[-1, -1]
         volume = 0.5 * np.linalg.slogdet(alone * self.deviation[:, None] * self.deviation)[1]
-        step = np.clip(
-            solution[:-1] - theta, -TOLERANCES.max_step * self.deviation, TOLERANCES.max_step * self.deviation
-        )
+        longest = TOLERANCES.max_step * self.deviation
+        step = np.clip(solution[:-1] - theta, -longest, longest)
         # More than the root mean square of the fitted residuals: as many coefficients as modes fit them.
         left = apart - slopes @ step - solution[-1]
         if len(mode):
-            spread = float(
-                np.clip(1.5 * np.sqrt(np.average(left**2, weights=certainty)), TOLERANCES.min_frequency_std, spread)
-            )
+            fitted = 1.5 * np.sqrt(np.average(left**2, weights=certainty))
+            spread = float(np.clip(fitted, TOLERANCES.min_frequency_std, spread))
         return theta + step, spread, float(volume)
 
     def _gain_rows(

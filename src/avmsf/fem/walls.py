@@ -64,8 +64,7 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
     folds prisms, as on scans with creases, both sides of the wall are filled as `fill` does, which is slower.
 
     Raises SimulationError for a surface without triangles or area, one whose triangles face different ways, a
-    thickness too large for how tightly the surface bends, and a closed surface that holds less
-    than the wall would.
+    thickness too large for how tightly the surface bends, and a closed surface that holds less than the wall would.
     """
     mesh = oriented(weld(surface))
     if not len(boundary_edges(mesh)) and mesh.area * thickness > abs(mesh.volume):

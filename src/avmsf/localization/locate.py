@@ -90,18 +90,16 @@ def assess_match(found: ContactPosterior) -> ContactPosterior:
     modal, null, ratio = 100 * found.modal_energy, 100 * found.null_energy, found.mismatch_ratio
     share = f"with free gains the object's modes explain {modal:.0f} % of it, modes of shifted frequencies {null:.0f} %"
     if ratio > REJECT_ABOVE:
-        refusal = (
+        return found.rejected(
             f"expected a mismatch ratio of at most {WARN_ABOVE:g}, as of this object's impacts, got a mismatch ratio "
             f"of {ratio:.2f}: another object, no impact, or noise ({share}); record it again, or choose another field"
         )
-        return found.rejected(refusal)
     if found.evidence <= 0.0:
-        refusal = (
+        return found.rejected(
             f"expected gains that the field predicts better than noise, got a log Bayes factor of {found.evidence:.1f}"
             f": another object, or too few recordings near the contact ({share}); record it again, or fit to more "
             "recordings"
         )
-        return found.rejected(refusal)
     if ratio > WARN_ABOVE:
         note = f"the sound may be of another object, or hold other sounds: a mismatch ratio of {ratio:.2f} ({share})"
     elif found.explained_energy < MIN_EXPLAINED:

@@ -76,14 +76,9 @@ class Locator:
         if not len(positions):
             raise LocationError.expected("one or more", 0, name="points")
         gains, variance, dampings = predict(field, positions, ways, factor=calibration_factor(field))
-        return cls(
-            field,
-            positions.float(),
-            gains,
-            variance + local_variance(positions, gains),
-            dampings,
-            smoothing_matrix(positions, contacts=distinct_contacts(field)),
-        )
+        variance = variance + local_variance(positions, gains)
+        smoothing = smoothing_matrix(positions, contacts=distinct_contacts(field))
+        return cls(field, positions.float(), gains, variance, dampings, smoothing)
 
     def locate(
         self,
@@ -129,6 +124,9 @@ class Locator:
         probability = torch.softmax(exponent * found.log_likelihood, 0)
         if self.smoothing is not None:
             probability = torch.from_numpy(self.smoothing @ probability.numpy())
+        notes: tuple[str, ...] = ()
+        if scaled is not None:
+            notes = _force_notes(scaled, free, exponent, length.unit, per_newton=self.field.origin.per_newton)
         return ContactPosterior(
             self.points,
             length.distance(values, noise),
@@ -137,10 +135,8 @@ class Locator:
             amplitudes.part(amplitudes.fitted),
             amplitudes.part(fmean(detuned)),
             float(found.force[row]) / length.unit,
-            evidence=free.evidence(),
-            notes=()
-            if scaled is None
-            else _force_notes(scaled, free, exponent, length.unit, per_newton=self.field.origin.per_newton),
+            notes,
+            free.evidence(),
         )
 
     def prepare(self, *samples: int) -> None:
@@ -183,9 +179,8 @@ class _Length:
             gains = gains * _damping_corrected(bank.damping, locator.dampings[:, modes], samples / rate)
         self.unit = float(gains.abs().square().mean().sqrt())
         if self.unit == 0.0:
-            raise LocationError.expected(
-                "gains above 0", 0.0, got="0 at all points", name="field", advice="fit it to other recordings"
-            )
+            got, advice = "0 at all points", "fit it to other recordings"
+            raise LocationError.expected("gains above 0", 0.0, got=got, name="field", advice=advice)
         self.gains = gains / self.unit
         """Of the modes themselves, [points, modes], in units of `unit`."""
         self.predicted = _decorrelated(self.gains, locator.variance[:, modes] / self.unit**2, self.extractor)
@@ -214,16 +209,12 @@ class _Length:
 
     def explained(self, amplitudes: Amplitudes, found: Likelihood, row: int) -> float:
         """Return the fraction of the sound's energy that an impact at a point explains."""
-        extractor = self.extractor
-        rotated = torch.polar(
-            found.force[row].expand(len(extractor.bank)).abs(),
-            2.0 * torch.pi * float(found.shift[row]) * extractor.bank.frequency,
-        )
-        own = (
-            extractor.separated[0] @ self.predicted.gains[row].to(torch.complex128) * rotated * found.force[row].sign()
-        )
+        angle = 2.0 * torch.pi * float(found.shift[row]) * self.extractor.bank.frequency
+        rotated = torch.polar(found.force[row].abs().expand_as(angle), angle)
+        predicted = self.extractor.separated[0] @ self.predicted.gains[row].to(torch.complex128)
+        own = predicted * rotated * found.force[row].sign()
         both = torch.cat([own.real, own.imag])
-        return amplitudes.part(float(2.0 * both @ amplitudes.products - both @ extractor.gram @ both))
+        return amplitudes.part(float(2.0 * both @ amplitudes.products - both @ self.extractor.gram @ both))
 
 
 def _damping_corrected(
@@ -271,11 +262,8 @@ def _check_above_noise(values: Complex128[Tensor, " modes"], noise: Float64[Tens
     surplus = values.abs().square() / noise
     modes = len(values)
     chance, clear = 1.0 + 5.0 / modes**0.5, 12.0 + float(torch.log(torch.tensor(float(modes))))
-    if float(surplus.mean()) < chance and float(surplus.max()) < clear:
-        raise LocationError.expected(
-            f"the object's {modes} modes at {chance:.2g} times it or more",
-            float(surplus.mean()),
-            got=f"{float(surplus.mean()):.2g} times",
-            name="noise",
-            advice="record the impact louder, or with less noise",
-        )
+    mean = float(surplus.mean())
+    if mean < chance and float(surplus.max()) < clear:
+        wanted, got = f"the object's {modes} modes at {chance:.2g} times it or more", f"{mean:.2g} times"
+        advice = "record the impact louder, or with less noise"
+        raise LocationError.expected(wanted, mean, got=got, name="noise", advice=advice)

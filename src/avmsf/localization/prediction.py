@@ -179,6 +179,7 @@ def calibrate_tempering(field: SoundField) -> float:
     # A locator leaves the others out, too.
     kept = torch.nonzero(field.audible & (field.scale != 0.0)).flatten()
     rotated = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
+    weights = 1.0 / (4.0 * field.bank.damping[kept].double())
     score = -0.5 * (_FACTORS.log() / _LOG_PRIOR_STD).square()
     for contact, truth in zip(contacts.tolist(), truths.tolist(), strict=True):
         left = gains.without((gains.contacts - gains.contacts[contact]).norm(dim=1) <= merged)
@@ -192,12 +193,8 @@ def calibrate_tempering(field: SoundField) -> float:
         known = PredictedGains(mean[:, kept], (variance + about)[:, kept], field.bank.frequency[kept].double())
         found = Likelihood(known, measured, torch.full(measured.shape, _NOISE * loudest**2, dtype=torch.float64))
         row = int(found.log_likelihood.argmax())
-        explained = _explained_energy(
-            known.gains[row].to(measured), measured, 1.0 / (4.0 * field.bank.damping[kept].double())
-        )
-        exponents = torch.tensor(
-            [found.tempering(explained, factor=tried) for tried in _FACTORS.tolist()], dtype=torch.float64
-        )
+        explained = _explained_energy(known.gains[row].to(measured), measured, weights)
+        exponents = _FACTORS.new_tensor([found.tempering(explained, factor=tried) for tried in _FACTORS.tolist()])
         score += _log_score(exponents[:, None] * found.log_likelihood + prior, truth, smoothing)
     return float(_FACTORS[int(score.argmax())])
 

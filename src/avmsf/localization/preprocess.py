@@ -171,6 +171,6 @@ def at_field_rate(
         share = 100.0 * float(energy[frequency < highest].sum() / energy.sum())
         note += (
             f"; located by {held} of the object's {counted(len(frequency), 'mode')}, with {share:.0f} % of the energy "
+            f"of its sounds: those above {highest:.4g} Hz are left out"
         )
-        note += f"of its sounds: those above {highest:.4g} Hz are left out"
     return torch.from_numpy(resampled.astype(np.float32)), highest, [note]

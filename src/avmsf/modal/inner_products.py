@@ -94,9 +94,8 @@ def project(
         lower = length // 2 if length > 2 * _BLOCK else 0
         group = torch.nonzero((needed > lower) & (needed <= upper)).flatten()
         if len(group):
-            inner[:, group], outer[:, group] = _project(
-                wide[:, : math.ceil(length / _BLOCK) * _BLOCK], poles[group], weighted
-            )
+            beginning = wide[:, : math.ceil(length / _BLOCK) * _BLOCK]
+            inner[:, group], outer[:, group] = _project(beginning, poles[group], weighted)
         upper, length = lower, lower
     products = torch.cat([inner.imag, inner.real], dim=1)
     return products, torch.cat([outer.imag, outer.real], dim=1) if weighted else None

@@ -24,9 +24,7 @@ def magnitude_stft(
     `fft_size` and `hop` in samples; the unit is that of the sounds times samples (see the module's text).
     """
     window = torch.hann_window(fft_size, dtype=sounds.dtype, device=sounds.device)
-    spectra = torch.stft(
-        sounds, fft_size, hop, window=window, center=True, pad_mode="constant", onesided=True, return_complex=True
-    )
+    spectra = torch.stft(sounds, fft_size, hop, window=window, center=True, pad_mode="constant", return_complex=True)
     # The slope of |z| is z / |z|, which torch takes as zero at z = 0; sqrt(re^2 + im^2) would give NaN there.
     return spectra.abs()
 

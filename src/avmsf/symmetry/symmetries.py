@@ -120,10 +120,8 @@ class Symmetries:
             rejected = math.inf if stored["rejected"] is None else _number(stored, "rejected")
             return cls(rotations, mirrors, _number(stored, "spacing"), _number(stored, "tolerance"), rejected)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            advice = "find the symmetries again"
-            raise SceneError.expected(
-                "numbers as they are stored", got=repr(error), name="symmetries", advice=advice
-            ) from error
+            wanted, advice = "numbers as they are stored", "find the symmetries again"
+            raise SceneError.expected(wanted, got=repr(error), name="symmetries", advice=advice) from error
 
 
 def _numbers(values: Float[Tensor, " 3"]) -> str:

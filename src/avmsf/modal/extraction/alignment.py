@@ -229,9 +229,8 @@ def _common_onset(impacts: Impacts, delays: PerContact, agreement: PerContact) -
     lead = impacts.before.shape[1]
     early = replace(impacts, sounds=impacts.sounds[:, : 3 * lead], after=impacts.after[:, :0])
     fractions = torch.arange(_ONSET_FRACTIONS, dtype=torch.float64) / _ONSET_FRACTIONS
-    power = torch.stack(
-        [early.delayed(delays - lead + each).sounds[:, : 2 * lead].double().square() for each in fractions], dim=2
-    ).flatten(1)
+    moved = (early.delayed(delays - lead + each).sounds[:, : 2 * lead] for each in fractions)
+    power = torch.stack([each.double().square() for each in moved], dim=2).flatten(1)
     mean = agreement @ (power / power.sum(1, keepdim=True).clamp_min(1e-300)) / agreement.sum()
     highest = float(mean.max())
     # Noise within 10 dB of the sounds hides all but their loudest.

@@ -104,9 +104,8 @@ def _search(
             frequency = turns * width + first * sample_rate / padded
             damping = -torch.log(poles.abs()) * width
             overlap = 0.02 * width
-            kept = (frequency >= bottom + _EDGE * width - overlap) & (
-                frequency < bottom + (1 - _EDGE) * width + overlap
-            )
+            kept = frequency >= bottom + _EDGE * width - overlap
+            kept &= frequency < bottom + (1 - _EDGE) * width + overlap
             kept &= (frequency >= lowest) & (frequency < sample_rate / 2)
             # What grows is noise; what dies faster than the band is wide is an artefact of its filter.
             kept &= (damping > -sample_rate / samples) & (damping < width)

@@ -194,12 +194,8 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
         bank, shifts = ModalBank(read["frequency"], read["damping"]), None
         if "poles" in read or "shift" in read:
             shifts = FrequencyShifts(bank, torch.view_as_complex(read["poles"].contiguous()), float(read["shift"]))
-        return Extraction(
-            bank,
-            torch.view_as_complex(read["gains"].contiguous()),
-            Residual(read["residual"]),
-            Alignment.restore(kept, train.names, recording_keys(train)) if kept else None,
-            shifts,
-        )
+        alignment = Alignment.restore(kept, train.names, recording_keys(train)) if kept else None
+        gains = torch.view_as_complex(read["gains"].contiguous())
+        return Extraction(bank, gains, Residual(read["residual"]), alignment, shifts)
     except (FieldFileError, KeyError):
         return None

@@ -289,9 +289,8 @@ class _Band:
             penalty = noise * precision
             slope = slope - penalty * (poles - center)
             diagonal = noise * information + penalty
-            damped = hessian + torch.diag_embed(
-                (penalty + trust[:, None] * diagonal).clamp_min(torch.finfo(torch.float64).tiny).to(hessian.dtype)
-            )
+            added = (penalty + trust[:, None] * diagonal).clamp_min(torch.finfo(torch.float64).tiny)
+            damped = hessian + torch.diag_embed(added.to(hessian.dtype))
             step = torch.linalg.solve(damped, slope[..., None])[..., 0]
             # No further than a mode's own width, and no damping that vanishes.
             step = step * (-poles.real / step.abs().clamp_min(torch.finfo(torch.float64).tiny)).clamp_max(1.0)

@@ -179,14 +179,10 @@ class NormalEquations:
         coefficients = self.solve()
         modes = coefficients.shape[1] // 2
         sine, cosine = coefficients[:, :modes], coefficients[:, modes:]
-        # Slopes of the model in the n-weighted basis: along f they are 2 pi n (g cos - q sin) / rate, along d they
-        # are -n (g sin + q cos) / rate.
-        slopes = torch.stack(
-            [
-                torch.cat([-cosine, sine], dim=1) * (2 * math.pi / sample_rate),
-                torch.cat([-sine, -cosine], dim=1) / sample_rate,
-            ]
-        )
+        # In the n-weighted basis: 2 pi n (g cos - q sin) / rate, and -n (g sin + q cos) / rate.
+        by_frequency = torch.cat([-cosine, sine], dim=1) * (2 * math.pi / sample_rate)
+        by_damping = torch.cat([-sine, -cosine], dim=1) / sample_rate
+        slopes = torch.stack([by_frequency, by_damping])
         residual = self.weighted_products - coefficients @ self.mixed_gram.T
         projected = self.weighted_gram - self.mixed_gram @ _solve(self.gram, self.mixed_gram).T
         blocks = projected.reshape(2, modes, 2, modes)

@@ -87,9 +87,8 @@ class Selection:
     def select(self, known: ModalBank, found: ModalBank, measured: Measured, *, range_db: float) -> ModalBank:
         """Return `known` and up to `count` of `found`: those that explain most of what is left, next to each other.
 
-        `measured` is that of `found`.
-        A candidate counts only when what it explains is significant, and within `range_db` of the strongest of its
-        neighborhood.
+        `measured` is that of `found`. A candidate counts only when what it explains is significant, and within
+        `range_db` of the strongest of its neighborhood.
         """
         if len(found) == 0:
             return known
