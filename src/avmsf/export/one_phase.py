@@ -1,6 +1,7 @@
 """Real signed amplitudes, for formats in which all modes have one phase."""
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Complex64, Float32, Float64
@@ -9,7 +10,6 @@ from torch import Tensor
 from avmsf.export.sampled_field import SampledField
 from avmsf.modal.modes import common_phase
 from avmsf.modal.spectra import magnitude_stft
-from avmsf.modal.synthesis import synthesize
 
 _COMPARED_POINTS = 8
 """Number of points at which an export is compared with the field."""
@@ -49,13 +49,7 @@ def approximation_error(
     spectra, dB, weighted by the field's energy.
     """
     rows = field.spread(_COMPARED_POINTS)
-    rendered = synthesize(
-        amplitude[rows],
-        field.frequency,
-        damping if damping.ndim == 1 else damping[rows],
-        samples=field.samples,
-        sample_rate=field.sample_rate,
-    )
+    rendered = replace(field.without_noise(), gains=amplitude, damping=damping).render(rows)
     reference = field.render(rows)
     peak = float(reference.abs().max())
     if peak == 0:
