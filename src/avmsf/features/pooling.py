@@ -1,7 +1,6 @@
 """Features that obey an object's symmetries: each point takes the mean over its counterparts (paper, supplement)."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -33,7 +32,6 @@ def refine(
     iterations: int = DEFAULT_ITERATIONS,
     angles: int = DEFAULT_ANGLES,
     reach: float = DEFAULT_REACH_SPACINGS,
-    log: Callable[[str], None] = lambda _: None,
 ) -> FeatureField:
     """Return the same points with features that agree between symmetric places.
 
@@ -43,13 +41,12 @@ def refine(
 
     A rotated point without a point of the cloud within `reach` spacings, in a hole of it, is left out of the mean, so
     that features of another part are not mixed in; `reach` 0 takes the nearest point however far it is (paper). Without
-    symmetries the features come back as they are. `log` receives a message for each symmetry. Raises
-    SceneError for fewer than one iteration or angle.
+    symmetries the features come back as they are. Raises SceneError for fewer than one iteration or angle.
     """
     if iterations < 1 or angles < 1:
         name, value = ("iterations", iterations) if iterations < 1 else ("angles", angles)
         raise SceneError.expected("at least 1", value, name=name)
-    orbits = _orbits(features.points, symmetries, angles=angles, reach=reach, log=log)
+    orbits = _orbits(features.points, symmetries, angles=angles, reach=reach)
     pools = [_pool(rows, found) for rows, found in orbits]
     values = features.features.detach().cpu().numpy()
     for _ in range(iterations):
@@ -97,7 +94,6 @@ def _orbits(
     symmetries: Symmetries,
     *,
     angles: int,
-    log: Callable[[str], None] = lambda _: None,
     reach: float = DEFAULT_REACH_SPACINGS,
 ) -> list[SymmetricPoints]:
     """Return the counterparts under every rotation, and then under every mirror plane."""
@@ -109,12 +105,9 @@ def _orbits(
     limit = reach * spacing if reach else torch.full_like(spacing, math.inf)
     orbits = []
     for rotation in symmetries.rotations:
-        log(f"symmetric points under {rotation}")
         turned = [rotation.turn(places, angle) for angle in rotation.angles(angles)[1:]]
         orbits.append(_symmetric_points(turned, tree, limit))
-    for mirror in symmetries.mirrors:
-        log(f"symmetric points under {mirror}")
-        orbits.append(_symmetric_points([mirror.reflect(places)], tree, limit))
+    orbits += [_symmetric_points([mirror.reflect(places)], tree, limit) for mirror in symmetries.mirrors]
     return orbits
 
 
