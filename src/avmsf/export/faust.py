@@ -11,6 +11,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from avmsf._utils.text import csv_text
 from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Written, check_suffix, generator, write_files
@@ -53,10 +54,8 @@ def write_faust(
         remarks.append("the noise restarts with every impact")
     elif noisy:
         remarks.append("the residual noise is left out")
-    rows = (
-        ",".join([str(row), *(f"{value:.9g}" for value in point)]) for row, point in enumerate(field.points.tolist())
-    )
-    coordinates = "\n".join(["contact,x,y,z", *rows, ""])
+    rows = ([row, *(f"{value:.9g}" for value in point)] for row, point in enumerate(field.points.tolist()))
+    coordinates = csv_text([("contact", "x", "y", "z"), *rows])
     contents = {path: text.encode(), contacts_path(path): coordinates.encode()}
     return Written(write_files(contents, overwrite=overwrite), tuple(remarks))
 
