@@ -90,22 +90,18 @@ class Guide(Protocol):
     @property
     def sample_rate(self) -> float:
         """Sample rate of the sounds that it takes and returns, Hz."""
-        ...
 
     def describe(self) -> dict[str, Any]:
         """Return its identifying settings, as plain values, for the edit's report and checkpoint."""
-        ...
 
     def start(self, rendered: FieldAtContacts) -> ModalEdit:
         """Return the initial edit, given the field at contacts far apart."""
-        ...
 
     def targets(self, sounds: Sounds, step: int, generator: torch.Generator) -> Sounds:
         """Return the targets of rendered sounds, row for row, at their level.
 
         A row with a sample that is not finite is left out of the step.
         """
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,6 @@ class Encoder(Protocol):
     @property
     def name(self) -> str:
         """What a feature field keeps, so that its features are never taken for another encoder's."""
-        ...
 
     def describe(
         self, image: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
@@ -37,7 +36,6 @@ class Encoder(Protocol):
 
         The image is red, green and blue as displayed: bytes, or numbers from 0 to 1.
         """
-        ...
 
 
 def unit_image(
