@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,9 +20,6 @@ from avmsf.gaussians.visibility import DepthMap, Visibility, depth_of_cloud, dep
 from avmsf.mesh.points import nearest_points
 from avmsf.photographs.cameras import Camera, View
 
-_DEPTH_DEVIATIONS = 1.0
-"""Standard deviations by which a Gaussian may lie behind the depth that is seen and still be of that surface. Two let
-twice as many through thin walls; what one turns away is seen at a slant, and by other views better."""
 _NEIGHBORS = 3
 """Seen points whose features an unseen one takes the mean of."""
 
@@ -105,10 +103,9 @@ def lift(
     `weighting`, `inpainted` and `progress` of `lift_points`. Raises as that.
     """
     depth_map = depth_of_cloud(cloud, rasterizer or choose_rasterizer(cloud.centers.device))
-
-    def reach(camera: Camera) -> Float[Tensor, " points"]:
-        return _DEPTH_DEVIATIONS * depth_reach(cloud, camera)
-
+    # Two standard deviations let twice as many through thin walls; what one turns away is seen at a slant, and by other
+    # views better.
+    reach = partial(depth_reach, cloud)
     return lift_points(cloud.centers, views, encoder, depth_map=depth_map, reach=reach, **settings)
 
 
