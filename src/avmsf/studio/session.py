@@ -54,14 +54,10 @@ class Session:
 
     def __init__(self, home: Path, publish: Callable[[Revision], None]) -> None:
         self.home, self._publish = home, publish
-        self._current = Revision(0)
+        self.current = Revision(0)
+        """The current revision."""
         self._past: list[Revision] = []
         self._lock = RLock()
-
-    @property
-    def current(self) -> Revision:
-        """The current revision."""
-        return self._current
 
     @property
     def can_undo(self) -> bool:
@@ -71,7 +67,7 @@ class Session:
     def open(self, field: SoundField | None) -> Revision:
         """Make a field, or none, the current one; the previous one can be restored by undo."""
         with self._lock:
-            before = self._current
+            before = self.current
             fresh = Revision(0, before.opening + 1, ground=field, field=field)
             return self._advance(fresh) if before.field is None else self._remember(fresh)
 
@@ -79,13 +75,13 @@ class Session:
         """Set the sliders. Raises RequestError (409) if `base` is not the current revision, and the errors of edits."""
         with self._lock:
             self.check_current(base)
-            field, remarks = sliders.apply(self._current.ground or self._current.require_field())
-            return self._remember(replace(self._current, sliders=sliders, field=field, remarks=tuple(remarks)))
+            field, remarks = sliders.apply(self.current.ground or self.current.require_field())
+            return self._remember(replace(self.current, sliders=sliders, field=field, remarks=tuple(remarks)))
 
     def lead(self, field: SoundField, remarks: tuple[str, ...]) -> Revision:
         """Take in what a guided edit has made; sliders are relative to it from then on."""
         with self._lock:
-            return self._remember(replace(self._current, ground=field, sliders=REST, field=field, remarks=remarks))
+            return self._remember(replace(self.current, ground=field, sliders=REST, field=field, remarks=remarks))
 
     def undo(self, base: int) -> Revision:
         """Undo the last revision, under a new number. Raises RequestError (409) as `edit`, and if there is no other."""
@@ -104,10 +100,10 @@ class Session:
         """
         with self._lock:
             self.check_current(base)
-            field = self._current.require_field()
+            field = self.current.require_field()
             path = self.home / file_name(name)
             _write_new(field, path)
-            saved = replace(self._current, ground=field, sliders=REST, name=path.name.removesuffix(SUFFIX))
+            saved = replace(self.current, ground=field, sliders=REST, name=path.name.removesuffix(SUFFIX))
             try:
                 return path, self._advance(saved)
             except BaseException:
@@ -117,21 +113,21 @@ class Session:
 
     def check_current(self, base: int) -> None:
         """Raise RequestError (409), with the current revision, if `base` is another one."""
-        if base != self._current.number:
-            now, got = self._current.number, "an older one: another tab has changed it"
+        if base != self.current.number:
+            now, got = self.current.number, "an older one: another tab has changed it"
             advice = "nothing was overwritten; make the change again"
             raise bad_request("base", "the current field", base, got=got, advice=advice, status=409, revision=now)
 
     def _remember(self, revision: Revision) -> Revision:
-        before = self._current
+        before = self.current
         changed = self._advance(revision)
         self._past = [*self._past, before][-_MAX_UNDONE:]
         return changed
 
     def _advance(self, revision: Revision) -> Revision:
-        numbered = replace(revision, number=self._current.number + 1)
+        numbered = replace(revision, number=self.current.number + 1)
         self._publish(numbered)
-        self._current = numbered
+        self.current = numbered
         return numbered
 
 
