@@ -23,14 +23,7 @@ from avmsf.export.one_phase import shared_dampings
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.writing import FORMATS, Written, check_suffix, generator, write_files
 
-_NORMAL_MODE, _COMPLEX_MODE = 2, 3
-_TRANSLATION = 2
-_STRAIGHT = 1.0
-"""Degrees up to which a normal counts as along an axis."""
-_RESPONSE = 4
 _TIME = re.compile(rb"^\d\d-\w{3}-\d\d \d\d:\d\d:\d\d *$", re.MULTILINE)
-_MAX_LINES = 1 << 16
-"""Frequencies of a response function, at most."""
 
 
 def write_universal(field: SampledField, path: str | Path, *, functions: int = 16, overwrite: bool = False) -> Written:
@@ -66,7 +59,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     if field.noise.any():
         remarks.append("the residual noise is left out")
     leaning = math.degrees(math.acos(min(1.0, float(field.normals[rows].abs().amax(1).min())))) if len(rows) else 0.0
-    if leaning > _STRAIGHT:
+    if leaning > 1.0:
         axis = f"their reference direction is the nearest axis, up to {leaning:.0f} degrees off"
         remarks.append(f"response functions are of impacts against the normal; {axis}")
     return Written(write_files({path: content}, overwrite=overwrite), tuple(remarks))
@@ -74,7 +67,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
 
 def response_frequencies(field: SampledField) -> Float64[np.ndarray, " lines"]:
     """Return where response functions are given, Hz: from 0 to about half the rate, as finely as sounds allow."""
-    lines = max(2, min(field.samples // 2 + 1, _MAX_LINES))
+    lines = max(2, min(field.samples // 2 + 1, 1 << 16))
     # The format has six digits for the step, from which readers count.
     step = float(f"{0.5 * field.sample_rate / (lines - 1):.5e}")
     return step * np.arange(lines)
@@ -126,7 +119,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
         "id4": "times the direction of a force: what it excites; impacts go against normals",
         "id5": "NONE",
         "model_type": 1,
-        "data_ch": _TRANSLATION,
+        "data_ch": 2,  # translations
         "spec_data_type": 0,
         "load_case": 0,
         "mode_n": mode + 1,
@@ -137,7 +130,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
         # sine sin + cosine cos = 2 Re(residue exp(i w t)).
         values = -0.5j * gains
         kind = {
-            "analysis_type": _COMPLEX_MODE,
+            "analysis_type": 3,  # complex modes
             "id3": "residues: sound = 2 Re sum shape exp(eig t)",
             "eig": complex(-rate, 2 * math.pi * frequency),
             "modal_a": 1.0 + 0.0j,
@@ -147,7 +140,7 @@ def _mode(field: SampledField, mode: int, damping: Float64[Tensor, " modes"]) ->
         values = gains.real
         undamped = math.hypot(frequency, rate / (2 * math.pi))
         kind = {
-            "analysis_type": _NORMAL_MODE,
+            "analysis_type": 2,  # normal modes
             "id3": "amplitudes: sound = sum shape exp(-d t) sin",
             "freq": undamped,
             "modal_m": 1.0,
@@ -167,7 +160,7 @@ def _function(field: SampledField, row: int, frequencies: Float64[np.ndarray, " 
     return {
         "type": 58,
         "binary": 1,
-        "func_type": _RESPONSE,
+        "func_type": 4,  # frequency response
         "id1": f"sound over impulse, impact at point {row + 1} against its normal",
         "rsp_ent_name": "MICROPHONE",
         "rsp_node": 0,
