@@ -11,13 +11,6 @@ from avmsf.export.sampled_field import SampledField
 from avmsf.modal.modes import common_phase
 from avmsf.modal.spectra import magnitude_stft
 
-_COMPARED_POINTS = 8
-"""Number of points at which an export is compared with the field."""
-_WINDOW_SECONDS = 0.04
-"""Window of the short-time spectra, seconds: about the temporal resolution of hearing."""
-_MIN_MAGNITUDE_RATIO = 1e-3
-"""Magnitude relative to the largest below which spectra are not compared: -60 dB."""
-
 
 def signed_amplitudes(field: SampledField) -> Float32[Tensor, "points modes"]:
     """Return a real amplitude of each mode at each point, without its phase.
@@ -48,14 +41,16 @@ def approximation_error(
     The largest difference of samples, relative to the largest sample; and the mean difference of short-time magnitude
     spectra, dB, weighted by the field's energy.
     """
-    rows = field.spread(_COMPARED_POINTS)
+    rows = field.spread(8)
     rendered = replace(field.without_noise(), gains=amplitude, damping=damping).render(rows)
     reference = field.render(rows)
     peak = float(reference.abs().max())
     if peak == 0:
         return 0.0, 0.0
-    size = max(4, 2 ** round(math.log2(_WINDOW_SECONDS * field.sample_rate)))
+    # Windows of about 40 ms: the temporal resolution of hearing.
+    size = max(4, 2 ** round(math.log2(0.04 * field.sample_rate)))
     found, expected = (magnitude_stft(each, fft_size=size, hop=size // 4) for each in (rendered, reference))
-    floor, energy = _MIN_MAGNITUDE_RATIO * float(expected.max()), expected.square()
+    # What is 60 dB below the largest magnitude, or more, does not count.
+    floor, energy = 1e-3 * float(expected.max()), expected.square()
     difference = 20.0 * torch.log10((found + floor) / (expected + floor)).abs()
     return float((rendered - reference).abs().max()) / peak, float((energy * difference).sum() / energy.sum())
