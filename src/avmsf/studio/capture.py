@@ -44,8 +44,6 @@ from avmsf.studio.responses import RequestError, bad_request
 
 COMMAND = "avmsf studio"
 """What other processes wait for, in their messages."""
-_REMOVED = "removed"
-"""In the capture's cache: the recordings that were replaced or removed."""
 _NUMBERED = re.compile(r"(\d{1,6})\.wav", re.IGNORECASE)
 
 
@@ -140,7 +138,7 @@ class ImpactTable:
         return memory.getvalue()
 
     def _write(self, lines: Sequence[str]) -> None:
-        _write(self.path, "".join(lines).encode())
+        write_whole(self.path, "".join(lines).encode(), raising=CaptureError)
 
 
 def file_of(row: Row) -> str:
@@ -196,7 +194,7 @@ class CaptureEditor:
                 wanted = f"a {name} as in all rows"
                 raise bad_request(name, wanted, got="none", advice="add it", status=422, file=table.path)
             file = self._next_name(table)
-            _write(self.folder / file, _as_wav(content, recording))
+            write_whole(self.folder / file, _as_wav(content, recording), raising=CaptureError)
             try:
                 table.add(file, impact, settings)
             except BaseException:
@@ -222,7 +220,7 @@ class CaptureEditor:
             elif os.path.lexists(self.folder / new) or new in map(file_of, table.rows):
                 new = self._next_name(table)
             self._set_aside(file)
-            _write(self.folder / new, _as_wav(content, recording))
+            write_whole(self.folder / new, _as_wav(content, recording), raising=CaptureError)
             if new != file:
                 table.rename(index, new)
                 (self.folder / file).unlink(missing_ok=True)
@@ -317,19 +315,15 @@ class CaptureEditor:
         return f"{max(numbers, default=0) + 1:03d}.wav"
 
     def _set_aside(self, file: str) -> None:
-        """Keep a copy of a recording in the cache."""
+        """Keep a copy of a recording in the cache's folder of what was replaced or removed."""
         path = self.folder / file
         if path.is_file():
             name = f"{path.stem}-{_digest(path.read_bytes())[:12]}{path.suffix}"
-            copy_whole(path, self.folder / CACHE / _REMOVED / name, raising=CaptureError)
+            copy_whole(path, self.folder / CACHE / "removed" / name, raising=CaptureError)
 
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-def _write(path: Path, content: bytes) -> None:
-    write_whole(path, content, raising=CaptureError)
 
 
 def _as_wav(content: bytes, recording: Recording) -> bytes:
