@@ -33,8 +33,6 @@ _LIMITS = {
 """The least and the greatest value of each slider. The page's own sliders stay far within."""
 _MAX_ROW = 1 << 31
 """Rows of a field's bank: far more than any has, and few enough digits to repeat."""
-_MAX_NAME = 100
-"""Characters of a material's name."""
 MUTE = -math.inf
 """Decibels that a mode is muted by; in JSON, where there are no such numbers, null."""
 
@@ -160,6 +158,6 @@ def _number(values: Mapping[str, Any], name: str) -> float:
 
 def _name(material: Mapping[str, Any], key: str) -> str | None:
     value = material.get(key)
-    if value is not None and not (isinstance(value, str) and len(value) <= _MAX_NAME):
+    if value is not None and not (isinstance(value, str) and len(value) <= 100):
         raise bad_request(f"material.{key}", "a name", value)
     return value or None

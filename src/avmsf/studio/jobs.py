@@ -27,7 +27,6 @@ Finish = Callable[[Event], Awaitable[Event]]
 _STOPPED: Event = {"stage": "cancelled", "words": "stopped"}
 """The last event of a job that somebody has stopped."""
 WORKER = (sys.executable, "-m", "avmsf.studio.worker")
-_MAX_LINE_BYTES = 1 << 22
 _GRACE = 3.0
 """Seconds that a process has to end once its standard input is closed."""
 _MAX_STDERR_CHARACTERS = 4000
@@ -94,7 +93,7 @@ class Job:
     async def _work(self) -> Event:
         """Return the event with the worker's result, or with an error; its other events are published."""
         process = await asyncio.create_subprocess_exec(
-            *self.command, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=_MAX_LINE_BYTES
+            *self.command, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=1 << 22
         )
         assert process.stdin is not None
         assert process.stdout is not None

@@ -22,8 +22,6 @@ from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
 _SOUNDS = tuple(suffix for suffix, kind in MEDIA_TYPES.items() if kind.startswith("audio/"))
-_GONE = 499
-"""Response to a page that has disconnected."""
 
 
 def make_app(studio: Studio, announce: Callable[[], None] = lambda: None) -> Starlette:
@@ -177,7 +175,7 @@ def _file(folder: Path, request: Request, *, only: Sequence[str] = tuple(MEDIA_T
 async def _answer_error(request: Request, error: Exception) -> Response:
     """Answer each error by a sentence and a status: 500 only where it is the server's own fault."""
     if isinstance(error, ClientDisconnect):
-        return Response(status_code=_GONE)
+        return Response(status_code=499)  # nobody receives it
     if isinstance(error, HTTPException):
         return Answer({"error": f"{request.method}: nothing found at this address"}, error.status_code)
     if isinstance(error, AvmsfError):

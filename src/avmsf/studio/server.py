@@ -24,14 +24,12 @@ from avmsf.studio.studio import Studio, StudioConfig
 PORT = 8634
 """Where the page is without --port, so that a browser remembers what this page may do, such as use the microphone."""
 _HOME = "127.0.0.1"
-_MAX_CLOSING_SECONDS = 1
-"""How long a running response may take when the server ends."""
 
 
 def make_server(app: ASGIApp) -> uvicorn.Server:
     """Return a server that prints nothing."""
     silent: Any = {"log_level": "critical", "access_log": False, "server_header": False}
-    return uvicorn.Server(uvicorn.Config(app, ws="none", timeout_graceful_shutdown=_MAX_CLOSING_SECONDS, **silent))
+    return uvicorn.Server(uvicorn.Config(app, ws="none", timeout_graceful_shutdown=1, **silent))
 
 
 def serve(

@@ -34,8 +34,6 @@ from avmsf.pipeline.stages import StageFolder
 from avmsf.studio.capture import COMMAND
 
 Values = Mapping[str, Any]
-_EVENT_INTERVAL = 10
-"""Steps of a fit between two progress events."""
 
 
 class EventWriter:
@@ -65,7 +63,7 @@ class EventWriter:
         self.write(**step, loss=loss, pitch=progress.pitch)
 
     def _stage_step(self, stage: str, done: int, total: int, words: str) -> None:
-        if done % _EVENT_INTERVAL == 0 or done == total or stage == "features":
+        if done % 10 == 0 or done == total or stage == "features":
             self.write(stage=stage, done=done, total=total, words=words)
 
 
