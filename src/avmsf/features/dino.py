@@ -19,8 +19,6 @@ MODELS: Final = tuple(
 IMAGENET: Final = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 """Mean and standard deviation of the colors that a model was trained with, where its files do not say."""
 _FILES = _CONFIG, _WEIGHTS, _PREPROCESSOR = "config.json", "model.safetensors", "preprocessor_config.json"
-_HUB_SECONDS = 5.0
-"""How long to wait for the hub's answer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,7 @@ def _download(name: str) -> Path:
     if all(isinstance(path, str) for path in cached):
         return Path(str(cached[0])).parent
     try:
-        return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=_HUB_SECONDS))
+        return Path(snapshot_download(name, allow_patterns=list(_FILES), etag_timeout=5.0))
     except Exception as error:  # the hub's client raises whatever the network beneath it does
         got = f"none: they could not be downloaded ({download_failure(error)})"
         advice = (

@@ -23,8 +23,6 @@ from avmsf.photographs.folder import mask_paths
 from avmsf.photographs.images import UnreadableImageError, read_image, read_mask, size_of
 
 WORKER = Path(__file__).with_name("sfm_worker.py")
-MIN_REGISTERED_RATIO = 0.5
-"""Part of the images that must get a camera."""
 
 
 def estimate_cameras(
@@ -161,12 +159,12 @@ def _run_worker(begun: Path, *, timeout: float) -> dict[str, list[str]]:
     return dict(sorted(registered.items(), key=lambda model: -len(model[1])))
 
 
-def _stage_and_lines(log: Path, count: int = 6) -> tuple[str, str]:
+def _stage_and_lines(log: Path) -> tuple[str, str]:
     """Return the stage that the worker came to, and its last lines."""
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     stages = [line.removeprefix("stage ") for line in lines if line.startswith("stage ")]
     output = [f"  {line[:200]}" for line in lines if not line.startswith("stage ")]
-    return stages[-1] if stages else "starting", "\n".join(output[-count:])
+    return stages[-1] if stages else "starting", "\n".join(output[-6:])
 
 
 def _check_groups(
@@ -174,7 +172,7 @@ def _check_groups(
 ) -> list[CaptureWarning]:
     """Return remarks on the images without a camera in the first and largest group; raise CaptureError for too many."""
     largest = set(groups[0]) if groups else set()
-    if len(largest) < max(MIN_VIEWS, MIN_REGISTERED_RATIO * len(everything)):
+    if len(largest) < max(MIN_VIEWS, 0.5 * len(everything)):
         lacking = [name for name in everything if name not in largest]
         apart = f" in {len(groups)} groups that could not be joined" if len(groups) > 1 else ""
         got = f"{len(largest)} of {len(everything)}{apart}, none for {listed(lacking)}"

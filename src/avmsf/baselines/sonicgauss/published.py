@@ -73,9 +73,9 @@ class PublishedSizes:
 class _Fourier(nn.Module):
     """A number, and its sines and cosines at random frequencies."""
 
-    def __init__(self, count: int = 128) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.weights = nn.Parameter(torch.randn(count))
+        self.weights = nn.Parameter(torch.randn(128))
 
     def forward(self, values: Float[Tensor, " batch"]) -> Float[Tensor, "batch dim"]:
         angles = values[:, None] * self.weights * 2.0 * math.pi
