@@ -21,14 +21,10 @@ _FLOOR = 1e-7
 """Added to powers before logarithms."""
 _LOG_SCALE = 40.0
 """Octaves of power over the floor that make a feature 1."""
-_FEATURES = 3
-"""Moments at which a row of a spectrogram is sampled."""
 _NEAR = 2
 """Bins on both sides of a mode whose points move with it."""
 _BLUR = 0.01
 """Length of geomloss, the root of its temperature: .01 of the position axis is 160 Hz at 32 kHz."""
-_LAST_WEIGHT = 0.1
-"""Frames weigh from 0 at the start to this at the end, over their mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +54,12 @@ class ClipSpectra:
     def difference(self, predicted: Float[Tensor, " samples"]) -> Float[Tensor, ""]:
         """Return the mean absolute difference of log2 powers plus that of powers, the mean over all clips.
 
-        Later frames weigh more; the row of 0 Hz is left out.
+        Frames weigh in proportion to their time; the row of 0 Hz is left out.
         """
         total = predicted.new_zeros(())
         for fft_size, (logs, powers) in self._spectra.items():
             own = _power(predicted[None], fft_size)[:, 1:]
-            weight = torch.linspace(0.0, _LAST_WEIGHT, own.shape[2], dtype=own.dtype, device=own.device)
+            weight = torch.linspace(0.0, 0.1, own.shape[2], dtype=own.dtype, device=own.device)
             weight = weight / weight.mean()
             total = total + (weight * ((own + _FLOOR).log2() - logs).abs()).mean()
             total = total + (weight * (own - powers).abs()).mean()
@@ -107,7 +103,7 @@ def _positions(bins: int, modes: Float[Tensor, " modes"] | None) -> Float[Tensor
 def _cloud(
     features: Float[Tensor, "contacts bins frames"], position: Float[Tensor, " bins"]
 ) -> Float[Tensor, "contacts bins 4"]:
-    sampled = torch.nn.functional.interpolate(features.detach(), size=_FEATURES, mode="linear")
+    sampled = torch.nn.functional.interpolate(features.detach(), size=3, mode="linear")
     return torch.cat([sampled, position.expand(len(sampled), -1)[..., None]], dim=2)
 
 

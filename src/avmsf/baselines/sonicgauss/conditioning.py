@@ -19,9 +19,6 @@ CHANNELS = 23
 LEAST_LOGIT = 0.02
 """Opacity, before the sigmoid, below which the published program leaves a Gaussian out."""
 FREQUENCIES = 10
-_REST = 9
-_DEGREE_THREE = 15
-"""Coefficients above degree 0 of one color channel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +72,8 @@ def first_nine(cloud: GaussianCloud) -> Float[Tensor, "points 9"]:
     Clouds of a lower degree are continued by zeros to degree 3. The published weights were trained on this.
     """
     rest = cloud.harmonics[:, 1:]
-    padded = torch.nn.functional.pad(rest, (0, 0, 0, _DEGREE_THREE - rest.shape[1]))
-    return padded.mT.flatten(1)[:, :_REST]
+    padded = torch.nn.functional.pad(rest, (0, 0, 0, 15 - rest.shape[1]))
+    return padded.mT.flatten(1)[:, :9]
 
 
 class ContactEncoding(nn.Module):
