@@ -30,8 +30,6 @@ from avmsf.studio.session import Revision
 
 _MAX_OBJECT_POINTS = 8_000
 """Points of an object without a field."""
-_CACHED_REVISIONS = 4
-"""Number of revisions whose files are kept: a page may still be reading the previous ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,8 @@ class Showcase:
         file = {"file": f"revisions/{revision.number}/field.bin"}
         manifest["tensors"] = {name: {**tensor, **file} for name, tensor in manifest["tensors"].items()}
         self._shown[revision.number] = Shown(manifest, files, sampled, revision, remarks)
-        while len(self._shown) > _CACHED_REVISIONS:
+        # A page may still be reading the files of the revisions before.
+        while len(self._shown) > 4:
             self._shown.popitem(last=False)
 
     def _surface(self, field: SoundField | None) -> Path | Surface | None:

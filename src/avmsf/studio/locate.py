@@ -28,9 +28,6 @@ from avmsf.studio.jobs import Threads
 from avmsf.studio.responses import FORESEEN_ERRORS
 from avmsf.studio.session import Revision, Session
 
-_SETTLED = 0.5
-"""Seconds that a revision stays the last one before its tables are made: sliders are dragged."""
-
 
 @dataclass(frozen=True, eq=False)
 class Finder:
@@ -108,7 +105,8 @@ class Searches:
         # One task for all revisions: one that is cancelled would leave its thread running while the next one's runs.
         prepared = None
         while (revision := self.session.current) is not prepared and revision.field is not None:
-            await asyncio.sleep(_SETTLED)
+            # Sliders are dragged: most revisions are soon not the last one.
+            await asyncio.sleep(0.5)
             if self.session.current is revision:
                 try:
                     await self.threads.run("prepare", self.finder_of(revision).prepare)

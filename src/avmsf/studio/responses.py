@@ -16,7 +16,6 @@ UNUSABLE = 422
 """Status of what was understood and cannot be used, as a recording of silence."""
 _STATUSES: Mapping[type[AvmsfError], int] = {FolderInUseError: 503, RecordingLengthError: 413}
 """Other statuses of errors that are no `RequestError`."""
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 NUMERIC_ERRORS = (ValueError, ArithmeticError, torch.linalg.LinAlgError)  # type: ignore[attr-defined]
 """Errors of edits and searches for valid numbers that give no result."""
 FORESEEN_ERRORS = (OSError, MemoryError, RecursionError)
@@ -63,7 +62,7 @@ def error_response(error: Exception) -> RequestError:
         where = "" if error.filename is None else f"{error.filename}: "
         reason = error.strerror or str(error)
         return RequestError(
-            507 if error.errno in _FULL else 503,
+            507 if error.errno in (errno.ENOSPC, errno.EDQUOT) else 503,
             f"{where}expected a file to read or write, got {reason!r}; choose another folder or name",
             file=error.filename if isinstance(error.filename, str | Path) else None,
             value=reason,

@@ -19,8 +19,6 @@ from avmsf.studio.responses import RequestError, bad_request
 
 SUFFIX = ".safetensors"
 _NAME = re.compile(r"\w[\w .()+-]{0,99}(?<![. ])")
-_MAX_UNDONE = 100
-"""Maximum number of undo steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +119,8 @@ class Session:
     def _remember(self, revision: Revision) -> Revision:
         before = self.current
         changed = self._advance(revision)
-        self._past = [*self._past, before][-_MAX_UNDONE:]
+        # At most 100 steps back.
+        self._past = [*self._past, before][-100:]
         return changed
 
     def _advance(self, revision: Revision) -> Revision:
