@@ -130,7 +130,7 @@ class Reference:
         the target's own duration counts: beyond its end it continues with the rendered sound, and a longer decay would
         reduce the relative error.
         """
-        rendered = rendered.first(_MAX_CONTACTS)
+        rendered = rendered.first(6)
         best = (math.inf, 0.0, 0.0)
         for pitch in self._pitches(rendered):
             step, damping = _MAX_LOG_DAMPING / 4, 0.0
@@ -261,8 +261,6 @@ _WIDTH = 3.0
 _MAX_LOG_PITCH = math.log(8.0)
 """Largest change of the pitch, logarithm."""
 _MAX_LOG_DAMPING = math.log(64.0)
-_MAX_CONTACTS = 6
-"""Contacts of the search."""
 _FFT_SIZES = (2048, 1024, 512, 256)
 
 

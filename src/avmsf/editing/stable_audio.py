@@ -254,7 +254,6 @@ def _reach(strides: list[int]) -> int:
 
 
 _NETWORKS: Final = ("vae", "text_encoder", "projection_model", "transformer")
-_PRECONDITIONING: Final = ("precondition_inputs", "precondition_noise", "precondition_outputs")
 _SAMPLED = 64
 """Numbers of each weight that a digest looks at, evenly spaced."""
 _ON_SAVING: Final = ("architectures", "dtype", "torch_dtype", "transformers_version")
@@ -281,7 +280,7 @@ def _load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
             # No user of this package can fix it.
             warnings.filterwarnings("ignore", message="`torch.nn.utils.weight_norm` is deprecated")
             pipeline = kind.from_pretrained(place, local_files_only=True, use_safetensors=True)
-        for part in _PRECONDITIONING:
+        for part in ("precondition_inputs", "precondition_noise", "precondition_outputs"):
             if not hasattr(pipeline.scheduler, part):
                 raise ValueError(f"the scheduler {type(pipeline.scheduler).__name__}, not of the EDM family")
         for part in _NETWORKS:

@@ -228,8 +228,6 @@ def _check_points(
 
 _NEIGHBORS = 12
 """Neighbors in the graph along which the orientation is propagated."""
-_VIEWS = 128
-"""Directions in which the outermost points of a component are determined."""
 
 
 def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "points 3"]:
@@ -254,14 +252,14 @@ def outward_normals(points: Float[Tensor, "points 3"]) -> Float32[Tensor, "point
     edges, first = np.unique(edges, axis=0, return_index=True)
     tree = minimum_spanning_tree(coo_matrix((bend[first], edges.T), shape=(len(places),) * 2).tocsr())
     count, part = connected_components(tree, directed=False)
-    views = fibonacci_sphere(_VIEWS).numpy()
+    directions = fibonacci_sphere(128).numpy()
     for number in range(count):
         members = np.flatnonzero(part == number)
         order, parents = breadth_first_order(tree, members[0], directed=False)
         for row in order[1:]:
             if normals[row] @ normals[parents[row]] < 0:
                 normals[row] *= -1.0
-        outermost = members[np.argmax(places[members] @ views.T, axis=0)]
-        if np.einsum("vd,vd->", normals[outermost], views) < 0:
+        outermost = members[np.argmax(places[members] @ directions.T, axis=0)]
+        if np.einsum("vd,vd->", normals[outermost], directions) < 0:
             normals[members] *= -1.0
     return torch.from_numpy(normals).float()

@@ -15,8 +15,6 @@ from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureWarning, SceneError
 from avmsf.photographs.cameras import MIN_VIEWS, Camera, View
 
-COARSE_CELLS, FINE_CELLS = 50**3, 80**3
-"""Cells of the hull on its first and its second grid."""
 MIN_VIEW_RATIO = 1 / 3
 """Part of the views that must have a cell in their image for it to be object."""
 _CELLS_AT_ONCE = 1 << 16
@@ -164,13 +162,13 @@ def carve(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]) -
     if sum(mask.any() for mask in masks) < 2:
         return None
     middle, reach = object_extent(masks, cameras)
-    coarse = count_votes(masks, cameras, Grid.filling(middle - reach, middle + reach, cells=COARSE_CELLS))
+    coarse = count_votes(masks, cameras, Grid.filling(middle - reach, middle + reach, cells=50**3))
     inside = coarse.occupied(missing=len(masks) // 6)
     if not inside.any():
         return None
     low, high = coarse.grid.box(inside)
     margin = 1.5 * coarse.grid.spacing
-    return count_votes(masks, cameras, Grid.filling(low - margin, high + margin, cells=FINE_CELLS))
+    return count_votes(masks, cameras, Grid.filling(low - margin, high + margin, cells=80**3))
 
 
 def silhouette(
