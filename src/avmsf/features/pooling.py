@@ -103,12 +103,9 @@ def _orbits(
     tree = cKDTree(places.numpy())
     spacing = torch.from_numpy(read_neighborhoods(places.numpy()).spacing)
     limit = reach * spacing if reach else torch.full_like(spacing, math.inf)
-    orbits = []
-    for rotation in symmetries.rotations:
-        turned = [rotation.turn(places, angle) for angle in rotation.angles(angles)[1:]]
-        orbits.append(_symmetric_points(turned, tree, limit))
-    orbits += [_symmetric_points([mirror.reflect(places)], tree, limit) for mirror in symmetries.mirrors]
-    return orbits
+    moved = [[each.turn(places, angle) for angle in each.angles(angles)[1:]] for each in symmetries.rotations]
+    moved += [[mirror.reflect(places)] for mirror in symmetries.mirrors]
+    return [_symmetric_points(each, tree, limit) for each in moved]
 
 
 def _symmetric_points(
