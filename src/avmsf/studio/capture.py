@@ -239,10 +239,7 @@ class CaptureEditor:
             (self.folder / file).unlink(missing_ok=True)
 
     def _lock(self) -> AbstractContextManager[None]:
-        """Lock the table and the recordings against other studios.
-
-        Raises FolderInUseError if another one holds the lock for long; the page then sends the recording again.
-        """
+        """Lock the table and the recordings against other studios. Raises FolderInUseError after some seconds."""
         wait, advice = self.lock_seconds, ", and try again"
         return write_lock(self.folder / CACHE, "capture", command=COMMAND, wait=wait, advice=advice)
 
@@ -270,11 +267,7 @@ class CaptureEditor:
         return self.impacts()[index]
 
     def _owned(self, file: str, match: str | None) -> tuple[ImpactTable, int]:
-        """Return the table and the row of a recording to change.
-
-        Raises RequestError (409) unless it is the only row, the recording is no link, which may belong to another
-        impact or capture, and its digest is `match`.
-        """
+        """Return the table and the only row of a recording to change. Raises RequestError (404, 409)."""
         table = ImpactTable(self.folder)
         indices = table.rows_of(file)
         conflict = partial(bad_request, status=409)
@@ -283,6 +276,7 @@ class CaptureEditor:
             got, advice = f"rows {', '.join(map(str, lines))}", "correct the table"
             raise conflict(file, f"one row of {file}", lines, got=got, advice=advice, file=TABLE)
         path = self.folder / file
+        # What a link leads to may belong to another impact or capture.
         if path.resolve() != path:
             raise conflict("file", "a file", "link", got="a link", advice="copy the file there first", file=file)
         if match is not None and not (path.is_file() and match == _digest(path.read_bytes())):

@@ -156,10 +156,7 @@ class Showcase:
 
 
 def _on_mesh(surface: Surface) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
-    """Return points on a mesh and the normals of its faces, outward on average; its vertices if it has no faces.
-
-    For faces of inconsistent orientation the normals are estimated from the points.
-    """
+    """Return points on a mesh, its vertices if it has no faces, and normals, outward on average."""
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())
     if not len(surface.faces) or not mesh.area > 0:
         points = _thinned(surface.vertices, _MAX_OBJECT_POINTS)
