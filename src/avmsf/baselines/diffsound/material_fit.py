@@ -46,12 +46,6 @@ POISSON = 0.01, 0.499
 """Range of Poisson's ratio."""
 _STIFFER = 10.0
 """Largest factor on the stiffness of the material at the start, and its inverse."""
-_TRANSPORT_RATE, _DIFFERENCE_RATE = 1e-3, 2e-3
-_TRANSPORT_DECAY, _DIFFERENCE_DECAY = 0.9, 0.95
-"""Adam's rates, and their factor after each tenth and each twentieth of a stage."""
-_PUBLISHED_STEPS = 1000, 2000
-_MAX_RATE = 0.005
-"""Longest steps of a descent by differences: longer ones leave the basin that they start in."""
 _FASTEST_DECAY = 300.0
 """Largest damping of modes that the damping curve is made of, 1/s."""
 _CURVE_STEP, _CURVE_END = 500.0, 20_000.0
@@ -185,11 +179,13 @@ def fit_material(
         lowest = float(family.bodies[0].modes(starts[0]).frequency[0])
         wanted, got = f"modes from {BAND[0]:g} to {BAND[1]:g} Hz", f"a lowest mode at {lowest:.3g} Hz"
         raise EvaluationError.expected(wanted, lowest, got=got, name="frequency", advice="give the mesh's unit")
+    # The published rates of Adam, for 1000 and 2000 steps, and their factors after a tenth and a twentieth of a stage.
     steps = max(config.transport_steps, 1)
-    rate, decay = _TRANSPORT_RATE * _PUBLISHED_STEPS[0] / steps, _TRANSPORT_DECAY ** (10.0 / steps)
+    rate, decay = 1e-3 * 1000 / steps, 0.9 ** (10.0 / steps)
     best, _ = problem.descended(best, problem.transport, config.transport_steps, rate=rate, decay=decay)
     steps = max(config.difference_steps, 1)
-    rate, decay = min(_DIFFERENCE_RATE * _PUBLISHED_STEPS[1] / steps, _MAX_RATE), _DIFFERENCE_DECAY ** (20.0 / steps)
+    # Longer steps by differences leave the basin that they start in.
+    rate, decay = min(2e-3 * 2000 / steps, 0.005), 0.95 ** (20.0 / steps)
     _, best = problem.descended(best, problem.difference, config.difference_steps, rate=rate, decay=decay)
     if config.search:
         best = minimize_within(problem.bounds, problem.loss, best, generations=config.search)
