@@ -27,7 +27,6 @@ _FLOAT, _UNSIGNED = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
 _TARGETS = {**dict.fromkeys(("POSITION", "NORMAL", "COLOR_0"), 34962), "indices": 34963}
 """What a buffer view is bound to: vertices, or the indices of triangles."""
-_GRAY = 0.7
 _TURNS: dict[Axis, tuple[float, float, float, float]] = {
     "x": (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)),
     "y": (0.0, 0.0, 0.0, 1.0),
@@ -89,7 +88,7 @@ def _document(
     indices = {name: number[name] for name in drawn if name == "indices"}
     attributes = {name: number[name] for name in drawn if name != "indices"}
     primitive = {"attributes": attributes, "mode": _TRIANGLES if indices else _POINTS, "material": 0, **indices}
-    shade = 1.0 if "COLOR_0" in drawn else float(_linear(torch.tensor(_GRAY)))
+    shade = 1.0 if "COLOR_0" in drawn else float(_linear(torch.tensor(0.7)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
     sounds = {"modalModel": 0}
     document = {

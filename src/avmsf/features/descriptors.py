@@ -19,7 +19,6 @@ from torch import Tensor
 from avmsf.features.encoder import unit_image
 
 _Plane = NDArray[np.float32]
-_HARMONICS = 4
 _COLOR_SIZES = np.array([1 / 0.14, 1 / 0.08, 1 / 0.08], dtype=np.float32)
 """What brings L, a and b, as shares of 100, to about unit spread over an object's surface, as seen on real textures."""
 _SPREAD_SIZES = np.array([1 / 0.03, 1 / 0.02, 1 / 0.02], dtype=np.float32)
@@ -80,7 +79,7 @@ def _orientations(brightness: _Plane, scale: float) -> list[_Plane]:
     turn = (across + 1j * down) / np.maximum(strength, np.float32(1e-6))
     mean = _smooth(strength, scale)
     planes, power = [_plane(np.log1p(100 * mean)) * _GRADIENT_SIZE], strength.astype(np.complex64)
-    for _ in range(_HARMONICS):
+    for _ in range(4):
         power = power * turn
         magnitude = np.hypot(_smooth(_plane(power.real), scale), _smooth(_plane(power.imag), scale))
         planes.append(_plane(magnitude / (mean + _MIN_GRADIENT)) * _HARMONIC_SIZE)

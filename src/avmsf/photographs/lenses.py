@@ -19,8 +19,6 @@ from avmsf.photographs.images import MAX_PIXELS
 
 _GRID_POINTS = 33
 """Points along each side of a pinhole's image at which a lens is tested."""
-_MAX_FIELD_RATIO = 2.0
-"""Width and height that a pinhole takes in over those that the lens has in its middle, at most."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,8 @@ def undistort(
 
 def _widest_pinhole(lens: Lens) -> Camera:
     """Return the pinhole of smallest focal length, by bisection, whose every pixel lies in the lens's image."""
-    narrow, wide = 4.0, 1 / _MAX_FIELD_RATIO
+    # No wider than twice the width and height of the lens's middle.
+    narrow, wide = 4.0, 0.5
     if not _covers(lens, narrow):
         advice = f"check the camera model (fisheye: {lens.fisheye}) and the order of its coefficients"
         raise lens.origin.expected("an invertible distortion", lens.distortion, name="distortion", advice=advice)
