@@ -14,8 +14,6 @@ from avmsf.features.feature_field import FeatureField
 from avmsf.mesh.neighborhoods import read_neighborhoods
 from avmsf.symmetry.symmetries import Symmetries
 
-DEFAULT_ITERATIONS = 3
-"""Rounds of orbit and mirror pooling (paper: T, not stated)."""
 DEFAULT_ANGLES = 36
 """Angles of an orbit about a continuous axis: every 10 degrees."""
 DEFAULT_REACH_SPACINGS = 3.0
@@ -29,15 +27,16 @@ def refine(
     features: FeatureField,
     symmetries: Symmetries,
     *,
-    iterations: int = DEFAULT_ITERATIONS,
+    iterations: int = 3,
     angles: int = DEFAULT_ANGLES,
     reach: float = DEFAULT_REACH_SPACINGS,
 ) -> FeatureField:
     """Return the same points with features that agree between symmetric places.
 
-    In every round, for each rotation the mean over its orbit of the feature of the point nearest to the rotated point
-    (the point itself included), and then for each mirror plane the mean of a point's own feature and that of the point
-    nearest to its image. An orbit has the turns of the rotation's order, or `angles` even ones about a continuous axis.
+    In each of the `iterations` (paper: T, not stated), for each rotation the mean over its orbit of the feature of the
+    point nearest to the rotated point (the point itself included), and then for each mirror plane the mean of a point's
+    own feature and that of the point nearest to its image. An orbit has the turns of the rotation's order, or `angles`
+    even ones about a continuous axis.
 
     A rotated point without a point of the cloud within `reach` spacings, in a hole of it, is left out of the mean, so
     that features of another part are not mixed in; `reach` 0 takes the nearest point however far it is (paper). Without
@@ -90,11 +89,7 @@ def _pool(rows: Int[Tensor, "members points"], found: Bool[Tensor, "members poin
 
 
 def _orbits(
-    points: Float[Tensor, "points 3"],
-    symmetries: Symmetries,
-    *,
-    angles: int,
-    reach: float = DEFAULT_REACH_SPACINGS,
+    points: Float[Tensor, "points 3"], symmetries: Symmetries, *, angles: int, reach: float = DEFAULT_REACH_SPACINGS
 ) -> list[SymmetricPoints]:
     """Return the counterparts under every rotation, and then under every mirror plane."""
     if not symmetries:
