@@ -288,16 +288,10 @@ def _load_pipeline(source: str | Path, dtype: torch.dtype) -> tuple[Any, str]:
             if missing:
                 raise ValueError(f"{part} without {missing[0]} and {len(missing) - 1} other weights")
     except Exception as error:  # diffusers, transformers, safetensors and the hub's client have their own errors
-        raise EditError.expected(
-            f"a complete {kind.__name__} of diffusers",
-            str(source),
-            got=f"none ({download_failure(error)})",
-            file=folder,
-            name="source",
-            advice=f"copy it again; {_HOW_TO_GET.format(name=STABLE_AUDIO)}"
-            if folder
-            else _HOW_TO_GET.format(name=name),
-        ) from error
+        wanted, got = f"a complete {kind.__name__} of diffusers", f"none ({download_failure(error)})"
+        how = _HOW_TO_GET.format(name=STABLE_AUDIO if folder else name)
+        advice = f"copy it again; {how}" if folder else how
+        raise EditError.expected(wanted, str(source), got=got, file=folder, name="source", advice=advice) from error
     for part in _NETWORKS:
         # By hand, for how a pipeline's precision is set changed between versions of diffusers.
         getattr(pipeline, part).to(torch.float32 if part == "vae" else dtype)

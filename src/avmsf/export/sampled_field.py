@@ -213,13 +213,9 @@ def _check_points(
 ) -> None:
     finite = bool(torch.isfinite(places).all()) and (normals is None or bool(torch.isfinite(normals).all()))
     if len(places) == 0 or not finite:
-        raise ExportError.expected(
-            "finite points of the object's surface",
-            len(places),
-            got="none" if len(places) == 0 else "NaN or infinity",
-            name="points",
-            advice="name a mesh or Gaussians of the object, or fit the field to features on its surface",
-        )
+        wanted, got = "finite points of the object's surface", "NaN or infinity" if len(places) else "none"
+        advice = "name a mesh or Gaussians of the object, or fit the field to features on its surface"
+        raise ExportError.expected(wanted, len(places), got=got, name="points", advice=advice)
     if normals is not None and normals.shape != places.shape:
         raise ExportError.expected(f"one for each of {len(places)} points", len(normals), name="normals")
     if limit is not None and limit < 1:

@@ -56,12 +56,8 @@ def write(
     output = Path(output)
     kind = _OF_SUFFIX.get(output.suffix.lower()) if to is None else to
     if kind is None or kind not in FORMATS:
-        raise ExportError.expected(
-            f"a name that ends in {', '.join(_OF_SUFFIX)}, or to= one of {', '.join(FORMATS)}",
-            output.suffix if to is None else to,
-            file=output,
-            name="to",
-        )
+        wanted = f"a name that ends in {', '.join(_OF_SUFFIX)}, or to= one of {', '.join(FORMATS)}"
+        raise ExportError.expected(wanted, output.suffix if to is None else to, file=output, name="to")
     known = [name for name, each in signature(WRITERS[kind]).parameters.items() if each.kind is each.KEYWORD_ONLY]
     if unknown := next((name for name in options if name not in known), None):
         raise ExportError.unknown(unknown, known, name=f"an option of {kind}")

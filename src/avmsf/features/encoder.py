@@ -47,10 +47,8 @@ def unit_image(
     # Renderings overshoot a little; a factor of 255 is a mistake.
     if not -1.0 <= lowest <= highest <= 2.0:
         got = f"{tuple(image.shape)} numbers from {lowest:g} to {highest:g}"
-        advice = "divide by the largest value of a pixel"
-        raise SceneError.expected(
-            "bytes, or numbers from 0 to 1", [lowest, highest], got=got, name="image", advice=advice
-        )
+        wanted, advice = "bytes, or numbers from 0 to 1", "divide by the largest value of a pixel"
+        raise SceneError.expected(wanted, [lowest, highest], got=got, name="image", advice=advice)
     return color.clamp(0.0, 1.0)
 
 

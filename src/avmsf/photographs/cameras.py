@@ -37,13 +37,10 @@ class Camera:
     def __post_init__(self) -> None:
         numbers = [*self.focal, *self.principal, *self.world_to_camera.flatten().tolist()]
         if not all(map(math.isfinite, numbers)) or min(self.focal) <= 0 or min(self.width, self.height) < 1:
-            raise CaptureError.expected(
-                "finite numbers, positive focal lengths and a size in pixels",
-                [*self.focal, *self.principal, self.width, self.height],
-                got=f"focal lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}",
-                name="camera",
-                advice="check the file that holds the cameras",
-            )
+            wanted = "finite numbers, positive focal lengths and a size in pixels"
+            got = f"focal lengths {self.focal}, principal point {self.principal}, size {self.width} x {self.height}"
+            values, advice = [*numbers[:4], self.width, self.height], "check the file that holds the cameras"
+            raise CaptureError.expected(wanted, values, got=got, name="camera", advice=advice)
 
     @classmethod
     def looking(

@@ -58,10 +58,8 @@ def read_contact(query: Mapping[str, str]) -> Impact:
         impact = parse_row(Row(0, cells, decimal_comma=False), CaptureSettings())
         check_distances([impact], CaptureSettings())
     except CaptureError as error:
-        reason = str(error).partition(": ")[2]
-        raise RequestError(
-            400, f"contact: {reason[:200]}; click the object", name=error.name, value=error.value
-        ) from error
+        message = f"contact: {str(error).partition(': ')[2][:200]}; click the object"
+        raise RequestError(400, message, name=error.name, value=error.value) from error
     return impact
 
 
