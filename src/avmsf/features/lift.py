@@ -103,8 +103,8 @@ def lift(
     `weighting`, `inpainted` and `progress` of `lift_points`. Raises as that.
     """
     depth_map = depth_of_cloud(cloud, rasterizer or choose_rasterizer(cloud.centers.device))
-    # Two standard deviations let twice as many through thin walls; what one turns away is seen at a slant, and by other
-    # views better.
+    # Two standard deviations would let twice as many through thin walls; what one turns away is seen at a slant, and
+    # by other views better.
     reach = partial(depth_reach, cloud)
     return lift_points(cloud.centers, views, encoder, depth_map=depth_map, reach=reach, **settings)
 
