@@ -130,6 +130,7 @@ class Reference:
         the target's own duration counts: beyond its end it continues with the rendered sound, and a longer decay would
         reduce the relative error.
         """
+        # Each contact is rendered at every pitch and damping that is tried.
         rendered = rendered.first(6)
         best = (math.inf, 0.0, 0.0)
         for pitch in self._pitches(rendered):

@@ -79,6 +79,7 @@ def _orientations(brightness: _Plane, scale: float) -> list[_Plane]:
     turn = (across + 1j * down) / np.maximum(strength, np.float32(1e-6))
     mean = _smooth(strength, scale)
     planes, power = [_plane(np.log1p(100 * mean)) * _GRADIENT_SIZE], strength.astype(np.complex64)
+    # Harmonics 1 to 4 of the histogram.
     for _ in range(4):
         power = power * turn
         magnitude = np.hypot(_smooth(_plane(power.real), scale), _smooth(_plane(power.imag), scale))
