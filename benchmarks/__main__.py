@@ -72,7 +72,8 @@ def _run(name: str, measure: Measurement, settings: Settings, output: Path | Non
     """Print the records of one part: those that are stored for this commit, or measured now and stored."""
     commit, path = code_commit(), None if output is None else output / f"{name}.jsonl"
     found = [] if path is None else stored(path)
-    if "+" in commit or not found or any(record.commit != commit for record in found):
+    failed = any(record.name.endswith(".failure") for record in found)
+    if "+" in commit or not found or failed or any(record.commit != commit for record in found):
         found = []
         for each in measure(settings):
             found.append(replace(each, name=f"{name}.{each.name}", commit=commit, machine=machine()))

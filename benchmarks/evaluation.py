@@ -40,10 +40,11 @@ def _evaluate(
 ) -> Iterator[Record]:
     """Means over objects of sim-20, exact meshes, seed 0, by `avmsf evaluate`.
 
-    ratio: over the mean of three, geometric means; median: over contacts. Features are descriptors, for want of DINOv2;
-    vision: six objects, features of EfficientNet-Lite0 trained on ImageNet. shots: six objects; localize: those without
-    rotational symmetry. Parts that begin with paper: three objects (paper-regularized: all), recordings of .5 s at
-    16 kHz from their peaks, with which the preset `paper` is trained to its end.
+    ratio: over the mean of three, geometric means; median: over contacts. What failed is left out, and named. Features
+    are descriptors, for want of DINOv2; vision: six objects, features of EfficientNet-Lite0 trained on ImageNet. shots:
+    six objects; one-impact: all, one training impact; localize: those without rotational symmetry. Parts that begin
+    with paper: three objects (paper-regularized: all), recordings of .5 s at 16 kHz from their peaks, with which the
+    preset `paper` is trained to its end.
     """
     chosen = settings.objects or settings.some(names, 6 if protocol == "edit" else 2)
     options = ["--visual-source", "mesh", "--no-cdpam", "--set", f"lift.encoder={encoder}"]
@@ -77,7 +78,6 @@ def _evaluate(
         if code not in (0, FAILED):
             raise RuntimeError(f"avmsf {' '.join(words)} ended with {code}")
         summary, results = json.loads((output / SUMMARY).read_text(encoding="utf-8")), ResultsFolder(output).records()
-    # Means are of the objects that have results.
     for each in summary["failures"]:
         reason = ": ".join(filter(None, (each["method"], each["case"], each["failure"])))
         yield Record("failure", math.nan, "", "", each["object"], note=reason)

@@ -80,6 +80,8 @@ def _parts(names: Sequence[str], options: Mapping[str, str], said: set[str]) -> 
         said.add(text)
         shown = [each for each in found if fnmatch(row_of(each), options.get("rows", "*"))]
         yield markdown(shown, options["columns"].split("; ") if "columns" in options else ())
+        if failures := [each for each in found if each.name.endswith(".failure")]:
+            yield f"Without {'; '.join(f'{each.object}: {each.note}' for each in failures)}"
         yield f"{_command([part])}, commit {_commits(found)}; [records](benchmarks/{part}.jsonl)"
     yield from _missing(names)
 

@@ -270,7 +270,9 @@ def test_render_takes_a_table_in_any_unit_and_with_directions(path: Path) -> Non
     rows = ("rim/one.wav;50,0;30;2;0;0;-1;a", "wall;50;30;2;0;0;1;b", "lid;-40;10;2;;;;c")
     table, output = path.with_name("places.csv"), path.with_name("out")
     table.write_text("\n".join(["File;X;Y;Z;NX;NY;NZ;who", *rows]) + "\n")
-    assert main(["render", str(path), "--contact-table", str(table), "--unit", "mm", "--output", str(output)]) == 0
+    words = ["render", str(path), "--contact-table", str(table), "--unit", "mm", "--output", str(output)]
+    # What is there is replaced only where that is asked for.
+    assert [main(words), main(words), main([*words, "--overwrite"])] == [0, 2, 0]
     expected = load(path).render(PLACES, directions=DIRECTIONS)
     for sound, name in zip(expected, ("rim/one.wav", "wall.wav", "lid.wav"), strict=True):
         assert np.array_equal(soundfile.read(output / name, dtype="float32")[0], sound.numpy())

@@ -79,7 +79,8 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int) -> list[int]:
 def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, capsys: Streams) -> None:
     folder, output = field.parent / "look", field.with_name("new.safetensors")
     words = ["edit", field, "-o", output, "--to", "Wood", "--from", "ceramic", "--scale", "2", "--plots", folder]
-    told, _ = results_of(capsys, *words)
+    told, shown = results_of(capsys, *words)
+    assert "gains by the law of recordings in proportion to" in shown
     new = load(output)
     expect_same(new, change_material(ceramic(), CERAMIC, WOOD, size=2.0))
     assert told["edits"][0]["to"]["name"] == "wood"

@@ -69,6 +69,19 @@ def test_a_bar_rings_along_itself_and_twists():
         assert float((found.frequency / expected - 1).abs().min()) < tolerance
 
 
+def test_frequencies_converge_as_second_order_elements_do():
+    two, four, six = (
+        elastic_modes(block((0.05, 0.04, 0.03), (n, n, n)), GLASS, count=3).frequency.numpy() for n in (2, 4, 6)
+    )
+    for coarse, middle, fine in zip(two, four, six, strict=True):
+        # Errors of n^-p make this ratio of differences, Richardson's. Smooth bodies have p = 4, edges cost some of it;
+        # linear elements have 2.
+        ratio = (coarse - middle) / (middle - fine)
+        order = scipy.optimize.brentq(lambda p, r=ratio: r * (4.0**-p - 6.0**-p) - (2.0**-p - 4.0**-p), 0.5, 8.0)
+        assert 2.8 < order < 4.2
+        assert coarse > middle > fine
+
+
 def test_the_few_lowest_modes_of_a_thin_ball_are_found_though_they_are_close_together():
     radius, thickness = 0.05, 0.001
     found = elastic_modes(shell(sphere(radius), thickness=thickness, detail=0.08), GLASS, count=5).frequency

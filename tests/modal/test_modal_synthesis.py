@@ -45,6 +45,15 @@ def test_blocks_make_the_plain_sum(dtype: torch.dtype, tolerance: float, samples
     assert float((found - expected).abs().max()) < tolerance * float(expected.abs().max())
 
 
+def test_each_contact_decays_at_its_own_damping():
+    gains, frequency, damping = draw()
+    own = damping * torch.tensor([[1.0], [2.0], [5.0]], dtype=torch.float64)
+    together = synthesize(gains, frequency, own, samples=2000, sample_rate=RATE)
+    for row in range(3):
+        alone = plain_sum(gains[row : row + 1], frequency, own[row], 2000)
+        torch.testing.assert_close(together[row : row + 1], alone, rtol=0, atol=1e-11)
+
+
 def test_gradients_are_those_of_finite_differences():
     gains, frequency, damping = draw(contacts=1, modes=2)
     # Slow enough that a finite difference in frequency stays in the linear range over the two blocks.

@@ -325,6 +325,14 @@ def test_the_hull_of_a_ball_is_the_ball_within_half_a_pixel() -> None:
     assert float(np.abs(found - truth)[near].mean()) < 0.5e-3
 
 
+def test_a_higher_rank_forgives_as_many_wrong_masks() -> None:
+    views = list(views_of(ball(RADIUS)))
+    views[0] = replace(views[0], mask=torch.zeros_like(views[0].mask))
+    outlines = [Outline.of(view) for view in views]
+    assert not (hull_distance(outlines, GRID, rank=0) > 0).any()
+    assert (hull_distance(outlines, GRID, rank=1) > 0).any()
+
+
 def _ball() -> np.ndarray:
     places = np.stack(np.meshgrid(*[np.arange(25.0)] * 3, indexing="ij"), axis=-1)
     return (8.3 - np.linalg.norm(places - 12.2, axis=-1)).astype(np.float32)

@@ -59,6 +59,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
     if field.noise.any():
         remarks.append("the residual noise is left out")
     leaning = math.degrees(math.acos(min(1.0, float(field.normals[rows].abs().amax(1).min())))) if len(rows) else 0.0
+    # Nearer than a degree, a normal counts as along an axis.
     if leaning > 1.0:
         axis = f"their reference direction is the nearest axis, up to {leaning:.0f} degrees off"
         remarks.append(f"response functions are of impacts against the normal; {axis}")
@@ -67,6 +68,7 @@ def write_universal(field: SampledField, path: str | Path, *, functions: int = 1
 
 def response_frequencies(field: SampledField) -> Float64[np.ndarray, " lines"]:
     """Return where response functions are given, Hz: from 0 to about half the rate, as finely as sounds allow."""
+    # At most 65,536 lines of a function.
     lines = max(2, min(field.samples // 2 + 1, 1 << 16))
     # The format has six digits for the step, from which readers count.
     step = float(f"{0.5 * field.sample_rate / (lines - 1):.5e}")

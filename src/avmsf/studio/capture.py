@@ -265,7 +265,10 @@ class CaptureEditor:
         return self.impacts()[index]
 
     def _owned(self, file: str, match: str | None) -> tuple[ImpactTable, int]:
-        """Return the table and the only row of a recording to change. Raises RequestError (404, 409)."""
+        """Return the table and the row of a recording to change.
+
+        Raises RequestError: 404 for an unknown one; 409 unless it has one row, is no link and has the digest `match`.
+        """
         table = ImpactTable(self.folder)
         indices = table.rows_of(file)
         conflict = partial(bad_request, status=409)

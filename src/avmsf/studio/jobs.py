@@ -92,6 +92,7 @@ class Job:
 
     async def _work(self) -> Event:
         """Return the event with the worker's result, or with an error; its other events are published."""
+        # A result is one line of at most 4 MiB.
         process = await asyncio.create_subprocess_exec(
             *self.command, stdin=PIPE, stdout=PIPE, stderr=PIPE, limit=1 << 22
         )

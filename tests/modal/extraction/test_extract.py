@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -13,7 +14,8 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
-from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once, extract_sounds
+from avmsf.modal.config import ExtractionMethod
+from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_modes, extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, lowest_frequency
 from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank
@@ -227,3 +229,7 @@ def test_the_same_sounds_give_the_same_modes_to_the_last_bit() -> None:
     first, second = (extract_sounds(each, sample_rate=20000.0).bank for each in (sounds, shifted))
     assert torch.equal(first.frequency, second.frequency)
     assert torch.equal(first.damping, second.damping)
+
+
+def test_every_named_method_has_a_finder():
+    assert set(FINDERS) == set(get_args(ExtractionMethod))

@@ -103,6 +103,7 @@ def _positions(bins: int, modes: Float[Tensor, " modes"] | None) -> Float[Tensor
 def _cloud(
     features: Float[Tensor, "contacts bins frames"], position: Float[Tensor, " bins"]
 ) -> Float[Tensor, "contacts bins 4"]:
+    # Three moments of each row of a spectrogram.
     sampled = torch.nn.functional.interpolate(features.detach(), size=3, mode="linear")
     return torch.cat([sampled, position.expand(len(sampled), -1)[..., None]], dim=2)
 
