@@ -1,6 +1,7 @@
 """Help and errors: one screen, one line."""
 
 import json
+import math
 import re
 import subprocess
 import sys
