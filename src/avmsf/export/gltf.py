@@ -88,6 +88,7 @@ def _document(
     indices = {name: number[name] for name in drawn if name == "indices"}
     attributes = {name: number[name] for name in drawn if name != "indices"}
     primitive = {"attributes": attributes, "mode": _TRIANGLES if indices else _POINTS, "material": 0, **indices}
+    # An object without colors is gray.
     shade = 1.0 if "COLOR_0" in drawn else float(_linear(torch.tensor(0.7)))
     surface = {"baseColorFactor": [shade] * 3 + [1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
     sounds = {"modalModel": 0}
