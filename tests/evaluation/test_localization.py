@@ -32,7 +32,7 @@ from avmsf.evaluation.localization import (
 from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.evaluation.objects import ObjectInputs
-from avmsf.evaluation.registry import EditProtocolSettings
+from avmsf.evaluation.registry import EditProtocolSettings, VisualInput
 from avmsf.evaluation.results import ObjectRecord, ResultsFolder
 from avmsf.evaluation.simple_methods import NearestRecording, WhiteNoise
 from avmsf.evaluation.task import Task
@@ -165,7 +165,13 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
 
     def quick(method: FieldMethod, task: Task) -> SoundField:
         config = replace(QUICK, warmup_steps=0, steps=1)
-        return fit(task.train, task.features("positions"), task.modes(), config, gains=MixtureEstimator(("smooth",)))
+        return fit(
+            task.train,
+            task.features(VisualInput("visual", bare=True)),
+            task.modes(),
+            config,
+            gains=MixtureEstimator(("smooth",)),
+        )
 
     def watched(*given: Any, **named: Any) -> Any:
         asked[named["published"]] = named["vertices"]

@@ -26,7 +26,7 @@ from avmsf.evaluation.methods import (
     method_named,
     random_modes,
 )
-from avmsf.evaluation.registry import METHODS, METRICS, resolve
+from avmsf.evaluation.registry import METHODS, METRICS, VisualInput, resolve
 from avmsf.evaluation.splits import split
 from avmsf.evaluation.task import Method, Renderer, Task, report_of
 from avmsf.features.feature_field import FeatureField
@@ -49,6 +49,7 @@ from oracles.block import block
 
 TINY = replace(QUICK, hidden=16, layers=1, warmup_steps=6, steps=4, fft_sizes=(256,), early=256)
 COUNT, TRAIN = 20, 9
+VISUAL = VisualInput("visual")
 SECONDS, SAMPLES = 0.1, 800
 
 
@@ -198,12 +199,12 @@ def test_fields_read_what_their_names_say():
         return plate_features(200)
 
     def blind(look):
-        raise SceneError("no visual input", name=look)
+        raise SceneError("no visual input", name=look.form)
 
     task = replace(plate_task(parts()[0]), features=features)
     for name in ("field", "field-positions", "field-unaligned", "field-no-residual", "field-no-initialization"):
         tiny(method_named(name)).fit(task)
-    assert asked == ["visual", "positions", "unaligned", "visual", "visual"]
+    assert asked == [VISUAL, replace(VISUAL, bare=True), replace(VISUAL, pooled=False), VISUAL, VISUAL]
     with raises(SceneError, name="visual"):
         tiny(method_named("field")).fit(replace(task, features=blind))
 

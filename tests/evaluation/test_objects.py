@@ -16,7 +16,7 @@ from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import Dataset, ObjectFacts, VisualSource
 from avmsf.errors import CaptureError, EvaluationError, SceneError
 from avmsf.evaluation.objects import ObjectInputs, choose_objects, draw_other_recording
-from avmsf.evaluation.registry import PROTOCOLS
+from avmsf.evaluation.registry import PROTOCOLS, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
@@ -32,6 +32,7 @@ from factories.small_scene import slab, slab_views
 pytestmark = pytest.mark.filterwarnings("ignore:.*neither texture nor colors")
 
 CONFIG = SceneConfig(views=ViewsConfig(rendered=24), lift=LiftConfig(encoder="descriptors", points=1200, components=4))
+VISUAL, UNPOOLED = VisualInput("visual"), VisualInput("visual", pooled=False)
 
 
 class OneObject(Dataset):
@@ -62,7 +63,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_features_and_positions_are_of_the_same_points_and_made_once(seen: Path, tmp_path: Path) -> None:
     inputs = ObjectInputs(OneObject(seen), tmp_path, CONFIG)
     aligned, bare, unaligned = (
-        inputs.features("slab", visual_input) for visual_input in ("visual", "positions", "unaligned")
+        inputs.features("slab", each) for each in (VISUAL, VisualInput("visual", bare=True), UNPOOLED)
     )
     assert torch.equal(aligned.points, bare.points)
     assert torch.equal(aligned.points, unaligned.points)
@@ -72,17 +73,17 @@ def test_features_and_positions_are_of_the_same_points_and_made_once(seen: Path,
     assert not torch.allclose(aligned.features, unaligned.features)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
     assert len(before) == 2
-    inputs.features("slab", "visual")
+    inputs.features("slab", VISUAL)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")} == before
     # Pooling is left out where the settings say so, too.
     unpooled = replace(CONFIG, lift=replace(CONFIG.lift, symmetry=False))
-    plain = ObjectInputs(OneObject(seen), tmp_path / "plain", unpooled).features("slab", "visual")
+    plain = ObjectInputs(OneObject(seen), tmp_path / "plain", unpooled).features("slab", VISUAL)
     assert torch.equal(plain.features, unaligned.features)
     # The surface is that of the views where a mesh does not count.
     meshless = ObjectInputs(OneObject(seen, slab()), tmp_path, CONFIG, geometry="gaussians")
-    assert torch.equal(meshless.features("slab", "surface").points, bare.points)
+    assert torch.equal(meshless.features("slab", VisualInput()).points, bare.points)
     # Fewer views are kept apart from all.
-    assert not torch.allclose(inputs.features("slab", "unaligned", 6).features, unaligned.features)
+    assert not torch.allclose(inputs.features("slab", UNPOOLED, 6).features, unaligned.features)
     images = {place.name: len(list(place.rglob("images/*.png"))) for place in (tmp_path / "slab").iterdir()}
     assert images == {"6 views": 6, "all views": 72}
 
@@ -92,14 +93,15 @@ def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: P
     scene = replace(CONFIG, splat=SplatConfig(steps=30, start_points=1500))
     paper = replace(PRESETS["paper"].scene.lift, encoder="descriptors")
     inputs = ObjectInputs(OneObject(seen), tmp_path, scene, paper)
-    features = inputs.features("slab", "paper")
+    features = inputs.features("slab", VisualInput("paper"))
     (cloud,) = tmp_path.rglob("cloud.ply")
     assert {*map(tuple, features.points.tolist())} <= {*map(tuple, read_splats(cloud).centers.tolist())}
     # All that the encoder says, and no positions.
     assert features.features.shape[1] > 4 + 3
     assert "components" not in features.encoder
     # The paper's ablations differ from it in nothing else.
-    bare, unaligned = inputs.features("slab", "paper-positions"), inputs.features("slab", "paper-unaligned")
+    forms = (VisualInput("paper", bare=True), VisualInput("paper", pooled=False))
+    bare, unaligned = (inputs.features("slab", each) for each in forms)
     assert torch.equal(bare.points, features.points)
     assert torch.equal(bare.features, FeatureField.from_points(features.points).features)
     assert torch.equal(unaligned.points, features.points)
@@ -111,18 +113,18 @@ def test_the_papers_features_are_of_gaussians_even_where_a_mesh_is_there(seen: P
     (tmp_path / "made").mkdir()
     write_splats(made, tmp_path / "made" / SPLATS[0])
     smooth = ObjectInputs(OneObject(tmp_path / "made"), tmp_path / "smooth", scene, paper)
-    aligned, unaligned = (smooth.features("slab", each) for each in ("paper", "paper-unaligned"))
+    aligned, unaligned = (smooth.features("slab", each) for each in (VisualInput("paper"), forms[1]))
     assert torch.equal(unaligned.points, aligned.points)
     assert not torch.allclose(unaligned.features, aligned.features)
 
 
 def test_an_object_that_nothing_shows_has_positions_alone(tmp_path: Path) -> None:
     inputs = ObjectInputs(OneObject(None), tmp_path, CONFIG)
-    points = inputs.features("slab", "positions").points
+    points = inputs.features("slab", VisualInput("visual", bare=True)).points
     assert points.amin(0).tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
     assert points.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.1], abs=0.02)
     with raises(SceneError, name="slab"):
-        inputs.features("slab", "visual")
+        inputs.features("slab", VISUAL)
 
 
 def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) -> None:
@@ -133,7 +135,7 @@ def test_a_mesh_may_be_preferred_to_the_photographs_beside_it(tmp_path: Path) ->
 
 
 def test_the_surface_of_a_mesh_needs_no_views_and_is_that_of_a_fit(tmp_path: Path) -> None:
-    found = ObjectInputs(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3).features("slab", "surface")
+    found = ObjectInputs(OneObject(None, slab()), tmp_path / "cache", CONFIG, seed=3).features("slab", VisualInput())
     assert torch.equal(found.points, FeatureField.from_mesh(slab(), seed=3).points)
     assert not (tmp_path / "cache").exists()
 

@@ -25,6 +25,7 @@ from avmsf.evaluation.registry import (
     PROTOCOLS,
     MetricEntry,
     MetricSettings,
+    VisualInput,
 )
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.scores import score
@@ -227,7 +228,7 @@ def test_the_papers_method_is_the_preset_with_one_damping(name: str, damping: An
     preset = PRESETS["paper"]
     assert field.pipeline == replace(preset, fit=replace(preset.fit, damping=damping))
     assert (field.pipeline == preset) == (name == "av-msf")
-    assert (field.visual_input, field.published) == ("paper", True)
+    assert (field.visual_input, field.published) == (VisualInput("paper"), True)
 
 
 def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere(monkeypatch):
@@ -237,8 +238,8 @@ def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere
     monkeypatch.setattr(DinoEncoder, "load", missing)
     said = list[str]()
     with raises(SceneError, value="facebook/dinov2-base"):
-        available_encoders(LiftConfig(), {"visual", "paper"}, log=said.append)
-    usual, paper = available_encoders(LiftConfig(), {"visual"}, log=said.append)
+        available_encoders(LiftConfig(), {VisualInput("visual"), VisualInput("paper")}, log=said.append)
+    usual, paper = available_encoders(LiftConfig(), {VisualInput("visual")}, log=said.append)
     assert (usual.encoder, paper.encoder) == (DESCRIPTORS, DINO)
     assert any("descriptors" in line for line in said)
     named = available_encoders(LiftConfig(encoder=DESCRIPTORS), {"paper"}, log=said.append)
@@ -261,11 +262,11 @@ def test_encoders_are_loaded_once_on_the_device_and_only_for_who_reads_them(monk
     read = read_by("farthest", "knn3", "white-noise", "diffsound")
     assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0] == LiftConfig()
     # Recordings are located at the points that features have.
-    assert read_by("localize", "nearest") == read_by("localize", "field-auto") == {"surface"}
-    assert available_encoders(LiftConfig(), {"surface"}, log=said.append)[0] == LiftConfig()
+    assert read_by("localize", "nearest") == read_by("localize", "field-auto") == {VisualInput()}
+    assert available_encoders(LiftConfig(), {VisualInput()}, log=said.append)[0] == LiftConfig()
     assert loaded == []
     read = read_by("farthest", "field", "field-auto", "paper-grid")
-    assert read == {"visual", "surface", "paper"}
+    assert read == {VisualInput(each) for each in ("visual", "surface", "paper")}
     assert available_encoders(LiftConfig(), read, device="cpu", log=said.append)[0].encoder == DINO
     assert loaded == [(DINO, "cpu")]
 

@@ -7,7 +7,7 @@ from typing import Any
 from avmsf.capture import Capture, write_capture
 from avmsf.errors import SceneError, SimulationError
 from avmsf.evaluation.objects import ObjectInputs
-from avmsf.evaluation.task import VisualInput
+from avmsf.evaluation.registry import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.simulate.ground_truth import TRUTH, Truth, write_truth
 from factories.plate_field import CONTACT_TIME, HIGHEST, plate_impacts, rectangle
@@ -46,7 +46,7 @@ class PlateInputs(ObjectInputs):
     """Positions of a plate, and no looks and no shape."""
 
     def features(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
-        if visual_input not in ("surface", "positions"):
+        if visual_input.form != "surface" and not visual_input.bare:
             raise SceneError(f"{identifier}: nothing shows its look")
         return FeatureField.from_points(plate_surface_points(plate_named(identifier), 200))
 

@@ -28,9 +28,9 @@ from avmsf.capture.filenames import files_in
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.evaluation.metrics import envelope_distance
-from avmsf.evaluation.registry import kind_of, method_entry, resolve
+from avmsf.evaluation.registry import VisualInput, kind_of, method_entry, resolve
 from avmsf.evaluation.simple_methods import MeanGains
-from avmsf.evaluation.task import Contacts, Method, Renderer, Sounds, Task, VisualInput
+from avmsf.evaluation.task import Contacts, Method, Renderer, Sounds, Task
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.material import MATERIALS
 from avmsf.field.config import FitConfig, GainModelName
@@ -70,7 +70,7 @@ class FunctionMethod:
     """Makes the renderer from the task's training recordings. Raises AvmsfError where it cannot."""
     weights: str = ""
     """Digest of the weights that it starts from: results of other weights are not mixed."""
-    visual_input: VisualInput = "surface"
+    visual_input: VisualInput = field(default_factory=VisualInput)
     """What is read of the object's points, by the field that it asks for."""
 
 
@@ -260,7 +260,7 @@ class FieldMethod:
     """What tables call it."""
     pipeline: PipelineConfig = NETWORK
     """Settings of all stages."""
-    visual_input: VisualInput = "visual"
+    visual_input: VisualInput = field(default_factory=partial(VisualInput, "visual"))
     """What is read of the object's points."""
     published: bool = False
     """Whether modes are found as `pipeline` says, in place of those that all methods share, and recordings are located

@@ -21,8 +21,7 @@ from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.editing import TRANSITIONS, materials_of
 from avmsf.evaluation.modal_metrics import simulated
 from avmsf.evaluation.mode_embedding import check_materials
-from avmsf.evaluation.registry import Protocol
-from avmsf.evaluation.task import VisualInput
+from avmsf.evaluation.registry import Protocol, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.store import load_features, read_report
 from avmsf.fem.candidate_bodies import CandidateBodies
@@ -59,18 +58,18 @@ class ObjectInputs:
     """Seed of the points on a mesh, and of the methods."""
 
     def features(self, identifier: str, visual_input: VisualInput, views: int | None = None) -> FeatureField:
-        """Return what `visual_input` means for an object, from at most `views` views, or from all for None.
+        """Return these features of an object, from at most `views` views, or from all for None.
 
-        `positions` are those of the same points that features are lifted onto, so that the two differ in nothing else;
-        of an object that nothing shows, they are its surface's, or fill the box of its contacts. `surface` is as in
-        `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the features of an object
+        Positions are those of the same points that features are lifted onto, so that the two differ in nothing else; of
+        an object that nothing shows, they are its surface's, or fill the box of its contacts. The form `surface` is as
+        in `avmsf fit`, and needs no views of an object with a mesh. Raises SceneError for the features of an object
         that nothing shows, and DatasetError for an unknown one.
         """
-        if visual_input == "surface" and self.geometry != "gaussians":
+        if visual_input.form == "surface" and self.geometry != "gaussians":
             surface = self.dataset.capture(identifier).surface
             if surface is not None:
                 return FeatureField.from_mesh(surface, seed=self.seed)
-        bare = visual_input == "surface" or visual_input.endswith("positions")
+        bare = visual_input.form == "surface" or visual_input.bare
         if bare and self.dataset.visual_source(identifier) is None:
             capture = self.dataset.capture(identifier)
             if capture.surface is None:
@@ -83,19 +82,19 @@ class ObjectInputs:
     @contextmanager
     def _features(self, identifier: str, visual_input: VisualInput, views: int | None) -> Iterator[Path]:
         """Yield the file of the features of the points that views show, locked."""
-        lift = self.paper if visual_input.startswith("paper") else self.scene.lift
-        if visual_input == "surface" and lift.encoder == AUTO:
+        lift = self.paper if visual_input.form == "paper" else self.scene.lift
+        if visual_input.form == "surface" and lift.encoder == AUTO:
             # Positions do not depend on the encoder.
             lift = replace(lift, encoder=DESCRIPTORS)
         lift = replace(
             lift,
-            symmetry=lift.symmetry and not visual_input.endswith("unaligned"),
-            standardize=lift.standardize or visual_input.endswith("standardized"),
+            symmetry=lift.symmetry and visual_input.pooled,
+            standardize=lift.standardize or visual_input.standardized,
         )
         # The ablated features lie beside those of the fields without ablation.
-        name = f"{visual_input.removesuffix('-positions')}.safetensors"
-        if visual_input in ("surface", "positions", "visual"):
-            name = FEATURES
+        changes = {"paper": visual_input.form == "paper", "unaligned": not visual_input.pooled}
+        changes["standardized"] = visual_input.standardized
+        name = "-".join([*(change for change, made in changes.items() if made), FEATURES])
         with self._stages(identifier, replace(self.scene, lift=lift), views, name) as stages:
             yield stages.features.path
 
@@ -125,7 +124,7 @@ class ObjectInputs:
             return mesh_symmetries(surface, self.seed)
         if self.dataset.visual_source(identifier) is None:
             return None
-        with self._features(identifier, "surface", views) as path:
+        with self._features(identifier, VisualInput(), views) as path:
             return reported_symmetries(read_report(path))
 
     def family(self, identifier: str) -> BodyFamily:

@@ -14,10 +14,17 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.editing import Edits
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
-from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, table_modules
+from avmsf.evaluation.registry import (
+    METRICS,
+    EvaluationSettings,
+    MetricSettings,
+    Protocol,
+    VisualInput,
+    table_modules,
+)
 from avmsf.evaluation.results import SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import shared_cdpam
-from avmsf.evaluation.task import Method, VisualInput
+from avmsf.evaluation.task import Method
 from avmsf.features.descriptors import ImageDescriptors
 from avmsf.modal.extraction.extract import FINDERS
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
@@ -76,7 +83,7 @@ class Evaluation:
 
     def _described(self, method: Method) -> dict[str, str | None]:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        return {"settings": repr(method), "encoder": None if input_of(method) == "surface" else self.encoder}
+        return {"settings": repr(method), "encoder": None if input_of(method).form == "surface" else self.encoder}
 
 
 def _plain(settings: Any) -> dict[str, Any]:
@@ -147,25 +154,25 @@ def available_encoders(
     paper = PRESETS["paper"].scene.lift
     if lift.encoder != AUTO:
         return lift, replace(paper, encoder=lift.encoder)
-    if any(visual_input.startswith("paper") for visual_input in inputs):
+    if any(each.form == "paper" for each in inputs):
         choose_encoder(paper, log=log, device=device)
         return replace(lift, encoder=paper.encoder), paper
-    if not set(inputs) - {"surface"}:
+    if all(each.form == "surface" for each in inputs):
         return lift, paper
     built_in = isinstance(choose_encoder(lift, log=log, device=device), ImageDescriptors)
     return replace(lift, encoder=DESCRIPTORS if built_in else DINO), paper
 
 
 def input_of(method: Method) -> VisualInput:
-    """Return the features that a method reads; `surface`, which needs no encoder, for one that says nothing of it."""
-    read: VisualInput = getattr(method, "visual_input", "surface")
+    """Return the features that a method reads; the surface, which needs no encoder, for one that does not say."""
+    read: VisualInput = getattr(method, "visual_input", VisualInput())
     return read
 
 
 def visual_inputs(methods: Sequence[Method], protocol: Protocol) -> frozenset[VisualInput]:
     """Return the features that an evaluation reads: those of its methods, and the points that locate recordings."""
     read = {input_of(method) for method in methods}
-    return frozenset(read | {"surface"} if protocol.scoring == "contacts" else read)
+    return frozenset(read | {VisualInput()} if protocol.scoring == "contacts" else read)
 
 
 def dataset_title(dataset: Dataset, folder: Path) -> str:

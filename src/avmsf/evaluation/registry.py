@@ -18,7 +18,6 @@ from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
 
 if TYPE_CHECKING:
     from avmsf.evaluation.splits import Choosing
-    from avmsf.evaluation.task import VisualInput
 
 BASELINE = "knn3"
 """The method that all others are compared with."""
@@ -63,6 +62,21 @@ METRICS: dict[str, MetricEntry] = {
 
 
 @dataclass(frozen=True)
+class VisualInput:
+    """Which features of an object's points a method reads."""
+
+    form: Literal["surface", "visual", "paper"] = "surface"
+    """`surface`: positions of points on the mesh, of an object without one of the points that views show. `visual`:
+    positions with features of views. `paper`: the paper's features of Gaussians, without positions."""
+    bare: bool = False
+    """Whether only the positions of these points are read."""
+    pooled: bool = True
+    """Whether features are pooled over the object's symmetries."""
+    standardized: bool = False
+    """Whether features have mean 0 and length 1 before pooling."""
+
+
+@dataclass(frozen=True)
 class MethodEntry:
     """One method."""
 
@@ -73,8 +87,8 @@ class MethodEntry:
     make: str = ""
     """Import path of what makes the method of its name and `settings`, where it is more than a function."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    visual_input: "VisualInput" = "surface"
-    """The features that a function with `fit` reads (`task.VisualInput`), by the field that it asks for."""
+    visual_input: VisualInput = VisualInput()
+    """The features that a function with `fit` reads, by the field that it asks for."""
     path: str = ""
     """The folder or file that it reads, as the setting `path`, for a method whose name goes on with `:` and a path."""
     is_folder: bool = False
@@ -87,8 +101,8 @@ def _made(make: str, **common: Any) -> Callable[..., MethodEntry]:
     return lambda title, **settings: MethodEntry(title, make=make, settings={**common, **settings})
 
 
-_process, _network = (_made("methods:field_method", visual_input=each) for each in ("surface", "visual"))
-_paper = _made("methods:field_method", visual_input="paper", published=True)
+_process, _network = (_made("methods:field_method", visual_input=VisualInput(each)) for each in ("surface", "visual"))
+_paper = _made("methods:field_method", visual_input=VisualInput("paper"), published=True)
 _edit = partial(MethodEntry, is_edit=True)
 
 
@@ -117,7 +131,7 @@ METHODS: dict[str, MethodEntry] = {
         "reimplementation of DiffSound with the residual that `paper` learns, as in the paper",
         "methods:diffsound",
         settings={"learned_residual": True},
-        visual_input="paper",
+        visual_input=VisualInput("paper"),
     ),
     "diffsound-weighted": MethodEntry(
         "DiffSound with a fitted weight for each mode", "methods:diffsound", settings={"weighted": True}
@@ -127,9 +141,11 @@ METHODS: dict[str, MethodEntry] = {
     "field-elastic": _process("Gaussian process on elastic mode shapes only", model="elastic"),
     "field-smooth": _process("Gaussian process on distances only", model="smooth"),
     "field-thin-plate": _process("Gaussian process of thin-plate splines only", model="thin-plate"),
-    "field-positions": _network("attention network, quick settings, positions only", visual_input="positions"),
+    "field-positions": _network(
+        "attention network, quick settings, positions only", visual_input=VisualInput("visual", bare=True)
+    ),
     "field-unaligned": _network(
-        "attention network, quick settings, without symmetry pooling", visual_input="unaligned"
+        "attention network, quick settings, without symmetry pooling", visual_input=VisualInput("visual", pooled=False)
     ),
     # All steps end to end take long enough without two trials of dampings beforehand. The noise is trained, as
     # measuring it needs the modes.
@@ -145,21 +161,25 @@ METHODS: dict[str, MethodEntry] = {
         damping="validated",
     ),
     "paper": _paper("the paper's method with the preset `paper`, shared damping"),
-    "paper-positions": _paper("the paper's method without visual features", visual_input="paper-positions"),
+    "paper-positions": _paper(
+        "the paper's method without visual features", visual_input=VisualInput("paper", bare=True)
+    ),
     "paper-no-initialization": _paper("the paper's method without extracted modes", informed=False),
-    "paper-unaligned": _paper("the paper's method without symmetry pooling", visual_input="paper-unaligned"),
+    "paper-unaligned": _paper(
+        "the paper's method without symmetry pooling", visual_input=VisualInput("paper", pooled=False)
+    ),
     "paper-no-residual": _paper("the paper's method without residual noise", residual=False),
     "paper-per-contact": _paper("the paper's method with damping per contact", damping="per-contact"),
     "paper-regularized": _paper(
         "the paper's method with positive gains, standardized features and weight decay",
-        visual_input="paper-standardized",
+        visual_input=VisualInput("paper", standardized=True),
         positive_gains=True,
         weight_decay=1.0,
     ),
     "paper-mean-gains": MethodEntry(
         "the modes and noise of `paper`, with its own gains averaged over the three nearest training contacts",
         "methods:mean_trained_gains",
-        visual_input="paper",
+        visual_input=VisualInput("paper"),
     ),
     "field-grid": _network("attention network, settings chosen from a small grid", grid=True),
     "paper-grid": _paper("the paper's method with settings chosen from its lists", grid=True),

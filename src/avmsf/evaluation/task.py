@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -13,6 +13,7 @@ from avmsf.baselines.diffsound.body_family import BodyFamily
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import EvaluationError
+from avmsf.evaluation.registry import VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.field.sound_field import SoundField
@@ -72,16 +73,6 @@ def expect_renderer(given: Any) -> Renderer:
 def report_of(renderer: Renderer) -> dict[str, Any]:
     """Return what a method chose on its way to a renderer, as plain values; empty where it had no choice."""
     return dict(getattr(getattr(renderer, "origin", renderer), "report", {}))
-
-
-VisualInput = Literal[
-    "surface", "positions", "visual", "unaligned", "paper", "paper-positions", "paper-unaligned", "paper-standardized"
-]
-"""Features of an object's points. `surface`: positions of points on its mesh, or as `positions` without one.
-`positions`: only the positions of the points that visual features are of. `visual`: positions with visual features,
-pooled over the object's symmetries; `unaligned`: without pooling. `paper`: the paper's features of Gaussians;
-`paper-positions`: only their positions; `paper-unaligned`: without pooling; `paper-standardized`: of mean 0 and
-length 1 before pooling."""
 
 
 @dataclass(frozen=True, eq=False)
