@@ -12,6 +12,7 @@ from avmsf.errors import AvmsfError, CaptureWarning
 from benchmarks.pages import write_pages
 from benchmarks.records import (
     NAMES,
+    WORK,
     Measurement,
     MissingDataError,
     Settings,
@@ -36,11 +37,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--parts", nargs="+", metavar="PART", help="run only these")
     parser.add_argument("--output", type=Path, metavar="FOLDER", help="store the records, and skip parts stored there")
     parser.add_argument("--quick-look", dest="quick", action="store_true", help="small settings, to see that all runs")
-    parser.add_argument("--sim-20", dest="sim20", type=Path, help="folder of simulated objects, made where missing")
     parser.add_argument("--objects", nargs="+", default=(), metavar="NAME", help="gains: some of these objects")
-    parser.add_argument("--clouds", type=Path, help="gains, surface: folder that keeps Gaussians of these objects")
-    parser.add_argument("--weights", type=Path, help="baselines: file for the weights of sonicgauss-small")
-    parser.add_argument("--results", type=Path, help="evaluation: folder that keeps objects and unfinished results")
+    parser.add_argument(
+        "--work", type=Path, default=WORK, help="folder that keeps what parts share (default %(default)s)"
+    )
     parser.add_argument("--device", default="cpu", help="step: where (default cpu)")
     chosen = vars(parser.parse_args(arguments))
     name, asked, output = (chosen.pop(key) for key in ("name", "parts", "output"))

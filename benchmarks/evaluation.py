@@ -5,24 +5,23 @@ import math
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, redirect_stdout
+from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
 from avmsf.cli import main
 from avmsf.cli.evaluate import FAILED
 from avmsf.evaluation.registry import METRICS
 from avmsf.evaluation.report import SUMMARY
 from avmsf.evaluation.results import ResultsFolder
-from avmsf.evaluation.tables import values_of
+from avmsf.evaluation.tables import times_of, values_of
 from avmsf.features.efficientnet import NAME as EFFICIENTNET
 from avmsf.pipeline.config import DESCRIPTORS
-from avmsf.simulate.recipe import ABLATED, NON_SYMMETRIC, SIM20
+from avmsf.simulate.recipe import ABLATED, NON_SYMMETRIC, SET, SIM20
 from avmsf.simulate.simulation_folder import simulate_set
-from benchmarks.objects import simulated_folder
-from benchmarks.records import Measurement, Record, Settings, code_commit
+from benchmarks.records import MissingDataError, Record, Settings, code_commit, means, records
+from benchmarks.small_sonicgauss import NAME as SMALL
 
 SIMPLE = "nearest,knn3,knn-gains,spline-gains"
 DIFFSOUND = "diffsound,diffsound-weighted"
@@ -44,8 +43,13 @@ def _evaluate(
     are descriptors, for want of DINOv2; vision: six objects, features of EfficientNet-Lite0 trained on ImageNet. shots:
     six objects; one-impact: all, one training impact; localize: those without rotational symmetry. Parts that begin
     with paper: three objects (paper-regularized: all), recordings of .5 s at 16 kHz from their peaks, with which the
-    preset `paper` is trained to its end.
+    preset `paper` is trained to its end. seconds: of one thread an object, in all cases, to fit, and to render all test
+    contacts. Noise is of low fluctuation in fields and DiffSound, and Gaussian in `paper`, knn-gains and spline-gains.
     """
+    if SMALL in methods:
+        if not settings.weights.is_file():
+            raise MissingDataError(f"no weights at {settings.weights}: run python -m benchmarks baselines first")
+        methods = methods.replace(SMALL, f"{SMALL}:{settings.weights}")
     chosen = settings.objects or settings.some(names, 6 if protocol == "edit" else 2)
     options = ["--visual-source", "mesh", "--no-cdpam", "--set", f"lift.encoder={encoder}"]
     if settings.quick:
@@ -53,45 +57,48 @@ def _evaluate(
         methods = ",".join(each for each in methods.split(",") if not each.startswith(("paper", "av-msf")))
         options += ["--set", "modes=8", "--set", "body.dofs=2000", "--set", "edit.guide.steps=5"]
     options += ["--time-zero", "peak"] * paper + ["--counts", counts] * bool(counts)
-    with ExitStack() as stack:
-        folder = settings.results or Path(stack.enter_context(TemporaryDirectory()))
-        objects, (rate, seconds) = (folder / "short", (16000, 0.5)) if paper else (folder / "objects", (48000, 2.0))
-        if paper or settings.sim20 is None:
-            wanted = {each: replace(SIM20[each], views=0, sample_rate=rate, seconds=seconds) for each in chosen}
-            simulate_set(wanted, objects)
-        else:
-            # The folder may hold objects of other sets, which would be embedded too. Results keep the folder's name.
-            objects = Path(stack.enter_context(TemporaryDirectory())) / "objects"
-            objects.mkdir()
-            for each in chosen:
-                (objects / each).symlink_to(simulated_folder(each, settings).resolve())
-        made = folder / code_commit()
-        output = made / f"{'quick-' * settings.quick}{part}"
-        words = ["evaluate", protocol, str(objects), "--methods", methods, "--objects", ",".join(chosen), *options]
-        # All parts share what is made of an object: bodies, Gaussians and features.
-        words += ["--cache", str(made / f"features-{objects.name}"), "--output", str(output)]
-        words += ["--workers", str(os.cpu_count())]
-        with redirect_stdout(sys.stderr):
-            code = main(words)
-        if code > 128:
-            raise KeyboardInterrupt
-        if code not in (0, FAILED):
-            raise RuntimeError(f"avmsf {' '.join(words)} ended with {code}")
-        summary, results = json.loads((output / SUMMARY).read_text(encoding="utf-8")), ResultsFolder(output).records()
+    objects = settings.work / ("short" if paper else SET)
+    shape: dict[str, Any] = {"views": 0, "sample_rate": 16000, "seconds": 0.5} if paper else {}
+    # Random impacts and edits are of all objects of the folder.
+    made = chosen if settings.quick else tuple(SIM20)
+    simulate_set({each: replace(SIM20[each], **shape) for each in made}, objects)
+    results = settings.work / code_commit()
+    output = results / f"{'quick-' * settings.quick}{part}"
+    words = ["evaluate", protocol, str(objects), "--methods", methods, "--objects", ",".join(chosen), *options]
+    # All parts share what is made of an object: bodies, Gaussians and features.
+    words += ["--cache", str(results / f"features-{objects.name}"), "--output", str(output)]
+    words += ["--workers", str(os.cpu_count())]
+    with redirect_stdout(sys.stderr):
+        code = main(words)
+    if code > 128:
+        raise KeyboardInterrupt
+    if code not in (0, FAILED):
+        raise RuntimeError(f"avmsf {' '.join(words)} ended with {code}")
+    summary, outcomes = json.loads((output / SUMMARY).read_text(encoding="utf-8")), ResultsFolder(output).records()
     for each in summary["failures"]:
         reason = ": ".join(filter(None, (each["method"], each["case"], each["failure"])))
         yield Record("failure", math.nan, "", "", each["object"], note=reason)
     several = len(summary["cases"]) > 1
     for case, found in summary["cases"].items():
         for method, values in found.items():
-            yield from _records(values, method, case if several else "")
+            yield from _records(values, _kind(method), case if several else "")
     for group, of in (("ratio", "ratio_to_knn3"), ("median", "medians")):
         for method, values in summary[of].items():
-            yield from _records(values, f"{group}.{method}")
+            yield from _records(values, f"{group}.{_kind(method)}")
     metric = "rmed" if protocol == "localize" else "relative_stft"
-    for method, found in values_of(results, summary["main_case"]).items():
+    for method, found in values_of(outcomes, summary["main_case"]).items():
         for name, value in found.get(metric, {}).items():
-            yield Record(f"{metric}.{method}", value, object=name)
+            yield Record(f"{metric}.{_kind(method)}", value, object=name)
+    times = [each["methods"] for each in times_of(outcomes).values()]
+    for method in dict.fromkeys(method for each in times for method in each):
+        taken = means([each[method] for each in times if method in each])
+        yield from records(
+            {f"{step}_seconds": value for step, value in taken.items()}, group=f"seconds.{_kind(method)}"
+        )
+
+
+def _kind(method: str) -> str:
+    return method.partition(":")[0]
 
 
 def _records(values: dict[str, float], group: str, case: str = "") -> Iterator[Record]:
@@ -122,6 +129,7 @@ _PARTS: dict[str, partial[Iterator[Record]]] = {
         protocol="edit",
         methods="unedited,edit-independent,edit-published,edit-hierarchical,edit-physics",
     ),
+    "sonicgauss": partial(_evaluate, protocol="farthest", methods=f"knn3,{SMALL}"),
     "paper": partial(
         _paper,
         protocol="farthest",
@@ -143,4 +151,4 @@ _PARTS: dict[str, partial[Iterator[Record]]] = {
         names=tuple(each for each in ABLATED if each in NON_SYMMETRIC)[:3],
     ),
 }
-PARTS: dict[str, Measurement] = {part: partial(measure, part=part) for part, measure in _PARTS.items()}
+PARTS: dict[str, partial[Iterator[Record]]] = {part: partial(each, part=part) for part, each in _PARTS.items()}

@@ -165,36 +165,37 @@ def clips_in_place(name: str, *, highpass: float = 0.0) -> dict[str, tuple[Float
 
 
 def simulated(name: str, settings: Settings, imperfections: Mapping[str, float] | None = None) -> tuple[Capture, Truth]:
-    """Return an object of `SETS` and its truth, from the folder, or simulated now with other imperfections."""
-    if settings.sim20 is not None and imperfections is None:
+    """Return an object of `SETS` and its truth, from its folder, or simulated now with other imperfections."""
+    if imperfections is None:
         folder = simulated_folder(name, settings)
         return read_capture(folder), read_truth(folder)
-    made = _recipe(name)
-    made = replace(made, imperfections=replace(made.imperfections, **imperfections or {}))
+    made = SETS[_set_of(name)][name]
+    made = replace(made, imperfections=replace(made.imperfections, **imperfections))
     simulation = simulate_object(made, name=name)
     return simulation.capture, simulation.truth
 
 
 def simulated_folder(name: str, settings: Settings) -> Path:
     """Return the folder of an object of `SETS` with its pictures, simulated now where it does not exist."""
-    if settings.sim20 is None:
-        raise MissingDataError("expected --sim-20 FOLDER, which keeps simulated objects and their pictures")
-    if not (settings.sim20 / name).exists():
-        simulate_set({name: _recipe(name)}, settings.sim20)
-    return settings.sim20 / name
+    of = _set_of(name)
+    simulate_set({name: SETS[of][name]}, settings.work / of)
+    return settings.work / of / name
 
 
-def _recipe(name: str) -> ObjectRecipe:
-    return SCANS[name] if name in SCANS else recipe.named_recipe(name)
+def _set_of(name: str) -> str:
+    found = [of for of, recipes in SETS.items() if name in recipes]
+    if not found:
+        raise MissingDataError(
+            f"no object {name!r}; there are {', '.join(each for of in SETS.values() for each in of)}"
+        )
+    return found[0]
 
 
 def views_and_gaussians(name: str, settings: Settings) -> tuple[tuple[View, ...], GaussianCloud]:
-    """Return the photographs of a simulated object and its Gaussians, which `--clouds` keeps."""
+    """Return the photographs of a simulated object and its Gaussians."""
     config = replace(SplatConfig(), steps=200) if settings.quick else SplatConfig()
     views = read_views(simulated_folder(name, settings))
-    if settings.clouds is None:
-        return tuple(views), splat(views, config)
-    path = settings.clouds / f"{name}-{config.steps}-steps.ply"
+    path = settings.work / "gaussians" / f"{name}-{config.steps}-steps.ply"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_splats(splat(views, config), path)

@@ -19,6 +19,7 @@ NAMES = (
     *("speed", "step", "studio", "suggest", "surface", "tasks"),
 )
 REPOSITORY = Path(__file__).resolve().parents[1]
+WORK = REPOSITORY / ".cache" / "benchmarks"
 MEASURED = ("src", "benchmarks", "tests/oracles", "tests/factories")
 """Folders whose commits count: what is measured, and what measures."""
 Better: TypeAlias = Literal["lower", "higher", ""]
@@ -60,18 +61,17 @@ class Settings:
 
     quick: bool = False
     """Small settings that show that everything runs; the values are not the benchmark's then."""
-    sim20: Path | None = None
-    """Folder of the objects that `avmsf simulate` makes of a set; None to simulate them without photographs."""
     objects: tuple[str, ...] = ()
     """Some of these objects; none for all."""
-    clouds: Path | None = None
-    """Folder that keeps the Gaussians fitted to these objects."""
-    weights: Path | None = None
-    """File of the weights of sonicgauss-small."""
-    results: Path | None = None
-    """Folder that keeps the objects and unfinished results of `evaluation`."""
+    work: Path = WORK
+    """Folder that keeps simulated objects, their Gaussians, trained weights, and unfinished results of `evaluation`."""
     device: str = "cpu"
     """What the steps of `step` are taken on."""
+
+    @property
+    def weights(self) -> Path:
+        """File of the weights of sonicgauss-small."""
+        return self.work / "sonicgauss-small.safetensors"
 
     def some(self, items: Sequence[_Item], quick: int = 1) -> Sequence[_Item]:
         """Return all items, or the first `quick` of them for a quick look."""

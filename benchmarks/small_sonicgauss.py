@@ -140,9 +140,11 @@ def _patches(logs: Float[Tensor, "contacts bins frames"]) -> Float[Tensor, "cont
     return logs.reshape(len(logs), PATCHES, VALUES)
 
 
-COMMAND = "python -m benchmarks baselines --parts sonicgauss-training --weights FILE"
+NAME = "sonicgauss-small"
+"""Of the method, and of its files' kind."""
+COMMAND = "python -m benchmarks baselines --parts sonicgauss-training"
 """What makes the weights."""
-_KIND = FileKind("sonicgauss-small", "the weights of the small SonicGauss", f"make it: {COMMAND}", EvaluationError)
+_KIND = FileKind(NAME, "the weights of the small SonicGauss", f"make it: {COMMAND}", EvaluationError)
 TUNING = TrainingConfig(steps=150, batch=8, rate=5e-4, warmup=20)
 """Fine-tuning to one object, whatever its number of recordings: half a minute on one core. The published program takes
 80 rounds over the recordings in steps of two, at a rate of 1e-4, of weights that were trained for days."""
@@ -385,7 +387,7 @@ def fit_task(task: Task, *, path: Path) -> TunedRenderer:
     return fit_small(SmallWeights.read(path), task.gaussians(), task.train, seed=task.seed)
 
 
-METHODS["sonicgauss-small"] = MethodEntry(
+METHODS[NAME] = MethodEntry(
     "SonicGauss's objective at a small size, trained from scratch on simulated objects",
     fit_task,
     path=f"a file, which {COMMAND} makes",

@@ -22,7 +22,7 @@ from avmsf.photographs.mesh_views import orbit_cameras, render_views
 from avmsf.simulate.recipe import SIM20, ObjectRecipe
 from avmsf.simulate.shapes.catalog import KINDS
 from avmsf.simulate.simulation import simulate_object
-from benchmarks.records import MissingDataError, Record, Settings, records
+from benchmarks.records import Record, Settings, records
 from benchmarks.small_sonicgauss import SmallConfig, object_tokens, train_small, visible
 
 OBJECTS = 40
@@ -73,18 +73,17 @@ def training_objects(recipes: Sequence[ObjectRecipe]) -> Iterator[tuple[Gaussian
 
 
 def training(settings: Settings) -> Iterator[Record]:
-    """Make the weights of sonicgauss-small in the file `--weights`: mean losses of the parts of training, in order.
+    """Make the weights of sonicgauss-small in the work folder: mean losses of the parts of training, in order.
 
     seconds: of processor time, for making the objects and for training.
     """
-    if settings.weights is None:
-        raise MissingDataError("sonicgauss-training: expected --weights FILE to write, got none")
     sizes, config = _QUICK if settings.quick else (SmallConfig(), PRETRAINING)
     begun = time.process_time()
     objects = list(training_objects(training_recipes(2 if settings.quick else OBJECTS)))
     made = time.process_time() - begun
     found = train_small(objects, sizes, config)
     trained = time.process_time() - begun - made
+    settings.work.mkdir(parents=True, exist_ok=True)
     found.write(settings.weights)
     losses = found.report["losses"]
     for number, loss in enumerate(losses, 1):

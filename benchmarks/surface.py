@@ -22,7 +22,7 @@ from avmsf.photographs import find_foreground
 from avmsf.photographs.cameras import View
 from avmsf.reconstruction import ObjectShape, object_surface
 from avmsf.simulate.recipe import SET, SETS
-from benchmarks.objects import views_and_gaussians
+from benchmarks.objects import simulated_folder, views_and_gaussians
 from benchmarks.records import Measurement, Record, Settings, means, records
 
 Points = Float64[np.ndarray, "points 3"]
@@ -77,8 +77,7 @@ def _degraded(settings: Settings) -> Iterator[Record]:
 
 def _material(name: str, settings: Settings) -> tuple[Sequence[View], GaussianCloud, _Truth]:
     views, cloud = views_and_gaussians(name, settings)
-    assert settings.sim20 is not None
-    mesh = _mesh(Surface.read(settings.sim20 / name / "surface.ply"))
+    mesh = _mesh(Surface.read(simulated_folder(name, settings) / "surface.ply"))
     points, normals = _sampled(mesh)
     outside = _openness(mesh, points, normals) >= OPEN
     hit = _rays(mesh, points[outside], -normals[outside])

@@ -2,8 +2,10 @@
 
 import ast
 import dataclasses
+import importlib
 import inspect
 import json
+import math
 import pkgutil
 import re
 import shlex
@@ -11,12 +13,14 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 import avmsf
 from avmsf.capture import CaptureSettings
 from avmsf.cli import VERBS, options_of
+from avmsf.evaluation.registry import expect_suited
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
@@ -148,7 +152,7 @@ def test_the_page_has_every_part_and_no_records_are_of_none(pages: ModuleType) -
 
 
 def test_every_part_of_a_benchmark_that_the_docs_name_exists(pages: ModuleType) -> None:
-    named = re.findall(r"python -m benchmarks ([a-z]+) --parts((?: (?!--)[\w-]+)+)", TEXT)
+    named = re.findall(r"\b([a-z]+)\s--parts((?:\s(?!--)[\w-]+)+)", TEXT)
     assert len(named) > 50
     assert {f"{name}.{part}" for name, parts in named for part in parts.split()} <= {*pages.parts()}
 
@@ -159,3 +163,35 @@ def test_a_number_has_three_digits_and_a_column_that_no_shown_row_has_is_of_dash
     table = pages.markdown([pages.Record("gains.sim20.mean.error", 0.5, "", "lower")], ["error", "gone"])
     assert table.splitlines() == ["|  | error ↓ | gone |", "|---|---|---|", "| mean | .500 | – |"]
     assert pages.markdown([pages.Record("gains.sim20.mean.error", 0.5, "", "lower")], ["gone"]) == ""
+
+
+def test_a_part_is_measured_again_if_it_failed_or_its_records_are_of_another_commit(
+    pages: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runner, commit, measured = importlib.import_module("benchmarks.__main__"), ["one"], list[str]()
+
+    def measure(settings: Any) -> Iterator[Any]:
+        """Measure nothing."""
+        measured.append(commit[0])
+        yield pages.Record("error", 0.5)
+        if len(measured) == 1:
+            yield pages.Record("failure", math.nan, object="bell", note="silent")
+
+    monkeypatch.setattr(runner, "parts_of", lambda name: {"part": measure})
+    monkeypatch.setattr(runner, "code_commit", lambda: commit[0])
+    words = ["tasks", "--output", str(tmp_path)]
+    assert [runner.main(words) for _ in range(3)] == [0, 0, 0]
+    assert measured == ["one", "one"]
+    commit[0] = "two"
+    assert runner.main(words) == 0
+    assert [each.commit for each in pages.stored(tmp_path / "tasks.part.jsonl")] == ["two"]
+    # With changes that are not committed nothing is known.
+    commit[0] = "two+"
+    assert runner.main(words) == runner.main(words) == 0
+    assert measured == ["one", "one", "two", "two+", "two+"]
+
+
+def test_every_method_of_an_evaluation_is_there_and_suits_its_protocol(pages: ModuleType) -> None:
+    for part in pages.parts_of("evaluation").values():
+        for method in part.keywords["methods"].split(","):
+            expect_suited(method, part.keywords["protocol"])
