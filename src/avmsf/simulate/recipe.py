@@ -255,7 +255,7 @@ SIM20 = _recipes(
 ABLATED = ("mug-ceramic", "bowl-glass", "bracket-steel", "pot-steel", "dish-ceramic", "spoon-wood")
 """Objects of the smaller studies: with and without symmetry, ringing and dull, thick and thin."""
 HELD_OUT = _recipes("bottle-glass", "lid-ceramic", "boomerang-wood", "channel-steel", "scallop-polycarbonate", seed=101)
-"""Objects of kinds that no constant of the reconstruction, of walls, masks, symmetries and gains was chosen on."""
+"""Objects of kinds that are not in sim-20; docs/benchmarks.md says which settings were chosen on them."""
 NON_SYMMETRIC = tuple(
     name
     for name, recipe in (SIM20 | HELD_OUT).items()
