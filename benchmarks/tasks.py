@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from avmsf.editing.material import change_material
-from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, IRON, PLASTIC, STEEL, WOOD, Material
 from avmsf.fem.solid import Solid
+from avmsf.fem.vibration import rayleigh
 from avmsf.field.gains.kernels import Sites, Smooth
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture
 from avmsf.field.gains.mixture_gains import MixtureGains

@@ -9,9 +9,9 @@ import torch
 from avmsf.editing.material import LAWS, MAX_MISMATCH, change_material, edit, guess_materials, infer_material
 from avmsf.editing.modal_edit import adjust_modes, silenced
 from avmsf.errors import EditError, SimulationError
-from avmsf.fem.damping import rayleigh
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
+from avmsf.fem.vibration import rayleigh
 from avmsf.field.gains.kernels import Smooth
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.modes import ModalBank

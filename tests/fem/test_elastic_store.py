@@ -8,8 +8,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from avmsf.errors import SimulationError
-from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
-from avmsf.fem.elastic_store import load_modes, save_modes
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes, load_modes, save_modes
 from avmsf.fem.material import GLASS
 from factories.raising import raises
 from oracles.block import block

@@ -12,9 +12,8 @@ from avmsf.cli import main
 from avmsf.editing.material import infer_material
 from avmsf.errors import FitError, SimulationError
 from avmsf.export import SampledField
-from avmsf.fem.damping import Vibration
 from avmsf.fem.material import STEEL
-from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated_pressure
+from avmsf.fem.vibration import AIR_DENSITY, SOUND_SPEED, Vibration, radiated_pressure
 from avmsf.field.next_contacts import suggest
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save

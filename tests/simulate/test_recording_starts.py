@@ -12,7 +12,7 @@ import torch
 from avmsf.capture import read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.fem.material import CERAMIC
-from avmsf.fem.radiation import SOUND_SPEED, travel_time
+from avmsf.fem.vibration import SOUND_SPEED, travel_time
 from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank

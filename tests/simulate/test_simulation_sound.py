@@ -11,9 +11,8 @@ import scipy.signal
 import torch
 
 from avmsf.errors import SimulationError
-from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.material import CERAMIC, STEEL
-from avmsf.fem.radiation import AIR_DENSITY, SOUND_SPEED, radiated
+from avmsf.fem.vibration import AIR_DENSITY, SOUND_SPEED, damped, radiated, rayleigh
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum
 from avmsf.simulate.imperfections import damping_matrix, frequency_factors, smooth_field, support_places
 from avmsf.simulate.recipe import Hammer, Imperfections

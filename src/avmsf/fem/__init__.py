@@ -3,8 +3,8 @@
 In goes a surface in meters (`mesh.Surface`) or tetrahedra (`Solid`), and a `Material`. Out come `ElasticModes`:
 undamped natural frequencies, and mass-normalized shapes on the surface, of which any contact and direction has gains.
 
-Core types: `Solid` (`solid`), `Material` (`material`), `ElasticModes` (kept by `elastic_store`), `CandidateBodies`, of
-which each body is a hypothesis of what lies behind a surface, `Vibration`, damped modes.
+Core types: `Solid` (`solid`), `Material` (`material`), `ElasticModes` and their files (`elastic_modes`),
+`CandidateBodies`, of which each body is a hypothesis of what lies behind a surface, `Vibration`, damped modes.
 
 - Meshes: `meshing` repairs a surface (generalized cross-validation for noise, quadric decimation), `remeshing` splits
   and collapses edges, `tetrahedra` (`tetrahedra_worker`) fills by fTetWild (Hu et al. 2020), `walls` makes layers
@@ -14,7 +14,7 @@ which each body is a hypothesis of what lies behind a surface, `Vibration`, damp
 - An object that is partly known: `candidate_bodies` computes bodies by thickness and by where they are held
   (`supports`), `thickness` searches the wall's by evidence, `perturbation` has first-order changes of stiffness and
   mass over Karhunen-Loeve fields, and `updating` finds those that measured gains ask for (Fox and Kapoor 1968).
-- Sound: `damping` (Rayleigh's, or any symmetric matrix) and `radiation` (simple sources with dipoles).
+- Sound: `vibration`, damped (Rayleigh's, or any symmetric matrix) and radiated (simple sources with dipoles).
 
 Start reading with `elastic_modes`, then `candidate_bodies`.
 """

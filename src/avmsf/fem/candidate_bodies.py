@@ -33,8 +33,7 @@ from avmsf.fem.body_meshes import (
     shape_solid,
     wall_solids,
 )  # fmt: skip
-from avmsf.fem.elastic_modes import ElasticModes, HeldModes, elastic_modes
-from avmsf.fem.elastic_store import modes_once
+from avmsf.fem.elastic_modes import ElasticModes, HeldModes, elastic_modes, modes_once
 from avmsf.fem.material import MAX_FREQUENCY_ERROR, NOMINAL, Material
 from avmsf.fem.meshing import CheckedSurface, checked, millimeters
 from avmsf.fem.solid import Solid

@@ -1,14 +1,23 @@
-"""The vibrations of an elastic body: natural frequencies, and how far each place moves in each.
+"""The vibrations of an elastic body: natural frequencies, how far each place moves in each, and their files.
 
 Held at few patches, a body vibrates in combinations of its free modes, its rigid motions and its static responses to
 the patches' loads, the attachment modes of component mode synthesis (Craig and Chang, AIAA Journal 14, 1976). On this
 basis every support is a dense eigenproblem of 100 to 400 unknowns.
+
+Files of fields have the modes' tensors with shapes in float32. A file of a cache has them to the last bit, with those
+of the perturbations, and in its header one JSON:
+
+{"mass": 0.31, "material": {"name": "ceramic", "density": 2700.0, "young": 7.2e10, ...}}
 """
 
+import json
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -17,10 +26,14 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
+from avmsf._utils.caching import keep_if_possible
+from avmsf._utils.headers import FileKind
+from avmsf._utils.tensor_files import read_tensors, write_tensors
+from avmsf._utils.text import count_of, parse_json
 from avmsf.errors import SimulationError
 from avmsf.fem.eigen import PENDULUM, factorize, lowest_vibrations, orthonormal, rigid_motions
 from avmsf.fem.elements import SecondOrder, mass, stiffness
-from avmsf.fem.material import Material
+from avmsf.fem.material import NOMINAL, Material
 from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Patch, Support, patches_of
@@ -245,3 +258,95 @@ def _quadratic(found: Closest) -> Float64[np.ndarray, "places 6"]:
     """Return the second-order shape functions of the nearest triangles in the nearest points of them."""
     corner = found.weights
     return np.concatenate([corner * (2.0 * corner - 1.0), 4.0 * corner * np.roll(corner, -1, axis=1)], axis=1)
+
+
+_KIND = FileKind("avmsf_elastic", "elastic modes", "compute them again", SimulationError)
+_PERTURBATIONS = ("stiffness", "mass", "poisson")
+
+
+def mode_sizes(modes: ElasticModes) -> dict[str, int]:
+    """Return the sizes of the tensors."""
+    return {"nodes": len(modes.nodes), "triangles": len(modes.triangles), "shapes": len(modes)}
+
+
+def mode_tensors(modes: ElasticModes) -> dict[str, Tensor]:
+    """Return the tensors by name, as files of fields hold them."""
+    named = {name: getattr(modes, name) for name in ("frequency", "nodes", "triangles")}
+    return named | {"shapes": modes.shapes.float()}
+
+
+def mode_skeleton(sizes: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return tensors on the device `meta`, of the shapes and dtypes that belong to sizes.
+
+    Raises ValueError, TypeError or KeyError for what are no sizes.
+    """
+    nodes, triangles, shapes = (count_of(sizes[name], name) for name in ("nodes", "triangles", "shapes"))
+    return {
+        "frequency": torch.empty(shapes, dtype=torch.float64, device="meta"),
+        "nodes": torch.empty(nodes, 3, dtype=torch.float64, device="meta"),
+        "triangles": torch.empty(triangles, 6, dtype=torch.int64, device="meta"),
+        "shapes": torch.empty(nodes, shapes, 3, dtype=torch.float32, device="meta"),
+    }
+
+
+def restored_modes(tensors: Mapping[str, Tensor], prefix: str) -> ElasticModes:
+    """Return the modes, of the nominal material and no mass, of tensors whose names begin with `prefix`.
+
+    Raises ValueError for values that no modes have.
+    """
+    frequency, nodes, rows, shapes = (
+        tensors[f"{prefix}{name}"] for name in ("frequency", "nodes", "triangles", "shapes")
+    )
+    if not bool((frequency > 0).all()):
+        raise ValueError(f"expected {prefix}frequency above 0, got {float(frequency.min()):g}")
+    if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < len(nodes):
+        raise ValueError(
+            f"expected corners of triangles from 0 to {len(nodes) - 1}, got {int(rows.min())} to {int(rows.max())}"
+        )
+    return ElasticModes(frequency, nodes, rows, shapes.double(), NOMINAL, mass=0.0)
+
+
+def save_modes(modes: ElasticModes, path: Path) -> None:
+    """Write modes to one file, which `load_modes` reads back to the last bit.
+
+    A file that is there stays whole until the new one is. Raises SimulationError where it cannot be written.
+    """
+    tensors = mode_tensors(modes) | {"shapes": modes.shapes}
+    if modes.perturbations is not None:
+        tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
+    header = json.dumps({"mass": modes.mass, "material": asdict(modes.material)}, allow_nan=False)
+    write_tensors(path, tensors, header, _KIND)
+
+
+def load_modes(path: Path) -> ElasticModes:
+    """Read modes that `save_modes` wrote.
+
+    Raises SimulationError for a file that is missing, cut short or of another kind.
+    """
+    header, tensors = read_tensors(path, _KIND)
+    try:
+        record = parse_json(header)
+        changes = {name: tensors.pop(name).numpy() for name in _PERTURBATIONS if name in tensors}
+        return ElasticModes(
+            **tensors, material=Material(**record["material"]), mass=float(record["mass"]),
+            perturbations=Perturbations(**changes) if changes else None,
+        )  # fmt: skip
+    except (ValueError, TypeError, KeyError) as error:
+        raise _KIND.damaged(path, error, name="modes") from error
+
+
+def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: Callable[[str], None]) -> ElasticModes:
+    """Return the modes that `path` keeps, or compute them and keep them there, where that is possible; None keeps none.
+
+    A damaged file is made again, and `log` is called. Raises as `compute`.
+    """
+    # Unlike Path.is_file, this is False where the folder cannot be read.
+    if path is not None and os.path.isfile(path):
+        try:
+            return load_modes(path)
+        except SimulationError as error:
+            log(f"computing the modes again ({error})")
+    modes = compute()
+    if path is not None:
+        keep_if_possible(lambda: save_modes(modes, path), path)
+    return modes

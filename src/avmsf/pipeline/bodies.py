@@ -17,10 +17,9 @@ from avmsf.errors import FitError, SimulationError
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.body_meshes import HollowShape
 from avmsf.fem.candidate_bodies import CandidateBodies
-from avmsf.fem.damping import damped, rayleigh
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.material import NOMINAL, Material, material_named
-from avmsf.fem.radiation import radiated_pressure
+from avmsf.fem.vibration import damped, radiated_pressure, rayleigh
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import BodyGains
 from avmsf.field.sound_field import Origin, SoundField

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from avmsf._utils.caching import key_of
 from avmsf.errors import SimulationError
-from avmsf.fem.elastic_modes import ElasticModes, elastic_modes
-from avmsf.fem.elastic_store import modes_once
+from avmsf.fem.elastic_modes import ElasticModes, elastic_modes, modes_once
 from avmsf.fem.material import material_named
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill

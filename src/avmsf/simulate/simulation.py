@@ -16,9 +16,8 @@ from avmsf.capture.folder import Capture
 from avmsf.capture.preprocess import preprocess
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
-from avmsf.fem.damping import Vibration, damped
 from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.radiation import radiated, travel_time
+from avmsf.fem.vibration import Vibration, damped, radiated, travel_time
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.modal.synthesis import synthesize

@@ -14,8 +14,7 @@ from torch import Tensor
 from avmsf._utils.arrays import short_repr
 from avmsf._utils.text import RecordError, count_of, like
 from avmsf.capture.impacts import places_of
-from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.fem.elastic_modes import ElasticModes, mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import POSITIONAL, Family, KernelFamily, Sites, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions, Statistic, mean_magnitude

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
 from avmsf._utils.text import RecordError, count_of, like
-from avmsf.fem.elastic_modes import ElasticModes
-from avmsf.fem.elastic_store import mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.fem.elastic_modes import ElasticModes, mode_sizes, mode_skeleton, mode_tensors, restored_modes
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
