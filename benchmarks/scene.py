@@ -9,7 +9,7 @@ import torch
 from avmsf.capture import Capture, read_capture, write_capture
 from avmsf.evaluation.scores import evaluate
 from avmsf.evaluation.splits import split
-from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.encoder import ImageDescriptors
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.field.config import FitConfig
 from avmsf.field.store import load

@@ -12,7 +12,7 @@ import trimesh
 from avmsf.cli import main
 from avmsf.cli.report import describe
 from avmsf.errors import EvaluationError
-from avmsf.features.store import load_features, read_report
+from avmsf.features.feature_field import load_features, read_report
 from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface

@@ -42,8 +42,7 @@ from avmsf.evaluation.splits import (
     evenly_spaced,
     split,
 )
-from avmsf.features.descriptors import ImageDescriptors
-from avmsf.features.encoder import Encoder
+from avmsf.features.encoder import Encoder, ImageDescriptors
 from avmsf.mesh.points import farthest_points
 from avmsf.pipeline.config import DESCRIPTORS, DINO, PRESETS, LiftConfig
 from avmsf.pipeline.features import DinoEncoder

@@ -8,9 +8,8 @@ import skimage.data
 import torch
 
 from avmsf.errors import SceneError
-from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.efficientnet import EfficientNetEncoder
-from avmsf.features.encoder import continue_outside, unit_image
+from avmsf.features.encoder import ImageDescriptors, continue_outside, unit_image
 from factories.raising import raises
 
 

@@ -8,9 +8,16 @@ import torch
 from safetensors.torch import save_file
 
 from avmsf.errors import FitError, SceneError
-from avmsf.features.feature_field import FeatureField, reduce, resize, with_positions
+from avmsf.features.feature_field import (
+    FeatureField,
+    load_features,
+    read_report,
+    reduce,
+    resize,
+    save_features,
+    with_positions,
+)
 from avmsf.features.pooling import orbit_spread, refine
-from avmsf.features.store import load_features, read_report, save_features
 from avmsf.mesh.points import cluster, lattice
 from avmsf.mesh.surface import Surface
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries

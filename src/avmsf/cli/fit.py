@@ -260,7 +260,7 @@ def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> 
 
 def _given_features(options: Options, path: Path) -> "tuple[FeatureField, dict[str, Any]]":
     """Return the features of a file, and how they were made; note where not as a preset other than the default does."""
-    from avmsf.features.store import load_features, read_report
+    from avmsf.features.feature_field import load_features, read_report
 
     described = read_report(path)
     made, wanted = described.get("scene", {}).get("lift", {}), asdict(options.all_settings.scene.lift)

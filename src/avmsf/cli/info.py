@@ -175,8 +175,7 @@ def _gaussians(path: Path) -> "_Described":
 
 def _features(path: Path) -> "_Described":
     from avmsf.cli.report import features_lines
-    from avmsf.features.feature_field import GEOMETRY
-    from avmsf.features.store import load_features, read_report
+    from avmsf.features.feature_field import GEOMETRY, load_features, read_report
     from avmsf.plotting.clouds import component_colors, draw_cloud
     from avmsf.symmetry.symmetries import Symmetries
 

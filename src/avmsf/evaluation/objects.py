@@ -22,8 +22,7 @@ from avmsf.evaluation.editing import TRANSITIONS, materials_of
 from avmsf.evaluation.modal_metrics import simulated
 from avmsf.evaluation.mode_embedding import check_materials
 from avmsf.evaluation.registry import Protocol, VisualInput
-from avmsf.features.feature_field import FeatureField
-from avmsf.features.store import load_features, read_report
+from avmsf.features.feature_field import FeatureField, load_features, read_report
 from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats

@@ -25,7 +25,7 @@ from avmsf.evaluation.registry import (
 from avmsf.evaluation.results import SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import shared_cdpam
 from avmsf.evaluation.task import Method
-from avmsf.features.descriptors import ImageDescriptors
+from avmsf.features.encoder import ImageDescriptors
 from avmsf.modal.extraction.extract import FINDERS
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, PRESETS, LiftConfig, SceneConfig, TimeZero, ViewsConfig

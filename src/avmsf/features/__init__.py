@@ -5,15 +5,15 @@ each with a vector of about unit size, which the gain models of `avmsf.field` re
 
 - `encoder.Encoder` turns an image into a map of features: DINOv2 (Oquab et al. 2023; `dino`), EfficientNet-Lite0 (Tan
   and Le 2019; `efficientnet`), or descriptors of color, orientation and curvature that need no download
-  (`descriptors`). All see the object's colors continued over the background (pull-push, Gortler et al. 1996;
-  `encoder.continue_outside`).
+  (`encoder.ImageDescriptors`). All see the object's colors continued over the background (pull-push, Gortler et al.
+  1996; `encoder.continue_outside`).
 - `lift.lift` and `lift.lift_points` give each point the weighted mean of the maps at its places in the views that see
   it, by a depth test against the Gaussians or the mesh (`avmsf.gaussians.visibility`; paper, section 3.2).
   `lift.supported` leaves out points that no view shows on the surface.
 - `feature_field` holds the points with their features: principal components (`reduce`), scale (`resize`), positions
-  next to them (`with_positions`), nearest points and k-means regions (paper, eq. 7).
+  next to them (`with_positions`), nearest points and k-means regions (paper, eq. 7); and their safetensors file, with
+  a JSON header.
 - `pooling.refine` takes means over the orbits of rotations and over mirror images (paper, eq. 16 and 17).
-- `store` writes and reads one safetensors file with a JSON header.
 
 To start reading: `feature_field`, then `lift`.
 """

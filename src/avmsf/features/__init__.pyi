@@ -1,11 +1,11 @@
-from .descriptors import ImageDescriptors as ImageDescriptors
 from .dino import DinoEncoder as DinoEncoder
 from .efficientnet import EfficientNetEncoder as EfficientNetEncoder
+from .encoder import ImageDescriptors as ImageDescriptors
 from .feature_field import FeatureField as FeatureField
+from .feature_field import load_features as load_features
 from .feature_field import reduce as reduce
 from .feature_field import resize as resize
+from .feature_field import save_features as save_features
 from .feature_field import with_positions as with_positions
 from .lift import lift as lift
 from .pooling import refine as refine
-from .store import load_features as load_features
-from .store import save_features as save_features

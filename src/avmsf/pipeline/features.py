@@ -8,11 +8,10 @@ import torch
 
 from avmsf._utils.device import usable_device
 from avmsf.errors import SceneError
-from avmsf.features.descriptors import ImageDescriptors
 from avmsf.features.dino import DinoEncoder
 from avmsf.features.efficientnet import NAME as EFFICIENTNET
 from avmsf.features.efficientnet import EfficientNetEncoder
-from avmsf.features.encoder import Encoder
+from avmsf.features.encoder import Encoder, ImageDescriptors
 from avmsf.features.feature_field import FeatureField, expect_varied, reduce, resize, with_positions
 from avmsf.features.lift import Lifted, by_presence, by_visibility, lift, lift_points, supported
 from avmsf.features.pooling import orbit_spread, refine

@@ -16,7 +16,7 @@ from avmsf.capture.filenames import no_views
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import SceneError
 from avmsf.features.encoder import Encoder
-from avmsf.features.store import save_features
+from avmsf.features.feature_field import save_features
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.initialize import StartPoints

@@ -14,8 +14,7 @@ from avmsf._utils.files import write_whole
 from avmsf._utils.progress import ProgressListener
 from avmsf.capture import Capture
 from avmsf.errors import FitError, SceneError
-from avmsf.features.feature_field import FeatureField
-from avmsf.features.store import load_features, read_report
+from avmsf.features.feature_field import FeatureField, load_features, read_report
 from avmsf.field.config import AUTO, NETWORK
 from avmsf.field.gains.kernels import Visual
 from avmsf.gaussians.ply import read_splats
