@@ -13,8 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from avmsf.export.bundle import Bundle
-from avmsf.export.web import page_files
+from avmsf.export.web import Bundle, page_files
 from avmsf.export.writing import write_folder
 
 AVMSF = (sys.executable, "-c", "import sys; from avmsf.cli import main; sys.exit(main())")

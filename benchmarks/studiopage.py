@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from avmsf._utils.arrays import fibonacci_sphere
-from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import make_bundle
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
 from benchmarks.browser import chromium, opened, served, write_site

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import make_bundle
 from avmsf.modal.modes import ForcePulse
 from avmsf.modal.residual_noise import shape_noise
 from benchmarks.browser import chromium, served, write_site

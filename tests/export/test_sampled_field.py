@@ -14,10 +14,9 @@ import trimesh
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import AvmsfError, ExportError
-from avmsf.export.bundle import make_bundle
 from avmsf.export.geometry import read_object
 from avmsf.export.sampled_field import SampledField, outward_normals
-from avmsf.export.web import write_webpage
+from avmsf.export.web import make_bundle, write_webpage
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField

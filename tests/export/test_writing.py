@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from avmsf.errors import ExportError
-from avmsf.export.bundle import make_bundle
-from avmsf.export.web import page_files, single_file, write_webpage
+from avmsf.export.web import make_bundle, page_files, single_file, write_webpage
 from avmsf.export.writing import Written, write_files, write_folder
 from factories.made_tables import struck_table
 from factories.raising import raises

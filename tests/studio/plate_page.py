@@ -11,8 +11,8 @@ import torch
 import trimesh
 
 from avmsf.capture.impacts import Impacts
-from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
+from avmsf.export.web import make_bundle
 from avmsf.export.writing import write_folder
 from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats

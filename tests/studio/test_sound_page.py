@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.web import write_webpage
+from avmsf.export.web import make_bundle, write_webpage
 from avmsf.modal.modes import ForcePulse
 from avmsf.modal.synthesis import synthesize
 from factories.made_tables import STRUCK_RATE as RATE

@@ -5,7 +5,7 @@ what their format cannot represent (`Written`). All formats start from a `Sample
 sine and a cosine amplitude of each mode at each point, of which `SampledField.render` is the reference that every file
 is compared with.
 
-- `web.write_webpage`, `bundle.make_bundle`: the studio's page with one field, as a folder or a single file.
+- `web.write_webpage`, `web.make_bundle`: the studio's page with one field, as a folder or a single file.
 - `gltf.write_gltf`: the object (`geometry`) and its modes in the draft extension KHR_audio_rigid_bodies.
 - `faust.write_faust`: a bank of resonators as a Faust program.
 - `samples.write_grid`: wav files of chosen contacts and forces, with a table and an SFZ instrument.
@@ -16,8 +16,8 @@ A new format is a writer here, a name in `writing.Format`, entries in `writing.F
 `avmsf.cli.export` the options that it uses (`_USED`, `Options`), what to do with its files (`_NEXT`) and `_for_format`.
 
 `write.write` (`avmsf.write`) chooses the writer by a file's ending. Files and folders are written atomically, and
-replaced only with `overwrite=True`. Start reading at `sampled_field`, then `one_phase` for formats with real amplitudes
-only, then any writer.
+replaced only with `overwrite=True`. Start reading at `sampled_field`, which has real amplitudes for formats of one
+phase too, then any writer.
 """
 
 import lazy_loader

@@ -16,8 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avmsf.export.geometry import read_vertices
-from avmsf.export.one_phase import approximation_error, shared_dampings, signed_amplitudes
-from avmsf.export.sampled_field import SampledField
+from avmsf.export.sampled_field import SampledField, approximation_error, shared_dampings, signed_amplitudes
 from avmsf.export.writing import FORMATS, Axis, Written, check_suffix, generator, no_modes, pack, write_files
 from avmsf.mesh.io import glb_bytes
 from avmsf.mesh.surface import Surface

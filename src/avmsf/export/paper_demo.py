@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from avmsf.errors import ExportError
-from avmsf.export.one_phase import approximation_error, signed_amplitudes
-from avmsf.export.sampled_field import SampledField
+from avmsf.export.sampled_field import SampledField, approximation_error, signed_amplitudes
 from avmsf.export.writing import MANIFEST, Precision, Written, generator, pack, write_folder
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.initialize import StartPoints, starting_cloud

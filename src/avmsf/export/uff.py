@@ -19,8 +19,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf.errors import ExportError, from_extra
-from avmsf.export.one_phase import shared_dampings
-from avmsf.export.sampled_field import SampledField
+from avmsf.export.sampled_field import SampledField, shared_dampings
 from avmsf.export.writing import FORMATS, Written, check_suffix, generator, write_files
 
 _TIME = re.compile(rb"^\d\d-\w{3}-\d\d \d\d:\d\d:\d\d *$", re.MULTILINE)

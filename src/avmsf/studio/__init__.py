@@ -6,7 +6,7 @@ served to other computers, other sites' pages or programs without the address (`
 
 - `server`, `guard`, `routes`, `responses`: HTTP with starlette and uvicorn; every refusal is one sentence and a status.
 - `studio`: what the page can ask for; `session`: immutable revisions of the field, with undo.
-- `files`: what the page fetches, in the format of `avmsf.export.bundle`, for the last few revisions.
+- `files`: what the page fetches, in the format of `avmsf.export.web`, for the last few revisions.
 - `edit`: the sliders, applied by `avmsf.editing.material.edit`; `locate`: the posterior of a contact, with tables made
   ahead of time.
 - `capture`: impacts added to and removed from `impacts.csv`, atomically and under a lock.

@@ -16,8 +16,8 @@ from torch import Tensor
 from avmsf.capture.folder import read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureError, CaptureWarning, StudioError
-from avmsf.export.bundle import make_bundle
 from avmsf.export.sampled_field import SampledField, outward_normals, supporting_columns
+from avmsf.export.web import make_bundle
 from avmsf.export.writing import MAX_POINTS
 from avmsf.features.feature_field import FeatureField
 from avmsf.field.gains.model import points_on_object
