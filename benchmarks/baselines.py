@@ -10,8 +10,7 @@ from avmsf.baselines.diffsound.body_family import BodyFamily, body_family
 from avmsf.baselines.diffsound.material_fit import MODES, DampingCurve, clip_spectra, fit_material
 from avmsf.capture.impacts import Impacts
 from avmsf.fem.material import Material, material_named
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from benchmarks.objects import simulated, surface_of
 from benchmarks.processes import processor_seconds
 from benchmarks.records import Measurement, Record, Settings, means, records

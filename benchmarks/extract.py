@@ -18,8 +18,7 @@ from avmsf.modal.extraction.extract import extract_modes, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, ModeFinder
 from avmsf.modal.extraction.least_squares import fit_sine_gains
 from avmsf.modal.extraction.stft import ShortTime
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.simulate.recipe import SIM20
 from benchmarks.objects import IMPULSE, clips_in_place, simulated
 from benchmarks.records import Measurement, Record, Settings, means, records

@@ -21,8 +21,8 @@ from avmsf.localization.locator import Locator
 from avmsf.mesh import Surface
 from avmsf.mesh.points import farthest_points
 from avmsf.modal.extraction.least_squares import fit_gains
+from avmsf.modal.modes import synthesize
 from avmsf.modal.residual_noise import Residual
-from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.scene import shape_of_cloud
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate.ground_truth import Truth

@@ -26,10 +26,9 @@ from avmsf.errors import AvmsfError, EvaluationError, LocationError, SimulationE
 from avmsf.fem.isotropic import isotropic_modes
 from avmsf.fem.material import GLASS
 from avmsf.mesh.surface import Surface
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import Residual
 from avmsf.modal.spectra import magnitude_stft
-from avmsf.modal.synthesis import synthesize
 from factories.made_sheet import sheet_over
 from oracles.block import block
 

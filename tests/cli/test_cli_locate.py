@@ -20,8 +20,7 @@ from avmsf.field.sound_field import Origin
 from avmsf.field.store import save
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from factories.made_fields import BANK, positional, sounding
 from factories.raising import raises
 from factories.verbs import results_of, run_verb

@@ -39,7 +39,7 @@ from avmsf.field.config import FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import Attention
 from avmsf.modal.extraction.stft import ShortTime
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import synthesize
 from factories.clouds import cloud
 from factories.known_bodies import KnownBodies
 from factories.made_sheet import sheet_over

@@ -21,8 +21,7 @@ from avmsf.evaluation.modal_metrics import (
 )
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace, check_materials, pitches, pitches_and_dampings
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.simulation import recorded
 from factories.raising import raises

@@ -6,7 +6,7 @@ import torch
 
 from avmsf.capture.impacts import Impacts
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import synthesize
 
 SECONDS = 0.5
 

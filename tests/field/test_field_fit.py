@@ -18,8 +18,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.training import Progress
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from factories.plate_field import PLATE, QUICK, RATE, plate_extraction, plate_fit, plate_impacts, same, tensors_of
 from factories.raising import raises
 from oracles.plate import plate_modes

@@ -14,8 +14,7 @@ from avmsf.localization.likelihood import Force, Likelihood, PredictedGains
 from avmsf.localization.locate import MIN_EXPLAINED, REJECT_ABOVE, assess_match, locate, locate_impacts
 from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import distinct_contacts
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.located_plate import (
     PLATE,

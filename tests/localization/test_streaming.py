@@ -15,8 +15,7 @@ from avmsf.localization.amplitudes import Extractor
 from avmsf.localization.locate import REJECT_ABOVE, WARN_ABOVE, locate
 from avmsf.localization.locator import Locator
 from avmsf.localization.streaming import WINDOW_SECONDS, LocatedImpact, Ringing, StreamingLocalizer
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from factories.located_plate import TrueGains
 from factories.made_fields import BANK, positional, sounding
 from factories.raising import raises

@@ -10,9 +10,8 @@ from scipy.integrate import quad
 from torch import Tensor
 
 from avmsf.errors import ArrayError, SimulationError
-from avmsf.modal.modes import LARGEST_DELAY, ForcePulse, cosine_distance
+from avmsf.modal.modes import LARGEST_DELAY, ForcePulse, cosine_distance, synthesize
 from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft
-from avmsf.modal.synthesis import synthesize
 from factories.raising import raises
 
 RATE = 48000.0

@@ -16,9 +16,8 @@ from avmsf.field.losses import SpectralTarget
 from avmsf.field.training import Targets, TrainingRun
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import Residual, shape_noise
-from avmsf.modal.synthesis import synthesize
 
 from .plate import Plate, plate_surface_points, sample_contacts
 

@@ -24,9 +24,8 @@ from avmsf.mesh.level_set import difference
 from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_sine_gains
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import Residual
-from avmsf.modal.synthesis import synthesize
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import BodyConfig
 from factories.known_bodies import KnownBodies

@@ -15,8 +15,7 @@ from matplotlib.figure import Figure
 from avmsf.errors import EvaluationError
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.plotting.clouds import ALL_SIDES, AROUND, component_colors, draw_cloud, view_from
 from avmsf.plotting.contacts import contact_colors, draw_contact
 from avmsf.plotting.edits import draw_clap_curves

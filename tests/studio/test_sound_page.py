@@ -12,8 +12,7 @@ import torch
 
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import make_bundle, write_webpage
-from avmsf.modal.modes import ForcePulse
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ForcePulse, synthesize
 from factories.made_tables import STRUCK_RATE as RATE
 from factories.made_tables import struck_table
 

@@ -24,7 +24,7 @@ from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
 from avmsf.modal.clips import Sounds, levelled, resampled, with_length
 from avmsf.modal.config import scaled_fft_size
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import synthesize
 
 _HELD = 0.9
 """Part of half a recording's rate up to which it still holds all of a sound."""

@@ -24,9 +24,8 @@ from avmsf.field.gains.kernels import Axes, Sites
 from avmsf.mesh.points import nearest_points
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import shape_noise
-from avmsf.modal.synthesis import synthesize
 
 _Baseline = TypeVar("_Baseline", bound="_Trained")
 

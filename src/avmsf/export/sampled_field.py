@@ -20,9 +20,8 @@ from avmsf.field.gains.model import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.neighborhoods import read_neighborhoods
 from avmsf.mesh.points import farthest_points, nearest_points
-from avmsf.modal.modes import ForcePulse, common_phase
+from avmsf.modal.modes import ForcePulse, common_phase, synthesize
 from avmsf.modal.spectra import magnitude_stft
-from avmsf.modal.synthesis import synthesize
 
 _BATCH = 1024
 """Points sampled at once; bounds the memory."""

@@ -20,9 +20,8 @@ from avmsf.field.gains.model import GainModel, Gains, expect_near, off_surface
 from avmsf.field.probable_body import ProbableBody
 from avmsf.field.quality import FieldQuality
 from avmsf.modal.extraction.alignment import Alignment
-from avmsf.modal.modes import ForcePulse, ModalBank
+from avmsf.modal.modes import ForcePulse, ModalBank, synthesize
 from avmsf.modal.residual_noise import MEDIAN_LEVEL, Residual, low_fluctuation_noise, missing_background, shape_noise
-from avmsf.modal.synthesis import synthesize
 
 SUPPORTING = "supporting_poles"
 """What a report calls the rows of the bank's poles that are no modes of the object."""

@@ -20,10 +20,9 @@ from avmsf.errors import FieldFileError, FitError
 from avmsf.field.gains.data import GainData
 from avmsf.field.gains.model import GainModel, Gains
 from avmsf.field.losses import SpectralTarget, spectral_loss, spectral_target
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import Residual, shape_noise
 from avmsf.modal.spectra import envelope
-from avmsf.modal.synthesis import synthesize
 
 
 @dataclass(frozen=True, eq=False)

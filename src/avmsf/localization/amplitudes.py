@@ -22,9 +22,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from avmsf.modal.inner_products import gram, poles_of, project
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import Residual
-from avmsf.modal.synthesis import synthesize
 
 _RIDGE = 1e-10
 """Relative to the Gram matrix's diagonal: two modes that a short sound cannot tell apart share what they explain."""

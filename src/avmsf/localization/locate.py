@@ -26,7 +26,7 @@ from avmsf.localization.likelihood import Force
 from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import Sound, at_field_rate, location_errors, open_recording, preprocess_recording
 from avmsf.modal.inner_products import poles_of
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import synthesize
 
 REJECT_ABOVE = 0.5
 """Mismatch ratio (see `ContactPosterior`) above which a sound is taken for another object's."""

@@ -4,9 +4,8 @@ A `ModalBank` holds frequencies f (Hz) and dampings d (1/s) [modes]. With the co
 sound of an impact is the sum over modes of Im(c exp((-d + 2 pi i f) t)), plus noise of one spectrum (`Residual`).
 
 - `extraction`: from recordings to their common time zero, modes, gains and residual (`extract_modes`). Start here.
-- `modes`: the bank, the phase that all contacts have in common, the cosine distance of gains at any delay, and the
-  pulse of a hammer's force.
-- `synthesis`: from gains and modes to sounds, with gradients.
+- `modes`: the bank, the phase that all contacts have in common, the cosine distance of gains at any delay, the pulse of
+  a hammer's force, and from gains and modes to sounds, with gradients.
 - `residual_noise`: the noise beside the modes, its estimate and its synthesis.
 - `spectra`: short-time and mel spectra, one convention for losses, metrics and pictures.
 - `inner_products`: closed forms of damped sines' inner products over time.

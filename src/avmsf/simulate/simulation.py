@@ -20,7 +20,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.vibration import Vibration, damped, radiated, travel_time
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import synthesize
 from avmsf.simulate.bodies import Body, make_body, up_of
 from avmsf.simulate.ground_truth import Truth
 from avmsf.simulate.hammer import contact_times, peak_forces, pulse_spectrum

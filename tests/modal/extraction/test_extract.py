@@ -18,8 +18,7 @@ from avmsf.modal.config import ExtractionMethod
 from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_modes, extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, lowest_frequency
 from avmsf.modal.extraction.stft import ShortTime
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 from factories.raising import raises
 from oracles.plate import Plate, PlateModes, plate_modes, strike
 

@@ -9,8 +9,7 @@ import torch
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.extract import extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 
 RATE, SAMPLES, CONTACTS = 16000.0, 16000, 8
 FREQUENCY = torch.tensor([520.0, 1210.0, 2400.0, 2404.0, 3900.0], dtype=torch.float64)

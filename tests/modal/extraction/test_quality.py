@@ -15,9 +15,8 @@ from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_so
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.quality import ModeQuality, measure_quality
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import Residual
-from avmsf.modal.synthesis import synthesize
 from oracles.known_modes import AIRCRAFT, count_modes, tree_frequencies
 
 RATE = 8000.0

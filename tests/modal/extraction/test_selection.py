@@ -10,8 +10,7 @@ from torch import Tensor
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.extraction.selection import Selection, chance_ratio, choose, merge
 from avmsf.modal.inner_products import gram, poles_of
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 
 RATE = 8000.0
 SAMPLES = 6000

@@ -28,8 +28,7 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.isotropic import IsotropicModes
 from avmsf.fem.material import MATERIALS, Material, material_named
 from avmsf.modal.clips import resampled, with_length
-from avmsf.modal.modes import ModalBank
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, synthesize
 
 PerMode = Float64[Tensor, " modes"]
 Point = Float64[Tensor, "3"]

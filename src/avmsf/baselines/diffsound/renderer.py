@@ -36,10 +36,9 @@ from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.modes import ModalBank, cosine_distance
+from avmsf.modal.modes import ModalBank, cosine_distance, synthesize
 from avmsf.modal.residual_noise import Residual, low_fluctuation_noise
 from avmsf.modal.spectra import magnitude_stft
-from avmsf.modal.synthesis import synthesize
 
 _FFT_SIZE = 2048
 """Samples at 44.1 and 48 kHz of the spectra that levels are fitted to."""

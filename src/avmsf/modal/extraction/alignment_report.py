@@ -17,8 +17,7 @@ from avmsf._utils.text import listed
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import fit_gains
-from avmsf.modal.modes import ModalBank, common_phase
-from avmsf.modal.synthesis import synthesize
+from avmsf.modal.modes import ModalBank, common_phase, synthesize
 
 _SHOWN = 8
 """Recordings that a sentence names."""

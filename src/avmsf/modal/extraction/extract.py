@@ -29,9 +29,8 @@ from avmsf.modal.extraction.finders import HighResolution, ModeFinder, lowest_fr
 from avmsf.modal.extraction.frequency_shifts import FrequencyShifts, modal_sounds
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.extraction.stft import ShortTime
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import Residual, estimate_residual, noise_bins
-from avmsf.modal.synthesis import synthesize
 
 FINDERS: dict[ExtractionMethod, type[ModeFinder]] = {"high-resolution": HighResolution, "short-time": ShortTime}
 """By the names that `avmsf modes --extraction` and `PipelineConfig.extraction` take."""

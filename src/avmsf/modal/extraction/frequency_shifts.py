@@ -27,9 +27,8 @@ from scipy.stats import f as f_distribution
 from torch import Tensor
 
 from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains
-from avmsf.modal.modes import ModalBank
+from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.modal.residual_noise import background_power
-from avmsf.modal.synthesis import synthesize
 
 Sounds = Float[Tensor, "contacts samples"]
 PerContact = Float64[Tensor, " contacts"]
