@@ -12,8 +12,8 @@ import torch
 from avmsf._utils.arrays import fibonacci_sphere
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import make_bundle
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
+from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from benchmarks.browser import chromium, opened, served, write_site
 from benchmarks.records import Record, Settings, records
 

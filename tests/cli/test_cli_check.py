@@ -16,8 +16,8 @@ from avmsf.capture import CaptureSettings
 from avmsf.capture.filenames import expect_views, pictures_in
 from avmsf.cli import main
 from avmsf.errors import SceneError
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
+from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.mesh.surface import Surface, surface_points
 from avmsf.photographs.folder import read_camera_file, write_frames
 from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced

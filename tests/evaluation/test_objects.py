@@ -19,8 +19,8 @@ from avmsf.evaluation.objects import ObjectInputs, choose_objects, draw_other_re
 from avmsf.evaluation.registry import PROTOCOLS, VisualInput
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.config import SplatConfig
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import read_splats, write_splats
+from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.folder import write_views
 from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig

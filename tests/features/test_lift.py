@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from avmsf.errors import SceneError
 from avmsf.features.lift import by_presence, by_visibility, lift, lift_points, supported
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.protocol import Rendering
-from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer
+from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer, Rendering
 from avmsf.gaussians.visibility import depth_of_cloud, depth_of_surface, depth_reach, depth_test
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import Camera, View

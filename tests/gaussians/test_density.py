@@ -9,11 +9,9 @@ from scipy.spatial.transform import Rotation
 from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
-from avmsf.gaussians.densify import Density
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
-from avmsf.gaussians.prune import blended_weight, keep_object
+from avmsf.gaussians.density import Density, blended_weight, keep_object
 from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer
-from avmsf.gaussians.start_points import visual_hull
+from avmsf.gaussians.start_points import StartPoints, starting_cloud, visual_hull
 from factories.ball_views import MIDDLE, RADIUS, ball_cameras, ball_color, ball_normals, ball_view, ball_views
 from factories.clouds import random_cloud
 from factories.raising import raises, warns

@@ -12,8 +12,7 @@ import torch
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.rasterizer.projection import project
-from avmsf.gaussians.rasterizer.protocol import Rendering
-from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer, choose_rasterizer
+from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer, Rendering, choose_rasterizer
 from avmsf.photographs.cameras import Camera
 from factories.raising import raises
 from oracles.gaussian_image import render_everywhere, splats

@@ -13,9 +13,9 @@ from avmsf.errors import CaptureWarning, SceneError
 from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import SplatProgress, splat
-from avmsf.gaussians.initialize import StartPoints, photographed_colors, starting_cloud
 from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer
 from avmsf.gaussians.ssim import convolved_ssim, psnr, ssim
+from avmsf.gaussians.start_points import StartPoints, photographed_colors, starting_cloud
 from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
 from avmsf.photographs.cameras import View
 from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_normals, ball_view, ball_views

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.protocol import Rendering
+from avmsf.gaussians.rasterizer.rasterizers import Rendering
 from avmsf.photographs.cameras import Camera
 
 _NEAR, _BLUR, _MARGIN = 0.01, 0.3, 0.3

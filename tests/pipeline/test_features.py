@@ -17,8 +17,8 @@ from avmsf.evaluation.objects import ObjectInputs
 from avmsf.features.feature_field import FeatureField
 from avmsf.features.lift import Lifted
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
+from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.mesh import Surface
 from avmsf.photographs.folder import write_frames
 from avmsf.pipeline.config import PRESETS, LiftConfig

@@ -14,8 +14,8 @@ from avmsf.capture.impacts import Impacts
 from avmsf.export.sampled_field import SampledField
 from avmsf.export.web import make_bundle
 from avmsf.export.writing import write_folder
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
+from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.studio.routes import PAGE
 from served import blow
 

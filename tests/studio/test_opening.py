@@ -12,8 +12,8 @@ import trimesh
 
 from avmsf.errors import AvmsfError, StudioError
 from avmsf.field.store import save
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import write_splats
+from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.studio.files import Showcase

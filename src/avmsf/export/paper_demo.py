@@ -16,8 +16,8 @@ from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField, approximation_error, signed_amplitudes
 from avmsf.export.writing import MANIFEST, Precision, Written, generator, pack, write_folder
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
 from avmsf.gaussians.ply import splat_bytes
+from avmsf.gaussians.start_points import StartPoints, starting_cloud
 
 PICKING, SCENE, MODAL = "picking.bin", "scene.ply", "modal.bin"
 

@@ -14,8 +14,7 @@ from avmsf.errors import SceneError
 from avmsf.features.encoder import Encoder, continue_outside
 from avmsf.features.feature_field import FeatureField
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.rasterizer.protocol import Rasterizer
-from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
+from avmsf.gaussians.rasterizer.rasterizers import Rasterizer, choose_rasterizer
 from avmsf.gaussians.visibility import DepthMap, Visibility, depth_of_cloud, depth_reach, depth_test
 from avmsf.mesh.points import nearest_points
 from avmsf.photographs.cameras import Camera, View

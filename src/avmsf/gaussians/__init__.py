@@ -3,10 +3,9 @@
 In go photographs with cameras and masks (`avmsf.photographs`), or a `.ply` of 3DGS (`ply`, `ply_header`); out come a
 `GaussianCloud`, and images, depth maps and the points that a camera sees (`visibility`) of it.
 
-`fit.splat` is 3D Gaussian Splatting (Kerbl et al. 2023): Gaussians start on the visual hull (`start_points`,
-`initialize`), images of them are compared with the photographs (`targets`, SSIM of Wang et al. 2004 in `ssim`), Adam
-(Kingma & Ba 2015) changes them, adaptive density control adds and splits them (`densify`), and those that are not the
-object's go (`prune`).
+`fit.splat` is 3D Gaussian Splatting (Kerbl et al. 2023): Gaussians start on the visual hull (`start_points`), images of
+them are compared with the photographs (`targets`, SSIM of Wang et al. 2004 in `ssim`), Adam (Kingma & Ba 2015) changes
+them, adaptive density control adds and splits them, and those that are not the object's go (`density`).
 
 How a Gaussian's gradient is computed on a CPU, and where: `rasterizer.rasterizers.NumbaRasterizer` is two functions of
 PyTorch's autograd, whose loops numba compiles.
@@ -21,7 +20,7 @@ PyTorch's autograd, whose loops numba compiles.
 4. `ellipses.project_points_back` and `harmonics.shade_back` carry these derivatives on to centers, rotations, scales,
    opacities and harmonics by the chain rule, in the steps of `project_points` and `shade` in reverse.
 
-On a GPU gsplat does all of this. To start reading: `cloud`, `fit.splat` and its `config`, `rasterizer.protocol`.
+On a GPU gsplat does all of this. To start reading: `cloud`, `fit.splat` and its `config`, `rasterizer.rasterizers`.
 """
 
 import lazy_loader

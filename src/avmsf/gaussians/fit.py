@@ -19,13 +19,10 @@ from avmsf._utils.device import steps_between_losses
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.config import SplatConfig
-from avmsf.gaussians.densify import Density
-from avmsf.gaussians.initialize import StartPoints, starting_cloud
-from avmsf.gaussians.prune import keep_object
-from avmsf.gaussians.rasterizer.protocol import Rasterizer, Rendering
-from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
+from avmsf.gaussians.density import Density, keep_object
+from avmsf.gaussians.rasterizer.rasterizers import Rasterizer, Rendering, choose_rasterizer
 from avmsf.gaussians.ssim import psnr, ssim
-from avmsf.gaussians.start_points import visual_hull
+from avmsf.gaussians.start_points import StartPoints, starting_cloud, visual_hull
 from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
 from avmsf.photographs.cameras import View
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
-from avmsf.gaussians.rasterizer.protocol import Rasterizer
+from avmsf.gaussians.rasterizer.rasterizers import Rasterizer
 from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import MeshTracer

@@ -18,11 +18,11 @@ from avmsf.errors import SceneError
 from avmsf.features.encoder import Encoder
 from avmsf.features.feature_field import save_features
 from avmsf.gaussians.cloud import GaussianCloud
+from avmsf.gaussians.density import keep_object
 from avmsf.gaussians.fit import SplatProgress, splat
-from avmsf.gaussians.initialize import StartPoints
 from avmsf.gaussians.ply import read_splats, write_splats
-from avmsf.gaussians.prune import keep_object
 from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
+from avmsf.gaussians.start_points import StartPoints
 from avmsf.gaussians.visibility import depth_of_cloud
 from avmsf.mesh.surface import Surface
 from avmsf.photographs import read_sparse_points, read_views, write_views

@@ -1,6 +1,6 @@
 """Rasterizers: from Gaussians to images, and from derivatives by pixels back to derivatives by the Gaussians.
 
-`protocol.Rasterizer` is the interface; `rasterizers` has one for CPUs, `NumbaRasterizer`, and one for GPUs by
+`rasterizers.Rasterizer` is the interface, of which there is one for CPUs, `NumbaRasterizer`, and one for GPUs by
 gsplat. The steps on a CPU, forward and backward, are listed in `avmsf.gaussians`:
 
 - `projection`, with the loops of `ellipses` and `harmonics`: each Gaussian to an ellipse and a color.
