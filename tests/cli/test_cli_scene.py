@@ -17,7 +17,7 @@ from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
 from avmsf.photographs.folder import write_frames
-from avmsf.plotting.surfaces import draw_surface
+from avmsf.plotting.objects import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views

@@ -16,13 +16,11 @@ from avmsf.errors import EvaluationError
 from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank, synthesize
-from avmsf.plotting.clouds import ALL_SIDES, AROUND, component_colors, draw_cloud, view_from
-from avmsf.plotting.contacts import contact_colors, draw_contact
 from avmsf.plotting.edits import draw_clap_curves
-from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
-from avmsf.plotting.spectrograms import draw_spectrograms, log_spectrogram
+from avmsf.plotting.objects import ALL_SIDES, AROUND, component_colors, draw_cloud, view_from
+from avmsf.plotting.pictures import draw_gains, draw_modes, draw_spectrograms, log_spectrogram, save_picture
 from avmsf.plotting.style import FIRST, SECOND
-from avmsf.plotting.uncertainty import draw_uncertainty
+from avmsf.plotting.uncertainty import contact_colors, draw_contact, draw_uncertainty
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
 from factories.believing_field import bar_contacts, bar_points, drawn_gains, elastic_field, sound_field
 from factories.made_fields import BANK, positional, sounding

@@ -26,8 +26,7 @@ from avmsf.evaluation.clap import Clap
 from avmsf.fem.material import Material, material_named
 from avmsf.field.sound_field import SoundField
 from avmsf.plotting.edits import draw_clap_curves, draw_edit
-from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.spectrograms import draw_spectrograms
+from avmsf.plotting.pictures import draw_spectrograms, save_picture
 
 _CANDIDATES = 64
 """Points of the surface among which the loudest is looked for."""

@@ -105,9 +105,8 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
     from avmsf.cli.report import levels
     from avmsf.mesh.points import farthest_points
     from avmsf.pipeline.fit import modes_words
-    from avmsf.plotting.pictures import draw_gains, draw_modes, save_picture
-    from avmsf.plotting.spectrograms import draw_spectrograms
-    from avmsf.plotting.surfaces import draw_surface
+    from avmsf.plotting.objects import draw_surface
+    from avmsf.plotting.pictures import draw_gains, draw_modes, draw_spectrograms, save_picture
     from avmsf.plotting.uncertainty import draw_uncertainty
 
     name, kept = field.origin.capture or "field", field.is_mode
@@ -163,7 +162,7 @@ def describe_shape(
 
 def _gaussians(path: Path) -> "_Described":
     from avmsf.gaussians.ply import read_splats
-    from avmsf.plotting.clouds import draw_cloud
+    from avmsf.plotting.objects import draw_cloud
 
     cloud = read_splats(path)
     extent = (cloud.centers.amax(0) - cloud.centers.amin(0)).tolist()
@@ -176,7 +175,7 @@ def _gaussians(path: Path) -> "_Described":
 def _features(path: Path) -> "_Described":
     from avmsf.cli.report import features_lines
     from avmsf.features.feature_field import GEOMETRY, load_features, read_report
-    from avmsf.plotting.clouds import component_colors, draw_cloud
+    from avmsf.plotting.objects import component_colors, draw_cloud
     from avmsf.symmetry.symmetries import Symmetries
 
     features, report = load_features(path), read_report(path)
@@ -198,7 +197,7 @@ def _surface(path: Path, contacts: "Float[Tensor, 'contacts 3'] | None") -> "_De
     import trimesh
 
     from avmsf.mesh.surface import Surface
-    from avmsf.plotting.surfaces import draw_surface
+    from avmsf.plotting.objects import draw_surface
 
     surface = Surface.read(path)
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)

@@ -245,8 +245,8 @@ def _draw(
 ) -> dict[str, str]:
     import torch
 
-    from avmsf.plotting.contacts import draw_contact
     from avmsf.plotting.pictures import save_picture
+    from avmsf.plotting.uncertainty import draw_contact
 
     picture = folder / f"{name}.png"
     others = [other["position"] for other in values["equivalent_points"]]

@@ -35,11 +35,10 @@ from avmsf.evaluation.results import (
 from avmsf.evaluation.splits import evenly_spaced
 from avmsf.evaluation.tables import Section, missing_of, sections, summarize, times_of
 from avmsf.export.web import report_directives, with_policy
-from avmsf.plotting.contacts import draw_contact
 from avmsf.plotting.edits import Curve, Move, draw_clap_curves, draw_embedding
-from avmsf.plotting.pictures import save_picture
-from avmsf.plotting.spectrograms import RANGE_DB, draw_spectrograms, log_spectrogram
+from avmsf.plotting.pictures import RANGE_DB, draw_spectrograms, log_spectrogram, save_picture
 from avmsf.plotting.style import SEQUENTIAL
+from avmsf.plotting.uncertainty import draw_contact
 
 SUMMARY, TIMES, TABLES, PAGE = "summary.json", "times.json", "report.md", "report.html"
 """The files next to `protocol.json` and the folder `objects`."""
