@@ -16,8 +16,8 @@ from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction import ObjectShape, object_shape, object_surface
 from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.fairing import fair_hull
-from avmsf.reconstruction.hull_distance import Outline, hull_distance
 from avmsf.reconstruction.object_shape import ShapeReport
+from avmsf.reconstruction.outlines import Outline, hull_distance
 from factories.looked_at import HEIGHT, RADIUS, ball, cup, cup_volume, depth_of, mesh_of, views_of
 
 CELLS = 48

@@ -6,9 +6,9 @@ surfaces (marching cubes, `avmsf.mesh.level_set`). Views do not show how thick a
 
 `outer_surface.object_surface` is the whole way; start reading there. Its steps:
 
-1. `mask_consistency`: masks that contradict the consensus of the others are left out, and outlines are moved to the
-   edges in the photographs.
-2. `hull_distance`: how far inside all outlines each cell lies, a signed distance.
+1. `outlines`: masks that contradict the consensus of the others are left out, and outlines are moved to the edges in
+   the photographs.
+2. `outlines.hull_distance`: how far inside all outlines each cell lies, a signed distance.
 3. `fairing`: the hull stretched as a membrane (Laplace's equation) between the points that outlines touch, since
    cameras below a flat top leave a low pyramid on it.
 4. `depth_fusion`: the distance of each cell before the depth that most views see (a quantile over views), less the bias

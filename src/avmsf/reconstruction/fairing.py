@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
 from avmsf.photographs.visual_hull import Grid
-from avmsf.reconstruction.hull_distance import Outline
 from avmsf.reconstruction.object_shape import closed_surface
+from avmsf.reconstruction.outlines import Outline
 
 _BLUR_RATIO = 0.015
 """Standard deviation of the Gaussian blur of the hull that measures how bent its surface is, over the diagonal."""

@@ -16,9 +16,8 @@ from avmsf.photographs.visual_hull import Grid, masked_views, no_common_point, o
 from avmsf.reconstruction.depth_fusion import free_space
 from avmsf.reconstruction.distance import depth_in_convex_hull
 from avmsf.reconstruction.fairing import fair_hull
-from avmsf.reconstruction.hull_distance import Outline, hull_distance
-from avmsf.reconstruction.mask_consistency import WRONG_FRACTION, consistent_masks, edge_offset
 from avmsf.reconstruction.object_shape import LID_BLUR, ObjectShape, ShapeReport, closed_surface, facing_similarly
+from avmsf.reconstruction.outlines import WRONG_FRACTION, Outline, consistent_masks, edge_offset, hull_distance
 
 _COARSE_CELLS = 48
 """Cells along an edge of the first grids, which find where the object is and which masks are wrong."""
