@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from avmsf.plotting.style import DIVERGING, FIRST, SECOND, SEQUENTIAL, SERIES, series_color, styled
-from avmsf.studio.routes import PAGE
+from avmsf.studio.server import PAGE
 
 # Machado, Oliveira and Fernandes (2009), severity 1, for linear red, green and blue.
 BLINDNESS = {

@@ -16,7 +16,7 @@ from avmsf.export.web import make_bundle
 from avmsf.export.writing import write_folder
 from avmsf.gaussians.ply import write_splats
 from avmsf.gaussians.start_points import StartPoints, starting_cloud
-from avmsf.studio.routes import PAGE
+from avmsf.studio.server import PAGE
 from served import blow
 
 if TYPE_CHECKING:

@@ -21,8 +21,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import save
 from avmsf.studio.guard import MAX_UPLOAD_BYTES, Guard, new_token
 from avmsf.studio.opening import Opened
-from avmsf.studio.routes import make_app
-from avmsf.studio.server import listen, make_server
+from avmsf.studio.server import listen, make_app, make_server
 from avmsf.studio.studio import Studio, StudioConfig
 from factories.capture_folder import ring
 from factories.made_fields import FIELDS, sounding

@@ -14,7 +14,7 @@ from avmsf.export.web import write_webpage
 from avmsf.field.store import load
 from avmsf.studio.guard import policy_of
 from avmsf.studio.opening import open_target
-from avmsf.studio.routes import PAGE
+from avmsf.studio.server import PAGE
 from factories.made_fields import BANK
 from plate_page import answer, plate_object, plate_table, words_on
 from served import Served, open_plate, plate_field, wav
