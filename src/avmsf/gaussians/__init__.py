@@ -1,7 +1,7 @@
 """3D Gaussians of an object: their files, their fit to photographs, and what they show of its surface.
 
-In go photographs with cameras and masks (`avmsf.photographs`), or a `.ply` of 3DGS (`ply`, `ply_header`); out come a
-`GaussianCloud`, and images, depth maps and the points that a camera sees (`visibility`) of it.
+In go photographs with cameras and masks (`avmsf.photographs`), or a `.ply` of 3DGS (`ply`); out come a `GaussianCloud`,
+and images, depth maps and the points that a camera sees (`visibility`) of it.
 
 `fit.splat` is 3D Gaussian Splatting (Kerbl et al. 2023): Gaussians start on the visual hull (`start_points`), images of
 them are compared with the photographs (`targets`, SSIM of Wang et al. 2004 in `ssim`), Adam (Kingma & Ba 2015) changes
