@@ -14,8 +14,7 @@ from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import ArrayError, FitError
 from avmsf.field.gains.elastic import REACH
 from avmsf.field.gains.mixture_gains import MixtureGains
-from avmsf.field.hammer_access import HAMMER_DIAMETER, reached_on_mesh, reached_on_points
-from avmsf.field.next_contacts import suggest
+from avmsf.field.next_contacts import HAMMER_DIAMETER, reached_on_mesh, reached_on_points, suggest
 from avmsf.field.sound_field import SoundField
 from factories.believing_field import (
     BANK,

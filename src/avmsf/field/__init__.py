@@ -22,7 +22,7 @@ a kernel K with a noise share q, the scale s^2 integrated out:
 
 Types: `SoundField` (`sound_field`); `GainModel` with `AttentionGains` (the paper's network), `MixtureGains`,
 `BodyGains` (a guess without recordings) and `ScaledGains` (edits); `FitConfig` (`config`). `store` has the file.
-`hammer_access`: which places can be struck; `probable_body`: the body of most evidence.
+`next_contacts`: where to strike next, of the places that can be struck; `probable_body`: the body of most evidence.
 """
 
 import lazy_loader
