@@ -15,8 +15,7 @@ from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.rasterizer.rasterizers import choose_rasterizer
 from avmsf.gaussians.visibility import depth_of_cloud
-from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.mesh.rays import RayCaster
+from avmsf.mesh.queries import ClosestPoints, RayCaster
 from avmsf.mesh.surface import Surface
 from avmsf.photographs import find_foreground
 from avmsf.photographs.cameras import View

@@ -14,7 +14,7 @@ from avmsf.cli import demo, main
 from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
-from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.queries import ClosestPoints
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.plate_capture import TINY, fill_plate
 from factories.verbs import results_of

@@ -26,8 +26,8 @@ from avmsf.fem.meshing import (
 )
 from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed
 from avmsf.fem.tetrahedra import fill
-from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.level_set import enclose
+from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import Surface
 from factories.looked_at import surface_of
 from factories.made_sheet import sheet_over

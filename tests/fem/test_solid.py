@@ -15,7 +15,7 @@ from avmsf.fem.remeshing import boundary_edges, coarsened, remeshed
 from avmsf.fem.solid import Solid
 from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import shell
-from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import Surface
 from factories.looked_at import mesh_of, sphere, surface_of
 from factories.raising import raises

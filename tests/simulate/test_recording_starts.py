@@ -13,7 +13,7 @@ from avmsf.capture import read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.fem.material import CERAMIC
 from avmsf.fem.vibration import SOUND_SPEED, travel_time
-from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.queries import ClosestPoints
 from avmsf.modal.extraction.least_squares import fit_gains
 from avmsf.modal.modes import ModalBank
 from avmsf.photographs import read_views

@@ -37,7 +37,7 @@ from avmsf.fem.material import NOMINAL, Material
 from avmsf.fem.perturbation import Perturbations, perturbations
 from avmsf.fem.solid import Solid
 from avmsf.fem.supports import Patch, Support, patches_of
-from avmsf.mesh.closest_point import Closest, ClosestPoints
+from avmsf.mesh.queries import Closest, ClosestPoints
 from avmsf.mesh.surface import Surface, surface_points
 
 RELATIVE_SHIFT = 1e-5

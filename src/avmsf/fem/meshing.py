@@ -23,8 +23,8 @@ from trimesh import Trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of
 from avmsf.fem.solid import several_parts
-from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.level_set import decimated
+from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import Surface
 
 

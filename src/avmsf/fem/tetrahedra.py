@@ -30,7 +30,7 @@ from avmsf.fem import tetrahedra_worker
 from avmsf.fem.meshing import principal_extents, weld
 from avmsf.fem.remeshing import boundary_edges, coarsened, even_points
 from avmsf.fem.solid import Solid
-from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import Surface
 
 WORKER = Path(tetrahedra_worker.__file__)

@@ -21,8 +21,7 @@ from avmsf.fem.meshing import oriented, weld
 from avmsf.fem.remeshing import adjacency, boundary_edges, components, even_points, mesh_of, remeshed, unit
 from avmsf.fem.solid import Solid, prism_cells
 from avmsf.fem.tetrahedra import fill
-from avmsf.mesh.closest_point import ClosestPoints
-from avmsf.mesh.rays import RayCaster
+from avmsf.mesh.queries import ClosestPoints, RayCaster
 from avmsf.mesh.surface import Surface
 
 

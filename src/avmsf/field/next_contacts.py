@@ -24,9 +24,8 @@ from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import off_surface
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SoundField
-from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.points import farthest_points
-from avmsf.mesh.rays import RayCaster
+from avmsf.mesh.queries import ClosestPoints, RayCaster
 
 HAMMER_DIAMETER = 0.01
 """Meters. A pencil has 7 mm, the head of the usual modal hammer (PCB 086C03) 16 mm and its tip 6 mm."""

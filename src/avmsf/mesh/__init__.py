@@ -11,8 +11,8 @@ each corner of a face, a normal, a color and a place in a texture.
 - `textured_mesh`: smooth normals with sharp edges (means over faces weighted by angles, Thürmer and Wüthrich 1998).
 - `level_set`: marching cubes (Lewiner et al. 2003, by scikit-image), decimation by quadrics (Garland and Heckbert 1997,
   by fast-simplification), and differences of solids (by manifold3d).
-- `closest_point`: the closest point of a surface, exactly, with the triangle and its barycentric coordinates.
-- `rays`: the triangle that a ray meets first, and how far away it is (Embree).
+- `queries`: the closest point of a surface, exactly, with the triangle and its barycentric coordinates; the triangle
+  that a ray meets first, and how far away it is (Embree).
 
 Pictures of a mesh are made in `avmsf.photographs`, its walls in `avmsf.reconstruction` and `avmsf.fem`. Start reading
 with `surface.Surface`, then `io`.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from avmsf.errors import CaptureError
 from avmsf.mesh.io import check_area
-from avmsf.mesh.rays import RayCaster
+from avmsf.mesh.queries import RayCaster
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
 from avmsf.photographs.cameras import Camera, View

@@ -19,7 +19,7 @@ from avmsf.field.config import AUTO, NETWORK
 from avmsf.field.gains.kernels import Visual
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh import Surface
-from avmsf.mesh.closest_point import ClosestPoints
+from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import surface_points
 from avmsf.photographs import read_views
 from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig

@@ -16,7 +16,7 @@ from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.solid import Solid
 from avmsf.fem.vibration import Vibration, rayleigh
-from avmsf.mesh.rays import RayCaster
+from avmsf.mesh.queries import RayCaster
 from avmsf.simulate.recipe import Imperfections
 from avmsf.simulate.shapes.body import mitred_normals, stream
 

@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from avmsf.errors import SimulationError
-from avmsf.mesh.closest_point import ClosestPoints
 from avmsf.mesh.points import farthest_points
-from avmsf.mesh.rays import RayCaster
+from avmsf.mesh.queries import ClosestPoints, RayCaster
 from avmsf.mesh.surface import Surface
 from avmsf.simulate.recipe import Imperfections
 from avmsf.simulate.shapes.body import stream
