@@ -12,30 +12,30 @@ from functools import cache
 from benchmarks.records import DASH, NAMES, REPOSITORY, Record, described, in_digits, markdown, parts_of, row_of, stored
 
 STORED = REPOSITORY / "docs" / "benchmarks"
-PAGES = (REPOSITORY / "README.md", *(REPOSITORY / "docs" / f"{each}.md" for each in ("benchmarks", "baselines")))
+PAGES = tuple(REPOSITORY / f"{each}.md" for each in ("README", "docs/baselines", "docs/benchmarks", "docs/scale"))
 MARKED = re.compile(r"(<!-- measured: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 RESULTS = (
-    ("measured aircraft, 8", "gains.captures.8", "aircraft_response", ""),
-    ("measured aircraft, 15", "gains.captures.15", "aircraft_response", ""),
-    ("measured aircraft, 28", "gains.captures.28", "aircraft_response", ""),
-    ("measured ruler, 7", "gains.captures.7", "ruler10", ""),
-    ("measured tree, no mesh, 20", "gains.captures.20", "tree43", ""),
-    ("clamped strip, hammer, 10", "gains.captures.10", "strip30", ""),
-    ("clamped strip, shaker, 10", "gains.captures.10", "strip30_shaker", ""),
-    ("20 simulated objects, 8", "gains.sim20.mean", "", ""),
-    ("20 simulated objects, 4", "gains.sim20.mean", "", "_4"),
-    ("20 simulated objects, 2", "gains.sim20.mean", "", "_2"),
-    ("20 simulated objects, 1", "gains.sim20.mean", "", "_1"),
-    ("20 from photographs, 8", "gains.sim20-photographs.mean", "", ""),
-    ("5 of other kinds, 8", "gains.held-out.mean", "", ""),
-    ("5 of other kinds, from photographs, 8", "gains.held-out-photographs.mean", "", ""),
+    ("measured aircraft, 8", "gains.captures.8", "aircraft_response", "", ""),
+    ("measured aircraft, 15", "gains.captures.15", "aircraft_response", "", ""),
+    ("measured aircraft, 28", "gains.captures.28", "aircraft_response", "", ""),
+    ("measured ruler, 7", "gains.captures.7", "ruler10", "", ""),
+    ("measured tree, no mesh, 20", "gains.captures.20", "tree43", "", ""),
+    ("clamped strip, hammer, 10", "gains.captures.10", "strip30", "", ""),
+    ("clamped strip, shaker, 10", "gains.captures.10", "strip30_shaker", "", ""),
+    ("20 simulated objects, 8", "gains.sim20.mean", "", "", "evaluation.farthest"),
+    ("20 simulated objects, 4", "gains.sim20.mean", "", "_4", ""),
+    ("20 simulated objects, 2", "gains.sim20.mean", "", "_2", ""),
+    ("20 simulated objects, 1", "gains.sim20.mean", "", "_1", "evaluation.one-impact"),
+    ("20 from photographs, 8", "gains.sim20-photographs.mean", "", "", ""),
+    ("5 of other kinds, 8", "gains.held-out.mean", "", "", ""),
+    ("5 of other kinds, from photographs, 8", "gains.held-out-photographs.mean", "", "", ""),
 )
-"""Rows of the table of results: title, the names' beginning, object, and the end of the name of an error."""
+"""Rows of the table of results: title, the names' beginning, object, the end of the name of an error, and the part that
+has what the first has not."""
 METHODS = {
-    "nearest recording": ("{group}.mean of 1{end}",),
-    "mean waveform of 3 nearest": ("{group}.mean of 3{end}", "{group}.averaging{end}"),
+    "nearest recording": ("{group}.mean of 1{end}", "{other}.nearest.relative_stft"),
+    "mean waveform of 3 nearest": ("{group}.mean of 3{end}", "{group}.averaging{end}", "{other}.knn3.relative_stft"),
     "best of eight simple methods, in hindsight": ("{group}.best simple{end}",),
-    "attention network, quick, positions only": ("align.errors.{count}.network.after{end}",),
     "**avmsf's default**": ("{group}.mixture{end}", "{group}.error{end}"),
     "held-out gains in intervals of 90 %": ("{group}.coverage{end}",),
 }
@@ -89,12 +89,11 @@ def _parts(names: Sequence[str], options: Mapping[str, str], said: set[str]) -> 
 def _results() -> Iterator[str]:
     """Yield the table of results, without methods that have none, and what of it is missing."""
     rows, used, asked = list[tuple[str, list[Record | None]]](), list[Record](), dict[str, None]()
-    for title, group, thing, end in RESULTS:
-        part, _, count = group.rpartition(".")
-        known = {(each.name, each.object): each for own in (part, "align.errors") for each in _records(own)}
-        names = [[name.format(group=group, count=count, end=end) for name in column] for column in METHODS.values()]
+    for title, group, thing, end, other in RESULTS:
+        known = {(each.name, each.object): each for part in (_part_of(group), other) for each in _records(part)}
+        names = [[name.format(group=group, end=end, other=other) for name in column] for column in METHODS.values()]
         cells = [next((known[name, thing] for name in column if (name, thing) in known), None) for column in names]
-        asked |= dict.fromkeys(_part_of(name) for column in names for name in column)
+        asked |= dict.fromkeys(filter(None, (_part_of(group), other)))
         if any(cells):
             rows.append((title, cells))
             used += filter(None, cells)

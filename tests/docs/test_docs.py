@@ -138,7 +138,7 @@ def pages() -> Iterator[ModuleType]:
         yield pages
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/benchmarks.md", "docs/baselines.md"])
+@pytest.mark.parametrize("name", ["README.md", "docs/baselines.md", "docs/benchmarks.md", "docs/scale.md"])
 def test_every_table_of_a_page_is_what_the_records_say(pages: ModuleType, name: str) -> None:
     text = (REPOSITORY / name).read_text(encoding="utf-8")
     assert text == pages.written(text), "python -m benchmarks tables"

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 FAILED = 1
 """The exit code where methods or objects failed and others have results."""
-_SHOWN = 5
-"""Failures that are printed; the report lists all."""
 _Names = Annotated[tuple[str, ...], arg("NAMES")]
 
 
@@ -190,9 +188,9 @@ def _print_results(
         for part in parts[1:3]
         if part.columns
     ]
-    lines += [f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}" for each in failures[:_SHOWN]]
+    lines += [f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}" for each in failures]
     if failures:
-        lines.append(f"{counted(len(failures), 'failure')}, listed in the report; run the command again to retry")
+        lines.append(f"{counted(len(failures), 'failure')}; run the command again to retry")
     show(
         "\n".join([*lines, f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", *(f"wrote {path}" for path in figures)])
     )
