@@ -62,9 +62,10 @@ def run(options: Options) -> int:
         found = suggest(field, options.count, unseen=options.unseen, progress=False)
     else:
         impacts = read_capture(options.candidates).impacts
-        places, ways = impacts.contacts, impacts.directions
-        found = suggest(field, options.count, candidates=places, directions=ways, progress=False)
-        straight = straight if ways is None else ""
+        found = suggest(
+            field, options.count, candidates=impacts.contacts, directions=impacts.directions, progress=False
+        )
+        straight = straight if impacts.directions is None else ""
         names = tuple(impacts.names[row] for row in found.rows.tolist())
     columns: dict[str, Any] = {"order": range(1, len(found.contacts) + 1)}
     columns |= {} if names is None else {"recording": names}

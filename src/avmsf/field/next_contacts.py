@@ -201,14 +201,14 @@ def suggest(
     given = None if candidates is None else as_vectors(candidates, "candidates").double()
     gains = _mixture_of(field, unseen)
     known = 0 if given is None else len(given)
-    ways = None if directions is None else as_directions(directions, "directions", count=known)
+    vectors = None if directions is None else as_directions(directions, "directions", count=known)
     with ProgressDisplay(shown=progress) as display:
         display.doing("computing the expected error over the surface")
         surface = gains.body.nodes if unseen and gains.body is not None else gains.points
         points = surface[farthest_points(surface, min(MAX_POINTS, len(surface)))].double()
         if given is not None:
             _expect_on_surface(given, gains)
-        pool, ways = _reachable(gains, points) if given is None else (given, ways)
+        pool, vectors = _reachable(gains, points) if given is None else (given, vectors)
         same = _SAME_POSITION_RATIO * float((points.amax(0) - points.amin(0)).norm())
         allowed = (pool[:, None] - gains.contacts).norm(dim=2).amin(1) > same
         if not bool(allowed.any()):
@@ -218,7 +218,7 @@ def suggest(
         if len(pool) > most:
             kept = torch.nonzero(allowed).flatten()
             kept = kept[farthest_points(pool[kept], min(most, len(kept)))].sort().values
-        sites = gains.sites(pool[kept], None if ways is None else ways[kept])
+        sites = gains.sites(pool[kept], None if vectors is None else vectors[kept])
         rows, (before, *after) = _choose(field, gains, points, sites, allowed[kept], count, same=same)
     return Suggestions(
         sites.points[rows],

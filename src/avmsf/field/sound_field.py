@@ -109,7 +109,7 @@ class SoundField:
     def quality(self) -> FieldQuality | None:
         """How well its contacts are predicted from one another.
 
-        None for few places, for the attention network, and for an edited field, which has no recordings.
+        None for few points, for the attention network, and for an edited field, which has no recordings.
         """
         found = None if self.origin.report.get("edits") else self.origin.report.get("quality")
         return FieldQuality.of(found) if isinstance(found, dict) else None
@@ -199,14 +199,14 @@ class SoundField:
     def relative_gain_std(self, points: ArrayLike) -> Float64[Tensor, " points"]:
         """Return the standard deviation of the gains at points (meters) over their root mean square on the object.
 
-        Both as energy over all modes: 0 is certainty; places that may be louder than the mean can have more than 1.
+        Both as energy over all modes: 0 is certainty; points that may be louder than the mean can have more than 1.
         Points off the object give no warning. Raises as `fitted_mixture`.
         """
-        places = self._near(points, "positions")
+        points = self._near(points, "positions")
         _, surface = self.fitted_mixture, self.gain_field.points
         step = max(1, len(surface) // _MAX_MAPPED_POINTS)
         energy = self.energy(self.gain_field.predict(surface[::step]).parts).mean()
-        std = self.gain_field.posterior(places).std
+        std = self.gain_field.posterior(points).std
         assert std is not None
         return (self.energy(std) / energy.clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
@@ -224,8 +224,8 @@ class SoundField:
         They are those along each mode's phase; `complex_gains` has what is ahead of it too.
         `directions`, unit vectors, are those of the impacts; without them they go straight into the surface.
         """
-        places, ways = self._impacts(contacts, directions)
-        return self.known(places, directions=ways).mean.real
+        points, vectors = self._impacts(contacts, directions)
+        return self.known(points, directions=vectors).mean.real
 
     def complex_gains(
         self, contacts: ArrayLike, *, directions: ArrayLike | None = None
@@ -234,23 +234,23 @@ class SoundField:
 
         -i times `Extraction.gains`; contacts, directions and unit as in `gains`, dampings d those of the contacts.
         """
-        places, ways = self._impacts(contacts, directions)
-        return self._amplitudes(self.known(places, directions=ways))
+        points, vectors = self._impacts(contacts, directions)
+        return self._amplitudes(self.known(points, directions=vectors))
 
     def known(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Gains:
         """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings.
 
         Contacts, directions and unit as in `gains`. Raises PositionError for a contact far from the object.
         """
-        places = self._near(contacts, "contacts")
-        ways = None if directions is None else as_directions(directions, "directions", count=len(places))
+        points = self._near(contacts, "contacts")
+        vectors = None if directions is None else as_directions(directions, "directions", count=len(points))
         with torch.no_grad():
-            return self.gain_field.point_estimate(places, ways)
+            return self.gain_field.point_estimate(points, vectors)
 
     def dampings(self, contacts: ArrayLike) -> Float[Tensor, "contacts modes"]:
         """Return the dampings at the contacts, 1/s: the bank's where they are shared."""
-        places, _ = self._impacts(contacts, None)
-        return self.known(places).dampings(self.bank.damping).expand(len(places), -1)
+        points, _ = self._impacts(contacts, None)
+        return self.known(points).dampings(self.bank.damping).expand(len(points), -1)
 
     def render(
         self,
@@ -285,17 +285,17 @@ class SoundField:
             Sounds [contacts, samples] at `sample_rate`: with `forces` as recorded, else in the unit of the training
             sounds.
         """
-        contacts, ways = self._impacts(positions, directions)
+        contacts, vectors = self._impacts(positions, directions)
         length = self.samples if samples is None else as_count(samples, "samples")
         recorded, average = noise and self.residual.recordings is not None, self.residual.force
         stationary = noise and not (recorded and average is None)
         background = self.noise(length) if stationary else torch.zeros(length)
         parts = [torch.zeros(0, length)]
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
-            way = None if ways is None else ways[rows]
-            modes = self.modal_sounds(self.known(contacts[rows], directions=way), length)
+            vector = None if vectors is None else vectors[rows]
+            modes = self.modal_sounds(self.known(contacts[rows], directions=vector), length)
             sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
-            parts.append(sounds + self._recorded(contacts[rows], way, length) if recorded else sounds)
+            parts.append(sounds + self._recorded(contacts[rows], vector, length) if recorded else sounds)
         sounds = torch.cat(parts)
         usual = average or 1.0
         given = as_forces(usual if forces is None else forces, "forces", count=len(contacts))[:, None].to(sounds)
@@ -307,9 +307,9 @@ class SoundField:
 
     def _near(self, positions: ArrayLike, name: str) -> Float[Tensor, "positions 3"]:
         """Return positions as a tensor. Raises PositionError for one far from the object."""
-        places = as_vectors(positions, name)
-        expect_near(places, self.gain_field.points, name=name)
-        return places
+        points = as_vectors(positions, name)
+        expect_near(points, self.gain_field.points, name=name)
+        return points
 
     def _impacts(
         self, positions: ArrayLike, directions: ArrayLike | None
@@ -322,8 +322,8 @@ class SoundField:
             wanted, got = "positions on the object", f"{len(off)} off it, this one by {1e3 * distance:.3g} mm"
             found = PositionWarning.expected(wanted, distance, got=got, name="positions", row=row)
             warnings.warn(found, stacklevel=3)
-        ways = None if directions is None else as_directions(directions, "directions", count=len(contacts))
-        return contacts, ways
+        vectors = None if directions is None else as_directions(directions, "directions", count=len(contacts))
+        return contacts, vectors
 
     def _amplitudes(self, known: Gains) -> Complex[Tensor, "contacts modes"]:
         return -1j * known.mean.to(torch.complex128) * torch.exp(1j * self.phase)

@@ -72,10 +72,10 @@ class Locator:
         """
         with location_errors():
             positions = as_vectors(field.gain_field.points if points is None else points, "points")
-            ways = None if directions is None else as_directions(directions, "directions", count=len(positions))
+            vectors = None if directions is None else as_directions(directions, "directions", count=len(positions))
         if not len(positions):
             raise LocationError.expected("one or more", 0, name="points")
-        gains, variance, dampings = predict(field, positions, ways, factor=calibration_factor(field))
+        gains, variance, dampings = predict(field, positions, vectors, factor=calibration_factor(field))
         variance = variance + local_variance(positions, gains)
         smoothing = smoothing_matrix(positions, contacts=distinct_contacts(field))
         return cls(field, positions.float(), gains, variance, dampings, smoothing)

@@ -166,8 +166,8 @@ class Regression:
         supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
         bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
         # Numbers of patches share the probability of being held alike, and so do stiffnesses.
-        ways = [math.comb(count, len(each.patches)) * count * len(STIFFNESS_RATIOS) for each in supports]
-        logs = [evidence - math.log(each) for evidence, each in zip(self.evidence(rows, bodies), ways, strict=True)]
+        counts = [math.comb(count, len(each.patches)) * count * len(STIFFNESS_RATIOS) for each in supports]
+        logs = [evidence - math.log(each) for evidence, each in zip(self.evidence(rows, bodies), counts, strict=True)]
         found = zip(logs, [each.patches for each in supports], bodies, strict=True)
         return max(found, key=itemgetter(0), default=(-math.inf, (), body))
 

@@ -179,7 +179,7 @@ DECORS: tuple[Decor, ...] = (_bands, _dipped, _spots, _strokes, _patches)
 
 def _waves(places: np.ndarray, random: np.random.Generator, length: float, number: int) -> np.ndarray:
     """Return a smooth field of root mean square 1 in space, of waves about this long."""
-    ways = random.standard_normal((number, 3))
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True) * length * random.uniform(0.7, 1.5, (number, 1))
+    wave_vectors = random.standard_normal((number, 3))
+    wave_vectors /= np.linalg.norm(wave_vectors, axis=1, keepdims=True) * length * random.uniform(0.7, 1.5, (number, 1))
     phases = random.uniform(0.0, 2.0 * math.pi, number)
-    return math.sqrt(2.0 / number) * np.cos(2.0 * math.pi * places @ ways.T + phases).sum(axis=1)
+    return math.sqrt(2.0 / number) * np.cos(2.0 * math.pi * places @ wave_vectors.T + phases).sum(axis=1)

@@ -24,8 +24,8 @@ def blob(random: np.random.Generator, wall: float | None) -> Draft:
 
     def shaped(ball: np.ndarray) -> np.ndarray:
         far = np.linalg.norm(ball, axis=1)
-        ways = ball / np.maximum(far, 1e-12)[:, None]
-        apart = np.linalg.norm(ways[:, None] - centers, axis=-1)
+        units = ball / np.maximum(far, 1e-12)[:, None]
+        apart = np.linalg.norm(units[:, None] - centers, axis=-1)
         # What is further from the middle stays further, as long as no dent takes more than 1 from the logarithm.
         return ball * np.exp(far * (np.exp(-((apart / widths) ** 2)) @ heights))[:, None]
 

@@ -215,8 +215,8 @@ def _punch(grid: Grid, flat: np.ndarray, row: int, column: int) -> np.ndarray:
     ring = np.abs(apart).max(axis=1) == _HOLE_HALF_SIDE
     center = flat[row * grid.columns + column].copy()
     radius = 0.9 * np.abs(flat[ring] - center).max(axis=0).min()
-    ways = apart[ring] / np.linalg.norm(apart[ring], axis=1, keepdims=True)
-    flat[ring] = center + radius * ways
+    outward = apart[ring] / np.linalg.norm(apart[ring], axis=1, keepdims=True)
+    flat[ring] = center + radius * outward
     return ~(np.abs(apart[grid.triangles]).max(axis=(1, 2)) <= _HOLE_HALF_SIDE)
 
 
