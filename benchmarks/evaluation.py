@@ -110,9 +110,7 @@ def _records(values: dict[str, float], group: str, case: str = "") -> Iterator[R
 _paper = partial(_evaluate, names=ABLATED[:3], paper=True)
 _PARTS: dict[str, partial[Iterator[Record]]] = {
     "farthest": partial(
-        _evaluate,
-        protocol="farthest",
-        methods=f"white-noise,random-impact,{SIMPLE},{DIFFSOUND},field,field-auto",
+        _evaluate, protocol="farthest", methods=f"white-noise,random-impact,{SIMPLE},{DIFFSOUND},field,field-auto"
     ),
     "closest": partial(_evaluate, protocol="closest", methods="knn3,field,field-auto"),
     "shots": partial(_evaluate, protocol="shots", methods=f"{SIMPLE},{DIFFSOUND},field-auto", names=ABLATED),
@@ -125,9 +123,7 @@ _PARTS: dict[str, partial[Iterator[Record]]] = {
         names=tuple(each for each in SIM20 if each in NON_SYMMETRIC),
     ),
     "edit": partial(
-        _evaluate,
-        protocol="edit",
-        methods="unedited,edit-independent,edit-published,edit-hierarchical,edit-physics",
+        _evaluate, protocol="edit", methods="unedited,edit-independent,edit-published,edit-hierarchical,edit-physics"
     ),
     "sonicgauss": partial(_evaluate, protocol="farthest", methods=f"knn3,{SMALL}"),
     "paper": partial(

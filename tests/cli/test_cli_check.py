@@ -213,10 +213,7 @@ Y_UP = np.array([[1.0, 0, 0, 0.3], [0, 0, 1, 0.1], [0, -1, 0, -0.2], [0, 0, 0, 1
 CAMERAS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {
     "as they are": (lambda pose: pose, ""),
     "moved": (lambda pose: Y_UP @ pose, "contacts on the object in the photographs, got most outside"),
-    "OpenCV's axes": (
-        lambda pose: pose @ np.diag([1.0, -1, -1, 1]),
-        "check the poses of the cameras",
-    ),
+    "OpenCV's axes": (lambda pose: pose @ np.diag([1.0, -1, -1, 1]), "check the poses of the cameras"),
 }
 
 

@@ -10,14 +10,7 @@ from avmsf._utils.text import in_order
 from avmsf.capture import read_capture
 from avmsf.cli import main
 from avmsf.datasets import CaptureCollection, Dataset, ObjectFolderRaw, RealImpact, open_dataset
-from avmsf.datasets.numbering import (
-    ABLATION,
-    NON_SYMMETRIC,
-    REALIMPACT_NAMES,
-    material_in,
-    number_of,
-    shared_objects,
-)
+from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC, REALIMPACT_NAMES, material_in, number_of, shared_objects
 from avmsf.errors import DatasetError
 from factories.capture_folder import fill
 from factories.dataset_folders import write_raw, write_realimpact

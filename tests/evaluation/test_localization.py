@@ -22,13 +22,7 @@ from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation import report
 from avmsf.evaluation.editing import PROMPTS, REALIMPACT_26, Edits, audible_modes, spectral_distance
-from avmsf.evaluation.localization import (
-    MAX_VERTICES,
-    located,
-    nearest_spectrum,
-    published_distance,
-    rendered_gains,
-)
+from avmsf.evaluation.localization import MAX_VERTICES, located, nearest_spectrum, published_distance, rendered_gains
 from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.evaluation.objects import ObjectInputs

@@ -14,14 +14,7 @@ from avmsf.capture import CaptureSettings, read_capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import CaptureWarning, EvaluationError
 from avmsf.evaluation.scores import evaluate
-from avmsf.evaluation.simple_methods import (
-    MeanGains,
-    MeanWaveform,
-    NearestRecording,
-    SplineGains,
-    WhiteNoise,
-    floor,
-)
+from avmsf.evaluation.simple_methods import MeanGains, MeanWaveform, NearestRecording, SplineGains, WhiteNoise, floor
 from avmsf.evaluation.splits import split
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.modes import ModalBank

@@ -18,15 +18,7 @@ from avmsf.datasets import CaptureCollection
 from avmsf.errors import EvaluationError, SceneError
 from avmsf.evaluation.methods import method_named
 from avmsf.evaluation.plan import Evaluation, available_encoders, visual_inputs
-from avmsf.evaluation.registry import (
-    BASELINE,
-    METHODS,
-    METRICS,
-    PROTOCOLS,
-    MetricEntry,
-    MetricSettings,
-    VisualInput,
-)
+from avmsf.evaluation.registry import BASELINE, METHODS, METRICS, PROTOCOLS, MetricEntry, MetricSettings, VisualInput
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.scores import score
 from avmsf.evaluation.simple_methods import MeanWaveform

@@ -14,16 +14,7 @@ from trimesh import Trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem import meshing
 from avmsf.fem.candidate_bodies import CandidateBodies
-from avmsf.fem.meshing import (
-    TOLERANCES,
-    CheckedSurface,
-    checked,
-    denoised,
-    roughness,
-    simplified,
-    thinned,
-    weld,
-)
+from avmsf.fem.meshing import TOLERANCES, CheckedSurface, checked, denoised, roughness, simplified, thinned, weld
 from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed
 from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.level_set import enclose

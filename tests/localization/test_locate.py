@@ -16,17 +16,7 @@ from avmsf.localization.locator import Locator
 from avmsf.localization.prediction import distinct_contacts
 from avmsf.modal.modes import ModalBank, synthesize
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
-from factories.located_plate import (
-    PLATE,
-    TrueGains,
-    bank,
-    field_of,
-    held,
-    locator_of,
-    missed,
-    struck,
-    true_field,
-)
+from factories.located_plate import PLATE, TrueGains, bank, field_of, held, locator_of, missed, struck, true_field
 from factories.raising import raises
 from oracles.plate import plate_surface_points
 

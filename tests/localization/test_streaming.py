@@ -159,12 +159,7 @@ def test_modes_that_an_edit_made_silent_are_not_followed() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value", "given"),
-    [
-        ("sample_rate", 44100.0, {}),
-        ("window", 0.0, {}),
-        ("window", 0.01, {}),
-        ("later", 0.05, {"window": 0.06}),
-    ],
+    [("sample_rate", 44100.0, {}), ("window", 0.0, {}), ("window", 0.01, {}), ("later", 0.05, {"window": 0.06})],
 )
 def test_streams_that_cannot_be_located_are_refused(name, value, given) -> None:
     with raises(LocationError, name=name, value=value):

@@ -223,14 +223,7 @@ def test_contacts_are_numbers_and_nothing_else(query: dict[str, str], name: str,
 
 
 @pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"<html>",
-        wav(np.zeros(4000)),
-        blow()[:60],
-    ],
-    ids=["empty", "page", "silent", "truncated"],
+    "content", [b"", b"<html>", wav(np.zeros(4000)), blow()[:60]], ids=["empty", "page", "silent", "truncated"]
 )
 def test_a_recording_that_cannot_be_used_is_refused(tmp_path: Path, content: bytes) -> None:
     editor = recorded(tmp_path, 0)

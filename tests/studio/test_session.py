@@ -135,11 +135,7 @@ def test_each_edit_starts_from_the_field_as_it_was_opened_and_undo_goes_back_und
 def test_two_tabs_never_overwrite_one_another(tmp_path: Path) -> None:
     session, _ = opened(tmp_path)
     session.edit(1, Sliders(pitch=2.0))
-    for late in (
-        lambda: session.edit(1, Sliders(pitch=3.0)),
-        lambda: session.undo(1),
-        lambda: session.save(1, "late"),
-    ):
+    for late in (lambda: session.edit(1, Sliders(pitch=3.0)), lambda: session.undo(1), lambda: session.save(1, "late")):
         with raises(RequestError, name="base", value=1) as refused:
             late()
         assert (refused.value.status, refused.value.more) == (409, {"revision": 2})

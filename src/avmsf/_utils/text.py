@@ -112,11 +112,7 @@ def read_json(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> Any:
 
 
 def read_json_object(
-    path: Path,
-    *,
-    raising: type[AvmsfError],
-    advice: str = "copy or export it again",
-    max_bytes: int = MAX_TEXT_BYTES,
+    path: Path, *, raising: type[AvmsfError], advice: str = "copy or export it again", max_bytes: int = MAX_TEXT_BYTES
 ) -> dict[str, Any]:
     """Return the object that a JSON file holds; raises `raising` where it cannot be read or holds something else."""
     try:

@@ -222,10 +222,7 @@ def expect_placed(
 
 
 def _find_mismatch(
-    tree: cKDTree,
-    contacts: Float64[np.ndarray, "contacts 3"],
-    placement: Placement,
-    resolution: float,
+    tree: cKDTree, contacts: Float64[np.ndarray, "contacts 3"], placement: Placement, resolution: float
 ) -> FrameMismatch | None:
     """Return the similarity of the least description length; None where that changes nothing."""
     widest, tolerance = max(2 * resolution, float(placement.distances.max())), placement.tolerance

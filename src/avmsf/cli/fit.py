@@ -76,9 +76,7 @@ class Options(Configured, Many):
     train_count: Int = None
     """Fit to so many, spread; score the others."""
     features: Annotated[
-        Path | None,
-        arg("FILE"),
-        Existing("features, as avmsf fit --until features writes them", ("features",)),
+        Path | None, arg("FILE"), Existing("features, as avmsf fit --until features writes them", ("features",))
     ] = None
     """Features in place of those of the views."""
     allow_missing_features: Flag = False

@@ -106,9 +106,7 @@ FieldFile = tyro.conf.Positional[
     ]
 ]
 FieldFiles = Annotated[
-    tuple[Path, ...],
-    arg("FIELD ..."),
-    Existing("sound fields, as avmsf fit writes them", ("a sound field",)),
+    tuple[Path, ...], arg("FIELD ..."), Existing("sound fields, as avmsf fit writes them", ("a sound field",))
 ]
 CaptureFolder = Annotated[
     Path, tyro.conf.arg(metavar="CAPTURE"), Existing("a capture folder, with impacts.csv", ("a folder",))

@@ -49,12 +49,7 @@ class DecoderDistillation:
     """A guide towards a prompt (Audio-SDS's decoder variant with partial multi-step denoising)."""
 
     def __init__(
-        self,
-        model: StableAudio,
-        prompt: str,
-        *,
-        sample_rate: float,
-        config: DistillationConfig | None = None,
+        self, model: StableAudio, prompt: str, *, sample_rate: float, config: DistillationConfig | None = None
     ) -> None:
         """Set a prompt for sounds of `sample_rate` Hz, that of the field. Raises `EditError` for an empty prompt."""
         self.model, self.prompt, self.sample_rate = model, check_prompt(prompt), sample_rate

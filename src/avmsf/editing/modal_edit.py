@@ -99,12 +99,7 @@ _POINTS = 256
 
 
 def adjust_modes(
-    field: SoundField,
-    *,
-    pitch: Slider = 1.0,
-    decay: Slider = 1.0,
-    brightness_db: float = 0.0,
-    gains_db: Slider = 0.0,
+    field: SoundField, *, pitch: Slider = 1.0, decay: Slider = 1.0, brightness_db: float = 0.0, gains_db: Slider = 0.0
 ) -> SoundField:
     """Return the field with other frequencies, decay times and levels of its modes.
 

@@ -191,13 +191,7 @@ class StableAudio:
         return clean
 
     def generate(
-        self,
-        prompt: str,
-        *,
-        seconds: float,
-        seed: Seed = None,
-        steps: int = 100,
-        guidance: float = 7.0,
+        self, prompt: str, *, seconds: float, seed: Seed = None, steps: int = 100, guidance: float = 7.0
     ) -> Float[Tensor, " samples"]:
         """Return a sound generated from a prompt alone, mono at the model's rate, by the pipeline's own sampler.
 

@@ -100,11 +100,7 @@ class Cdpam:
         return cls(tuple(_folded(weights, layer) for layer in range(_LAYERS)), head_layers)
 
     def distance(
-        self,
-        predicted: Float[Tensor, "..."],
-        truth: Float[Tensor, "..."],
-        *,
-        sample_rate: float,
+        self, predicted: Float[Tensor, "..."], truth: Float[Tensor, "..."], *, sample_rate: float
     ) -> PerContact:
         """Return each contact's distance; sounds are fractions of full scale. Raises as `validate` and `embed`."""
         validate(predicted, truth)

@@ -183,11 +183,7 @@ def draw_other_recording(dataset: Dataset, identifier: str, train: Impacts, *, s
 
 
 SUBSETS: Mapping[str, tuple[str, Sequence[str], Sequence[str]]] = {
-    "ablation": (
-        "those of the paper's ablations or the simulated ones in their place",
-        ABLATION,
-        recipe.ABLATED,
-    ),
+    "ablation": ("those of the paper's ablations or the simulated ones in their place", ABLATION, recipe.ABLATED),
     "non-symmetric": ("those without rotational symmetry", NON_SYMMETRIC, recipe.NON_SYMMETRIC),
 }
 """Groups of objects by name: what they have in common, their numbers in the paper's datasets, and simulated ones."""

@@ -14,14 +14,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.editing import Edits
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
-from avmsf.evaluation.registry import (
-    METRICS,
-    EvaluationSettings,
-    MetricSettings,
-    Protocol,
-    VisualInput,
-    table_modules,
-)
+from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, VisualInput, table_modules
 from avmsf.evaluation.results import SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import shared_cdpam
 from avmsf.evaluation.task import Method
@@ -140,11 +133,7 @@ def plan_evaluation(
 
 
 def available_encoders(
-    lift: LiftConfig,
-    inputs: Collection[VisualInput],
-    *,
-    log: Callable[[str], None],
-    device: str | None = None,
+    lift: LiftConfig, inputs: Collection[VisualInput], *, log: Callable[[str], None], device: str | None = None
 ) -> tuple[LiftConfig, LiftConfig]:
     """Return the settings of features, and those of the paper's form, with the encoders that `inputs` are made with.
 

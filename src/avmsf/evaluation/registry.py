@@ -271,11 +271,7 @@ PROTOCOLS: dict[str, Protocol] = {
             methods=(BASELINE, "field", *_ABLATED),
             subset="ablation",
         ),
-        Protocol(
-            "non-symmetric",
-            "As `farthest`, on objects without rotational symmetry.",
-            subset="non-symmetric",
-        ),
+        Protocol("non-symmetric", "As `farthest`, on objects without rotational symmetry.", subset="non-symmetric"),
         Protocol(
             "localize",
             "Train as in `farthest`; locate the test recordings, on objects without rotational symmetry.",

@@ -53,10 +53,7 @@ _LOWEST_HZ = 60.0
 
 
 def write_summary(
-    results: ResultsFolder,
-    *,
-    subsets: Mapping[str, frozenset[str]],
-    wanted: Mapping[str, Sequence[str]] | None = None,
+    results: ResultsFolder, *, subsets: Mapping[str, frozenset[str]], wanted: Mapping[str, Sequence[str]] | None = None
 ) -> dict[str, Any]:
     """Write `summary.json`, `times.json` and `report.md` of the folder's results, and return the summary.
 

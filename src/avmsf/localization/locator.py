@@ -81,11 +81,7 @@ class Locator:
         return cls(field, positions.float(), gains, variance, dampings, smoothing)
 
     def locate(
-        self,
-        sound: ArrayLike,
-        *,
-        highest: float | None = None,
-        force: Force | float | int | None = None,
+        self, sound: ArrayLike, *, highest: float | None = None, force: Force | float | int | None = None
     ) -> ContactPosterior:
         """Return the posterior of the contact for a sound [samples] that starts at its onset, at the field's rate.
 

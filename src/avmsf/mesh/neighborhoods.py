@@ -43,11 +43,7 @@ def read_neighborhoods(points: Float[np.ndarray, "points 3"], *, count: int = NE
 
 
 def describe_neighborhoods(
-    surface: Neighborhoods,
-    rows: Int[np.ndarray, " rows"],
-    others: Int[np.ndarray, " others"],
-    *,
-    diagonal: float,
+    surface: Neighborhoods, rows: Int[np.ndarray, " rows"], others: Int[np.ndarray, " others"], *, diagonal: float
 ) -> Float[np.ndarray, "rows dim"]:
     """Return numbers that are alike where the surface is alike, whichever way it is turned or mirrored.
 

@@ -1,4 +1,4 @@
-"""What is asked of triangles: where a surface is closest to a place, exactly, and where rays meet it, by Embree."""
+"""Closest points on a mesh, exactly, and where rays meet it, by Embree."""
 
 from dataclasses import dataclass
 from itertools import chain

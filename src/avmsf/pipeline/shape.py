@@ -145,11 +145,7 @@ def reported_symmetries(report: Mapping[str, Any]) -> Symmetries | None:
 
 
 def _shape_of_views(
-    capture: Capture,
-    config: PipelineConfig,
-    scene: SceneStages,
-    given: FeatureField | None,
-    report: Mapping[str, Any],
+    capture: Capture, config: PipelineConfig, scene: SceneStages, given: FeatureField | None, report: Mapping[str, Any]
 ) -> FitShape:
     """Return the shape that views show; `given` features with their report are in place of those of the views."""
     impacts, settings = capture.impacts, capture.settings

@@ -266,9 +266,7 @@ def _box_difference(points: Float64[Tensor, "points 3"], views: Sequence[View]) 
 
 
 def expect_contacts_in_views(
-    contacts: Float[Tensor, "contacts 3"],
-    views: Sequence[View],
-    settings: CaptureSettings,
+    contacts: Float[Tensor, "contacts 3"], views: Sequence[View], settings: CaptureSettings
 ) -> None:
     """Raise CaptureError where cameras see the object elsewhere than the contacts (m) lie.
 

@@ -136,11 +136,7 @@ def component_colors(features: Float[Tensor, "points dim"]) -> Float[Tensor, "po
 
 
 def _draw_symmetries(
-    axes: Axes,
-    middle: Float[np.ndarray, " 3"],
-    radius: float,
-    symmetries: Symmetries,
-    view: Float[np.ndarray, "3 3"],
+    axes: Axes, middle: Float[np.ndarray, " 3"], radius: float, symmetries: Symmetries, view: Float[np.ndarray, "3 3"]
 ) -> None:
     for mirror in symmetries.mirrors:
         normal, point = mirror.normal.double().numpy(), mirror.point.double().numpy()

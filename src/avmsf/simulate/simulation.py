@@ -241,10 +241,7 @@ def _captured(
     assert truth.starts is not None
     rate = float(recipe.sample_rate)
     settings = CaptureSettings(
-        name=name,
-        seconds=_kept(recipe) / recipe.sample_rate,
-        normalize="done",
-        align=bool((truth.starts != 0.0).any()),
+        name=name, seconds=_kept(recipe) / recipe.sample_rate, normalize="done", align=bool((truth.starts != 0.0).any())
     )
     written = strikes.written_places.tolist(), strikes.written_directions.tolist(), forces.tolist()
     sounds = (

@@ -132,8 +132,7 @@ def test_a_mode_without_gains_is_silent_and_changes_no_other(variance):
     others = torch.tensor([0, 1, 3, 4])
     silent = replace(gains, values=values, variance=torch.where(torch.arange(MODES) == 2, variance, gains.variance))
     rest = replace(
-        gains,
-        **{name: getattr(gains, name)[..., others] for name in ("values", "variance", "frequency", "damping")},
+        gains, **{name: getattr(gains, name)[..., others] for name in ("values", "variance", "frequency", "damping")}
     )
     one = fit_mixture(families(sites, elastic=False), silent, points, directional=True)
     other = fit_mixture(families(sites, elastic=False), rest, points, directional=True)

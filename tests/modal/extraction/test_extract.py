@@ -91,8 +91,7 @@ def test_gains_are_the_plates():
 @pytest.mark.parametrize("seconds", [0.5, 0.8])
 def test_a_doublet_three_hertz_apart_is_resolved(seconds: float):
     pair = ModalBank(
-        torch.tensor([1250.0, 1681.2, 1684.24], dtype=torch.float64),
-        torch.tensor([8.0, 3.1, 3.1], dtype=torch.float64),
+        torch.tensor([1250.0, 1681.2, 1684.24], dtype=torch.float64), torch.tensor([8.0, 3.1, 3.1], dtype=torch.float64)
     )
     gains = torch.randn(7, 3, generator=seeded(2))
     sounds = make(pair, gains, rate=RATE, samples=round(seconds * RATE), noise=0.02)

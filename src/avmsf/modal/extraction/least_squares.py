@@ -97,11 +97,7 @@ class NormalEquations:
 
     @classmethod
     def of(
-        cls,
-        sounds: Float[Tensor, "contacts samples"],
-        poles: Complex128[Tensor, " modes"],
-        *,
-        weighted: bool = False,
+        cls, sounds: Float[Tensor, "contacts samples"], poles: Complex128[Tensor, " modes"], *, weighted: bool = False
     ) -> "NormalEquations":
         """Return the equations of the given sounds and poles, with what `step` needs besides if `weighted`."""
         samples = sounds.shape[1]
