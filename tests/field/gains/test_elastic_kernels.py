@@ -113,6 +113,19 @@ def test_weak_modes_tell_the_factor_next_to_strong_ones_that_are_no_shapes():
     assert abs(math.log(weighed(both, sites).factor / 0.75)) <= 0.01
 
 
+def test_poles_with_the_patterns_of_shapes_at_other_frequencies_do_not_move_the_factor():
+    """Eighteen weak ones above all modes, as stand for how strong modes begin, each with the gains of one of these."""
+    sites = impacts(30, seed=1)
+    modes = measured(sites)
+    values = 0.05 * modes.values[:, [1, 3, 4] * 6]
+    frequency = modes.frequency[-1] * torch.linspace(1.3, 2.0, 18, dtype=torch.float64)
+    poles = MeasuredGains(values, torch.full((18,), 1e-5).double(), frequency, torch.full((18,), 60.0).double())
+    both = MeasuredGains(
+        *(torch.cat(each, dim=-1) for each in zip(vars(modes).values(), vars(poles).values(), strict=True))
+    )
+    assert abs(math.log(weighed(both, sites).factor)) <= 0.01
+
+
 def match(body, log_frequency, shape=0.0):
     """Return densities by factor, error and mode, with the same evidence of all shapes."""
     evidence = torch.full((len(body.modes), len(log_frequency)), shape, dtype=torch.float64)
@@ -202,7 +215,7 @@ def test_all_modes_together_tell_how_exact_the_frequencies_are(scatter, expected
 
 
 def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
-    """Half of the modes have the body's error, the others any; over that of a mode that is no shape.
+    """Half of the modes have the body's error, the others any or that of a mode that is no shape; over this density.
 
     In the range of the measured modes, .1 wider at both ends, these are as dense as the upper half of the shapes.
     """
@@ -214,12 +227,13 @@ def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
     for factor, each in zip(FACTORS.log(), given.frequency_weights.reshape(len(FACTORS), -1), strict=True):
         center = (factor + torch.log(plate().frequency)).numpy()
         inside = max(((center > low) & (center < high)).sum(), 1)
-        for error, weight in zip(FREQUENCY_ERRORS, 0.5 * each + 0.5 * each.mean(), strict=True):
+        for error, weight in zip(FREQUENCY_ERRORS, 0.5 * each + 0.1 * each.sum(), strict=True):
             density = norm.pdf(measured_modes.numpy(), center[:, None], error)
             expected += float(weight) * density / inside
     half = (SHAPES + 1) // 2
     power = math.log(SHAPES / half) / math.log(plate().frequency[-1] / plate().frequency[half - 1])
     expected /= power * np.exp(power * measured_modes.numpy()) / (np.exp(power * high) - np.exp(power * low))
+    expected += 0.1 / SHAPES
     found = given.shape_log_prior(measured_modes)
     assert found.exp().numpy() == pytest.approx(expected, rel=1e-4)
     # It is that of each kernel around a shape.

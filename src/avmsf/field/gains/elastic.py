@@ -14,7 +14,8 @@ Which shape a mode is follows from its gains and from its frequency f: given sha
 frequencies (the body's material and scale are not known), log f is normal about log(c f_k); under all other families it
 is as dense as the body's shapes, by a power law. Its standard deviation is the same for half of the modes of a body,
 one of several, and the others have any of these: so all modes together tell how exact the body's frequencies are, and
-with one or two impacts these tell which shape each mode is.
+with one or two impacts these tell which shape each mode is. In weighing the factor a few modes are shapes whose
+frequencies have nothing to do with theirs: poles that stand for how strong modes begin have the gains of these.
 """
 
 import math
@@ -55,6 +56,8 @@ FREQUENCY_ERRORS = (0.01, 0.03, 0.08, 0.2)
 """Standard deviations of log frequency about the nominal one, equally probable."""
 _EXCEPTIONS = 0.5
 """Share of the modes whose standard deviation is any of these, not that of the other modes."""
+UNRELATED = 0.02
+"""Share of the modes that are shapes whose frequency says nothing of theirs, in weighing factors."""
 _IMPROBABLE = 1e-6
 """Probability of a factor, over the most probable one's, below which it is left out: all of them together change
 probabilities by less than a thousandth."""
@@ -215,8 +218,13 @@ class Elastic(KernelFamily):
             found[rows, error] = torch.logsumexp(densities.add_(shape), dim=1)
         # A mode has its body's error or, as an exception, any.
         exception = torch.logsumexp(found, dim=1, keepdim=True) + math.log(_EXCEPTIONS / len(FREQUENCY_ERRORS))
-        known = torch.logaddexp(found + math.log(1.0 - _EXCEPTIONS), exception)
+        known = torch.logaddexp(found + math.log(1.0 - _EXCEPTIONS), exception) + math.log(1.0 - UNRELATED)
+        known = torch.logaddexp(known, self.unrelated(shape))
         return torch.logaddexp(known + (inside / total).log()[..., None], beyond[:, None]).flatten(0, 1)
+
+    def unrelated(self, shape: Float64[Tensor, "shapes modes"]) -> Float64[Tensor, " modes"]:
+        """Return the log density of modes that are any shape, but at another frequency; `shape` as in `match`."""
+        return torch.logsumexp(shape, dim=0) + math.log(UNRELATED / len(shape))
 
     def _densities(
         self, factors: Int[Tensor, " some"], log_frequency: Float64[Tensor, " modes"]

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Complex128, Float32, Float64, Int
 from torch import Tensor
 
 from avmsf.fem.updating import Matched
-from avmsf.field.gains.elastic import Elastic
+from avmsf.field.gains.elastic import UNRELATED, Elastic
 from avmsf.field.gains.kernels import KernelFamily
 from avmsf.field.gains.mixture import (
     NOISE_SHARES,
@@ -193,9 +193,10 @@ def matched(families: Sequence[WeighedFamily], elastic: Elastic, measured: Measu
     weighed = [*families, WeighedFamily.of(elastic, measured)]
     total, active = total_evidence(weighed, measured), measured.informative
     # Parts that say nothing of their mode's shape are left out, and each mode counts its frequency once.
-    prior = elastic.shape_log_prior(torch.log(measured.frequency))
-    joined = torch.cat([prior + _shape(weighed[-1], elastic, active), _no_shape(families, active)[None]])
-    return Matched(total, torch.softmax(joined, dim=0)[:-1], math.log(elastic.factor))
+    shape, prior = _shape(weighed[-1], elastic, active), elastic.shape_log_prior(torch.log(measured.frequency))
+    others = torch.stack([elastic.unrelated(shape), _no_shape(families, active)])
+    joined = torch.cat([prior + shape + math.log(1.0 - UNRELATED), others])
+    return Matched(total, torch.softmax(joined, dim=0)[: -len(others)], math.log(elastic.factor))
 
 
 def _shape(
