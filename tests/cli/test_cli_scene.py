@@ -11,7 +11,7 @@ import trimesh
 
 from avmsf.cli import main
 from avmsf.cli.report import describe
-from avmsf.errors import EvaluationError
+from avmsf.errors import EvaluationError, SceneError
 from avmsf.features.feature_field import load_features, read_report
 from avmsf.field.store import load, save
 from avmsf.gaussians.ply import read_splats
@@ -20,8 +20,9 @@ from avmsf.photographs.folder import write_frames
 from avmsf.plotting.objects import draw_surface
 from factories.believing_field import bar_contacts, drawn_gains, elastic_field, sound_field
 from factories.plate_capture import PLATE, TINY, fill_plate
+from factories.raising import raises
 from factories.small_scene import SMALL_SPLAT, THICKNESS, slab, slab_views
-from factories.verbs import results_of, sets
+from factories.verbs import results_of, run_verb, sets
 
 Streams = pytest.CaptureFixture[str]
 LIFT = sets("lift.encoder=descriptors lift.points=1200")
@@ -116,6 +117,12 @@ def test_a_gain_model_without_features_reads_the_shape_of_views_and_no_encoder(k
     mesh = trimesh.load(tmp_path / "slab.ply")
     assert mesh.is_watertight
     assert mesh.extents.tolist() == pytest.approx([PLATE.length, PLATE.width, THICKNESS], abs=0.02)
+
+
+def test_an_encoder_that_is_not_there_is_missed_before_gaussians_are_fitted(capture: Path, tmp_path: Path) -> None:
+    with raises(SceneError, name="encoder"):
+        run_verb("fit", str(capture), "--cache", str(tmp_path), *SMALL, "--set", f"lift.encoder={tmp_path / 'none'}")
+    assert not list(tmp_path.glob("cloud*"))
 
 
 @pytest.mark.parametrize("name", ["cloud", "features"])

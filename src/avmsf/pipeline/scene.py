@@ -162,14 +162,15 @@ class SceneStages(Pipeline):
         write_views(views_of_cloud(read_splats(given), size=self.config.views.rendered), path, replace=True)
 
     @cached_property
-    def _encoder(self) -> Encoder:
+    def encoder(self) -> Encoder:
+        """What describes the views. Raises SceneError where it is not available."""
         return choose_encoder(self.config.lift, log=self.listener.note, device=self.device)
 
     def _features_recipe(self) -> dict[str, object]:
-        return {"encoder": self._encoder.name, "lift": asdict(self.config.lift)}
+        return {"encoder": self.encoder.name, "lift": asdict(self.config.lift)}
 
     def _make_features(self, path: Path, views_path: Path, cloud: Path | None = None) -> None:
-        views, config, encoder = read_views(views_path), self.config.lift, self._encoder
+        views, config, encoder = read_views(views_path), self.config.lift, self.encoder
         if cloud is None:
             assert self.source is not None
             shape: Surface | GaussianCloud = Surface.read(self.source.path, meters=self.settings.surface_meters)

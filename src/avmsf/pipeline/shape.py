@@ -83,6 +83,9 @@ def pipeline_of(
         )
         points = capture.surface is not None and not is_mesh(capture.surface)
         if made and not (points and made.source is not None and made.source.kind == "mesh"):
+            if reads:
+                # Loaded before Gaussians, which take minutes.
+                _ = made.encoder
             return made
     return Pipeline(folder, listener=listener)
 
