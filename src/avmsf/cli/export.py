@@ -125,7 +125,7 @@ class Options(Many):
         return "position" in _USED[self.to] and bool(self.position or self.contact_table)
 
     def _check(self) -> None:
-        if len(self.inputs) > 1:
+        if self.several:
             return
         given = sum((bool(self.position), self.contact_table is not None, self.contacts is not None))
         if self.contacts_given and given > 1:
@@ -142,7 +142,7 @@ class Options(Many):
 
 def run(options: Options) -> int:
     """Read, write, and print the size and what is left out."""
-    if len(options.inputs) > 1:
+    if options.several:
         return run_many("export", options, raising=ExportError)
     from avmsf.export.faust import contacts_path
     from avmsf.export.samples import INSTRUMENT

@@ -135,10 +135,10 @@ class Options(Configured, Many):
         return StageFolder(self.cache or own)
 
     def _check(self) -> None:
-        if one := len(self.inputs) == 1:
+        if not self.several:
             self._check_capture()
         config = self.all_settings
-        if one and self.output is not None:
+        if not self.several and self.output is not None:
             New(_SUFFIXES[self.until]).check(self.output)
             source, guess = self.capture, self.material is not None
             own = settings_of(source).name or (source.resolve().name if source.is_dir() else source.resolve().stem)
@@ -178,7 +178,7 @@ class Options(Configured, Many):
 
 def run(options: Options) -> int:
     """Fit, write, and print a summary."""
-    if len(options.inputs) > 1:
+    if options.several:
         return run_many("fit", options, raising=FitError)
     from avmsf._utils.device import TRAINABLE, usable_device
 

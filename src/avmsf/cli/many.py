@@ -34,7 +34,7 @@ class Many(Common, ABC):
     """Options of the verbs that take many inputs."""
 
     workers: Annotated[int, arg("N")] = 1
-    """Of several: so many at a time, on one thread each."""
+    """So many at a time, on one thread each; the output is a folder then."""
     ray: Annotated[str | None, arg("ADDRESS")] = None
     """Of several: a ray cluster with the same paths."""
     inputs: tuple[Path, ...]
@@ -62,10 +62,14 @@ class Many(Common, ABC):
         """Raise as `Common`, of several inputs for what they share: what is wrong with one of them costs it alone."""
         if not self.inputs:
             raise InputError.expected("1 or more", 0, got="none", name="inputs")
-        several = len(self.inputs) > 1
-        super(Many, replace(self, inputs=()) if several else self).check_paths()
-        if several:
+        super(Many, replace(self, inputs=()) if self.several else self).check_paths()
+        if self.several:
             self.tasks()
+
+    @property
+    def several(self) -> bool:
+        """Whether the output is a folder: of several inputs, and of one where workers are asked for."""
+        return len(self.inputs) > 1 or self.workers > 1 or self.ray is not None
 
     def tasks(self: M) -> dict[str, M]:
         """Return the options for each of several inputs, by its name.
@@ -79,7 +83,7 @@ class Many(Common, ABC):
         New().check(folder)
         for each in fields(self):
             if each.name in self.alone and getattr(self, each.name) != each.default:
-                name, wanted = option_of(each.name), f"none with {len(self.inputs)} inputs"
+                name, wanted = option_of(each.name), "none where the output is a folder"
                 raise InputError.expected(wanted, got="one", name=name, advice="leave it out")
         made: dict[str, M] = {}
         for given in self.inputs:
