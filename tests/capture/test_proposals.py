@@ -128,7 +128,7 @@ def test_settings_that_a_user_wrote_are_kept(tmp_path: Path) -> None:
     (folder / "capture.toml").write_text("seconds = 0.4  # mine\n")
     proposals = propose_settings(folder)
     assert [each.key for each in proposals] == ["highpass"]
-    with pytest.raises(CaptureError):
+    with pytest.raises(CaptureError, match=proposals[0].line):
         write_settings(folder, proposals)
     assert (folder / "capture.toml").read_text() == "seconds = 0.4  # mine\n"
     # A choice is not questioned, not even of the default.

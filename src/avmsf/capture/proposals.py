@@ -103,7 +103,7 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
         with open(path, "x", encoding="utf-8") as file:
             file.write("\n".join(parts))
     except FileExistsError as error:
-        advice = "add the proposed lines to it by hand"
+        advice = f"add to it by hand: {'; '.join(each.line for each in proposals)}"
         raise CaptureError.expected("no such file", got="an existing one", file=path, advice=advice) from error
     except OSError as error:
         raise unwritable(path, error, raising=CaptureError) from error

@@ -129,7 +129,7 @@ def read_table(
     double = sorted({name for name in header if name in known and header.count(name) > 1})
     if missing:
         numbers = "vertex numbers have to become positions: " if any("vert" in name for name in header) else ""
-        wanted, got, advice = f"the columns {', '.join(missing)}", f"only {', '.join(header)}", numbers + advice
+        wanted, got, advice = f"columns named {', '.join(missing)}", f"only {', '.join(header)}", numbers + advice
         raise CaptureError.expected(wanted, header, got=got, file=path, row=first, name=missing[0], advice=advice)
     if double:
         got, wanted = f"more than one {', '.join(double)}", "different names of columns"
