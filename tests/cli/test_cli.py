@@ -137,7 +137,7 @@ def test_fit_writes_a_field_and_its_scores(capture: Path, tmp_path: Path, capsys
     # All impacts have one direction: it makes no baseline of its own.
     assert [name for name in told["scores"] if "direction" in name] == []
     errors = {method: each["relative_stft"] for method, each in told["scores"].items()}
-    assert min(errors, key=lambda method: errors[method]) == "the held-out recordings' own gains, no noise"
+    assert min(errors, key=lambda method: errors[method]) == "the held-out recordings' own gains"
     assert max(errors, key=lambda method: errors[method]) == "white noise"
     assert [each.name for each in path.parent.iterdir()] == ["plate.safetensors"]
     assert {"modes.png", "gains.png", "spectrograms.png"} <= {each.name for each in (tmp_path / "plots").iterdir()}
@@ -149,6 +149,12 @@ def test_the_paper_leaves_visual_features_out_only_if_that_is_allowed(capture, t
         run_verb(*words)
     _, said = results_of(capsys, *words, "--allow-missing-features")
     assert "without visual features" in said
+
+
+def test_one_capture_that_workers_are_asked_for_has_a_folder_as_several_have(capture: Path, tmp_path: Path) -> None:
+    options = FitOptions.parse([str(capture), "--workers", "2", "--output", str(tmp_path / "fields")])
+    options.check_inputs()
+    assert [each.output for each in options.tasks().values()] == [tmp_path / "fields" / f"{capture.name}.safetensors"]
 
 
 def test_fit_replaces_nothing_but_a_field_of_the_same_capture(capture: Path, field: Path, tmp_path: Path) -> None:
@@ -257,7 +263,8 @@ RENDERED: dict[str, dict[str, Any]] = {
 def test_render_is_the_fields_own(words: str, path: Path, capsys: Streams) -> None:
     output = path.with_name("sounds")
     spots = [*SPOT, "--position", "-40e-3", "1e-2", "0.002", "--output", output]
-    told, _ = results_of(capsys, "render", path, *spots, *words.split())
+    told, said = results_of(capsys, "render", path, *spots, *words.split())
+    assert ("--no-noise leaves it out" in said) == ("--force" in words)
     assert told["files"] == [str(output / "001.wav"), str(output / "002.wav")]
     expected = load(path).render(PLACES[1:], **RENDERED[words])
     for file, sound in zip(told["files"], expected, strict=True):

@@ -30,7 +30,7 @@ from avmsf.symmetry.symmetries import Symmetries
 
 MAX_LISTED_MODES = 15
 """Modes in a table, those of most energy."""
-_OWN_GAINS = "the held-out recordings' own gains, no noise"
+_OWN_GAINS = "the held-out recordings' own gains"
 HEADINGS = {"relative_stft": "relative STFT error", "l1": "L1", "l1_log": "L1-log", "envelope": "ENV"}
 """Metrics in the order of the table, as its columns call them."""
 
@@ -150,10 +150,11 @@ def quality_words(field: SoundField, path: Path) -> list[str]:
 
 
 def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction) -> dict[str, Scores]:
-    """Score the field, baselines of the same training impacts, and the held-out recordings' own gains without noise.
+    """Score the field, baselines of the same training impacts, and the held-out recordings' own gains.
 
-    All by recordings aligned like those that the modes were found in. Directions count in a baseline of their own where
-    they choose other neighbors.
+    These have the field's noise, unless it has the residuals of recordings in place of noise. All by recordings aligned
+    like those that the modes were found in. Directions count in a baseline of their own where they choose other
+    neighbors.
     """
     doing("comparing the field with the recordings that it was not fitted to")
     begun = time.monotonic()
@@ -170,7 +171,10 @@ def compare(field: SoundField, train: Impacts, test: Impacts, modes: Extraction)
     scores = {name: evaluate(renderer, test) for name, renderer in renderers.items()}
     if scores[nearest].mean() == scores[f"{nearest}, by direction"].mean():
         del scores[f"{nearest}, by direction"]
-    scores |= {_OWN_GAINS: score(floor(test, modes.bank), test)}
+    own = floor(test, modes.bank)
+    if field.residual.recordings is None:
+        own = own + field.noise(own.shape[1])
+    scores |= {_OWN_GAINS: score(own, test)}
     display.listener.ready("scores", time.monotonic() - begun)
     return scores
 
