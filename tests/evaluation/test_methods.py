@@ -230,7 +230,7 @@ def test_the_papers_method_finds_modes_in_its_own_way():
     train = plate_impacts()
     task = replace(plate_task(train, impacts=train), modes=shared)
     pipeline = replace(NETWORK, extraction="short-time", fit=replace(QUICK, steps=1, correction_rate=0.0))
-    field = FieldMethod("quick", pipeline, "paper", published=True).fit(task)
+    field = FieldMethod("quick", pipeline, VisualInput("paper"), published=True).fit(task)
     assert torch.allclose(field.bank.frequency, ShortTime().find(train.sounds, train.sample_rate).frequency)
 
 

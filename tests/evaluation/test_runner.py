@@ -25,7 +25,7 @@ from avmsf.evaluation.methods import FieldMethod, FunctionMethod, method_named
 from avmsf.evaluation.modal_metrics import compare_modes, truth_at
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.plan import Evaluation
-from avmsf.evaluation.registry import METRICS, PROTOCOLS, MetricSettings
+from avmsf.evaluation.registry import METRICS, PROTOCOLS, MetricSettings, VisualInput
 from avmsf.evaluation.report import write_summary
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.runner import CaseRun, ObjectData, Progress, run_objects
@@ -141,7 +141,7 @@ def test_without_a_body_the_default_method_is_the_fit_with_its_symmetries(plates
     run_objects(replace(plan, inputs=ObjectInputs(dataset, tmp_path)), ("a",), ResultsFolder(tmp_path / "results"))
     (task,) = tasks
     config = PipelineConfig("auto", fit=replace(QUICK, steps=3))
-    evaluated = FieldMethod("field-auto", config, "surface").fit(task)
+    evaluated = FieldMethod("field-auto", config, VisualInput()).fit(task)
     fitted = fit(replace(dataset.capture("a"), impacts=task.train, folder=None), config=config, progress=False)
     for field in (evaluated, fitted):
         assert Symmetric.kind in {each.kind for each in field.fitted_mixture.families}

@@ -24,7 +24,7 @@ from avmsf.evaluation.methods import FieldMethod, RecordedMethod, method_named
 from avmsf.evaluation.modal_metrics import truth_at, truth_from_first_sample, truth_of
 from avmsf.evaluation.objects import draw_other_recording
 from avmsf.evaluation.plan import Evaluation
-from avmsf.evaluation.registry import METRICS, MetricEntry
+from avmsf.evaluation.registry import METRICS, MetricEntry, VisualInput
 from avmsf.evaluation.results import (
     RECORDED,
     CaseRecord,
@@ -195,7 +195,7 @@ class CaseRun:
         self, name: str, recordings: _Recordings, renderer: Renderer, published: bool
     ) -> tuple[Values, dict[str, str]]:
         """Return the errors of located contacts, and the files of contacts' maps by the names of their recordings."""
-        points = self._shared(self.data.features)("surface", self.case.views).points
+        points = self._shared(self.data.features)(VisualInput(), self.case.views).points
         train, test, rows = recordings.train, recordings.test, self.stored_rows
         errors, found = located(
             renderer, train, test, points, vertices=self.data.vertices, published=published, map_rows=rows
