@@ -111,4 +111,4 @@ def test_the_python_of_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytes
         # Others need photographs, or solve a body of many elements.
         if "read_views" not in block and "bowl.ply" not in block:
             exec(block, {})
-    assert (tmp_path / "bowl.safetensors").is_file()
+    assert len(list(tmp_path.glob("*.safetensors"))) == 1

@@ -90,8 +90,8 @@ def run(options: Options) -> int:
     if options.force not in (None, 1) and not field.origin.per_newton:
         note(f"the forces are not known: {options.force:g} is relative to an average recorded impact")
     if options.force is not None and not options.no_noise and (average := field.residual.force):
-        beneath = f"beneath an impact of {average:.3g} {'N' if field.origin.per_newton else 'times the average force'}"
-        note(f"the noise does not depend on the force: it is as loud as {beneath}; --no-noise leaves it out")
+        level = f"{average:.3g} {'N' if field.origin.per_newton else 'times the average force'}"
+        note(f"the noise does not depend on the force: it is that of an impact of {level}; --no-noise leaves it out")
     if round(field.sample_rate) != field.sample_rate:
         note(f"the wav files have {round(field.sample_rate)} Hz for {field.sample_rate:g} Hz")
     doing("rendering")
