@@ -233,7 +233,7 @@ def test_an_encoder_that_is_not_there_is_refused_by_the_paper_and_said_elsewhere
     usual, paper = available_encoders(LiftConfig(), {VisualInput("visual")}, log=said.append)
     assert (usual.encoder, paper.encoder) == (DESCRIPTORS, DINO)
     assert any("descriptors" in line for line in said)
-    named = available_encoders(LiftConfig(encoder=DESCRIPTORS), {"paper"}, log=said.append)
+    named = available_encoders(LiftConfig(encoder=DESCRIPTORS), {VisualInput("paper")}, log=said.append)
     assert [each.encoder for each in named] == [DESCRIPTORS, DESCRIPTORS]
     assert named[1].onto == "gaussians"
 

@@ -34,13 +34,13 @@ class Many(Common, ABC):
     """Options of the verbs that take many inputs."""
 
     workers: Annotated[int, arg("N")] = 1
-    """So many at a time, on one thread each; the output is a folder then."""
+    """So many at a time; of 2 or more, -o is a folder."""
     ray: Annotated[str | None, arg("ADDRESS")] = None
-    """Of several: a ray cluster with the same paths."""
+    """A ray cluster with the same paths, -o a folder."""
     inputs: tuple[Path, ...]
     """What has an output each."""
     output: Path | None
-    """The output of a single input, or the folder of those of several."""
+    """The output of a single input, or the folder of those of several or of workers."""
     alone: ClassVar[tuple[str, ...]]
     """Options that only one input can have."""
 
@@ -72,7 +72,7 @@ class Many(Common, ABC):
         return len(self.inputs) > 1 or self.workers > 1 or self.ray is not None
 
     def tasks(self: M) -> dict[str, M]:
-        """Return the options for each of several inputs, by its name.
+        """Return the options for each input, by its name.
 
         Raises `OutputError` without a folder for outputs, and `InputError` for two inputs of one name, and for an
         option that only one input can have.

@@ -83,9 +83,6 @@ def pipeline_of(
         )
         points = capture.surface is not None and not is_mesh(capture.surface)
         if made and not (points and made.source is not None and made.source.kind == "mesh"):
-            if reads:
-                # Loaded before Gaussians, which take minutes.
-                _ = made.encoder
             return made
     return Pipeline(folder, listener=listener)
 
@@ -152,6 +149,9 @@ def _shape_of_views(
 ) -> FitShape:
     """Return the shape that views show; `given` features with their report are in place of those of the views."""
     impacts, settings = capture.impacts, capture.settings
+    if given is None:
+        # Loaded before Gaussians, which take minutes.
+        _ = scene.encoder
     if scene.source is not None and scene.source.kind == "cameras":
         # Before Gaussians, which take minutes.
         views = read_views(scene[VIEWS].path)
