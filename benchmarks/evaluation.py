@@ -20,7 +20,7 @@ from avmsf.features.efficientnet import NAME as EFFICIENTNET
 from avmsf.pipeline.config import DESCRIPTORS
 from avmsf.simulate.recipe import ABLATED, NON_SYMMETRIC, SET, SIM20
 from avmsf.simulate.simulation_folder import simulate_set
-from benchmarks.records import MissingDataError, Record, Settings, code_commit, means, records
+from benchmarks.records import MissingDataError, Record, Settings, means, records
 from benchmarks.small_sonicgauss import NAME as SMALL
 
 SIMPLE = "nearest,knn3,knn-gains,spline-gains"
@@ -57,16 +57,15 @@ def _evaluate(
         methods = ",".join(each for each in methods.split(",") if not each.startswith(("paper", "av-msf")))
         options += ["--set", "modes=8", "--set", "body.dofs=2000", "--set", "edit.guide.steps=5"]
     options += ["--time-zero", "peak"] * paper + ["--counts", counts] * bool(counts)
-    objects = settings.work / ("short" if paper else SET)
+    objects = settings.kept / ("short" if paper else SET)
     shape: dict[str, Any] = {"views": 0, "sample_rate": 16000, "seconds": 0.5} if paper else {}
     # Random impacts and edits are of all objects of the folder.
     made = chosen if settings.quick else tuple(SIM20)
     simulate_set({each: replace(SIM20[each], **shape) for each in made}, objects)
-    results = settings.work / code_commit()
-    output = results / f"{'quick-' * settings.quick}{part}"
+    output = settings.kept / f"{'quick-' * settings.quick}{part}"
     words = ["evaluate", protocol, str(objects), "--methods", methods, "--objects", ",".join(chosen), *options]
     # All parts share what is made of an object: bodies, Gaussians and features.
-    words += ["--cache", str(results / f"features-{objects.name}"), "--output", str(output)]
+    words += ["--cache", str(settings.kept / f"features-{objects.name}"), "--output", str(output)]
     words += ["--workers", str(os.cpu_count())]
     with redirect_stdout(sys.stderr):
         code = main(words)

@@ -178,8 +178,8 @@ def simulated(name: str, settings: Settings, imperfections: Mapping[str, float] 
 def simulated_folder(name: str, settings: Settings) -> Path:
     """Return the folder of an object of `SETS` with its pictures, simulated now where it does not exist."""
     of = _set_of(name)
-    simulate_set({name: SETS[of][name]}, settings.work / of)
-    return settings.work / of / name
+    simulate_set({name: SETS[of][name]}, settings.kept / of)
+    return settings.kept / of / name
 
 
 def _set_of(name: str) -> str:
@@ -195,7 +195,7 @@ def views_and_gaussians(name: str, settings: Settings) -> tuple[tuple[View, ...]
     """Return the photographs of a simulated object and its Gaussians."""
     config = replace(SplatConfig(), steps=200) if settings.quick else SplatConfig()
     views = read_views(simulated_folder(name, settings))
-    path = settings.work / "gaussians" / f"{name}-{config.steps}-steps.ply"
+    path = settings.kept / "gaussians" / f"{name}-{config.steps}-steps.ply"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_splats(splat(views, config), path)

@@ -69,9 +69,14 @@ class Settings:
     """What the steps of `step` are taken on."""
 
     @property
+    def kept(self) -> Path:
+        """The folder of `work` for this commit."""
+        return self.work / code_commit()
+
+    @property
     def weights(self) -> Path:
         """File of the weights of sonicgauss-small."""
-        return self.work / "sonicgauss-small.safetensors"
+        return self.kept / f"{'quick-' * self.quick}sonicgauss-small.safetensors"
 
     def some(self, items: Sequence[_Item], quick: int = 1) -> Sequence[_Item]:
         """Return all items, or the first `quick` of them for a quick look."""

@@ -83,7 +83,7 @@ def training(settings: Settings) -> Iterator[Record]:
     made = time.process_time() - begun
     found = train_small(objects, sizes, config)
     trained = time.process_time() - begun - made
-    settings.work.mkdir(parents=True, exist_ok=True)
+    settings.kept.mkdir(parents=True, exist_ok=True)
     found.write(settings.weights)
     losses = found.report["losses"]
     for number, loss in enumerate(losses, 1):
