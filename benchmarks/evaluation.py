@@ -12,7 +12,7 @@ from typing import Any
 
 from avmsf.cli import main
 from avmsf.cli.evaluate import FAILED
-from avmsf.evaluation.registry import METRICS
+from avmsf.evaluation.registry import METRICS, kind_of
 from avmsf.evaluation.report import SUMMARY
 from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.tables import times_of, values_of
@@ -80,24 +80,20 @@ def _evaluate(
     several = len(summary["cases"]) > 1
     for case, found in summary["cases"].items():
         for method, values in found.items():
-            yield from _records(values, _kind(method), case if several else "")
+            yield from _records(values, kind_of(method), case if several else "")
     for group, of in (("ratio", "ratio_to_knn3"), ("median", "medians")):
         for method, values in summary[of].items():
-            yield from _records(values, f"{group}.{_kind(method)}")
+            yield from _records(values, f"{group}.{kind_of(method)}")
     metric = "rmed" if protocol == "localize" else "relative_stft"
     for method, found in values_of(outcomes, summary["main_case"]).items():
         for name, value in found.get(metric, {}).items():
-            yield Record(f"{metric}.{_kind(method)}", value, object=name)
+            yield Record(f"{metric}.{kind_of(method)}", value, object=name)
     times = [each["methods"] for each in times_of(outcomes).values()]
     for method in dict.fromkeys(method for each in times for method in each):
         taken = means([each[method] for each in times if method in each])
         yield from records(
-            {f"{step}_seconds": value for step, value in taken.items()}, group=f"seconds.{_kind(method)}"
+            {f"{step}_seconds": value for step, value in taken.items()}, group=f"seconds.{kind_of(method)}"
         )
-
-
-def _kind(method: str) -> str:
-    return method.partition(":")[0]
 
 
 def _records(values: dict[str, float], group: str, case: str = "") -> Iterator[Record]:

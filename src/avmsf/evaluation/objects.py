@@ -91,8 +91,11 @@ class ObjectInputs:
             standardize=lift.standardize or visual_input.standardized,
         )
         # The ablated features lie beside those of the fields without ablation.
-        changes = {"paper": visual_input.form == "paper", "unaligned": not visual_input.pooled}
-        changes["standardized"] = visual_input.standardized
+        changes = {
+            "paper": visual_input.form == "paper",
+            "unaligned": not visual_input.pooled,
+            "standardized": visual_input.standardized,
+        }
         name = "-".join([*(change for change, made in changes.items() if made), FEATURES])
         with self._stages(identifier, replace(self.scene, lift=lift), views, name) as stages:
             yield stages.features.path
