@@ -1,17 +1,16 @@
 """States, caches and tensors in files: they come back, and no others do."""
 
-import math
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import save as to_bytes
 
-from avmsf._utils import caching, checkpoint
+from avmsf._utils import caching
 from avmsf._utils.checkpoint import Checkpoint
 from avmsf._utils.files import write_whole
 from avmsf._utils.headers import FileKind
-from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
+from avmsf._utils.tensor_files import read_tensors, write_tensors
 from avmsf.errors import AvmsfWarning, FieldFileError, FitError
 from factories.raising import raises, warns
 
@@ -104,20 +103,6 @@ def test_a_state_comes_back(tmp_path: Path) -> None:
         of(path / "below").save({})
 
 
-def test_without_a_path_nothing_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkpoint, "SAVE_SECONDS", -1.0)
-    of(None).save({"step": 3})
-    assert of(None).read() is None
-    assert not of(None).due
-    assert of(tmp_path / "state").due
-
-
-def test_the_state_of_other_work_is_refused_by_what_differs(tmp_path: Path) -> None:
-    of(tmp_path / "state", recordings="a").save({})
-    with raises(FitError, file="state", value=["recordings", "views"]):
-        of(tmp_path / "state", recordings="b", views="c").read()
-
-
 @pytest.mark.parametrize("kind", ["empty", "text", "cut", "list", "pickle"])
 def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "state"
@@ -138,11 +123,7 @@ def test_what_is_no_checkpoint_is_refused_and_kept(tmp_path: Path, kind: str) ->
 
 
 KIND = FileKind("kind", "a file", "make it again", FieldFileError, formats=(1,))
-SKELETON = {
-    "places": torch.empty(4, 3, dtype=torch.float64, device="meta"),
-    "rows": torch.empty(4, dtype=torch.int64, device="meta"),
-}
-PLACES, ROWS = torch.zeros(4, 3, dtype=torch.float64), torch.zeros(4, dtype=torch.int64)
+PLACES = torch.zeros(4, 3, dtype=torch.float64)
 
 
 @pytest.mark.parametrize(
@@ -168,19 +149,3 @@ def test_a_file_cut_short_or_of_another_kind_is_refused_as_a_missing_one_and_a_f
     for wrong in (path, tmp_path / "nowhere", tmp_path):
         with raises(FieldFileError, file=wrong):
             KIND.parse(read_tensors(wrong, KIND)[0], wrong)
-
-
-@pytest.mark.parametrize(
-    ("tensors", "name", "value"),
-    [
-        ({"places": PLACES, "lines": ROWS}, "rows", [["rows"], ["lines"]]),
-        ({"places": PLACES, "rows": ROWS, "lines": ROWS}, "lines", [[], ["lines"]]),
-        ({"places": PLACES[:3], "rows": ROWS}, "places", "float64[3, 3]"),
-        ({"places": PLACES.float(), "rows": ROWS}, "places", "float32[4, 3]"),
-        ({"places": PLACES - math.inf, "rows": ROWS}, "places", (-math.inf, -math.inf)),
-    ],
-)
-def test_the_tensor_at_fault_is_named(tensors: dict[str, torch.Tensor], name: str, value: object) -> None:
-    expect_tensors({"places": PLACES, "rows": ROWS}, SKELETON, Path("x"), KIND)
-    with raises(FieldFileError, file=Path("x"), name=name, value=value):
-        expect_tensors(tensors, SKELETON, Path("x"), KIND)

@@ -3,8 +3,6 @@
 import errno
 import math
 import os
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +13,7 @@ import torch
 from avmsf._utils.compiled import compiled
 from avmsf._utils.files import model_folder
 from avmsf._utils.text import MAX_TOML_BYTES, format_number, parse_json, read_json, read_text, read_toml
-from avmsf.errors import CaptureError, SceneError, download_failure, lacks_memory
+from avmsf.errors import CaptureError, SceneError, from_extra, lacks_memory
 from factories.raising import raises
 
 
@@ -107,34 +105,6 @@ def test_numbers_have_three_significant_digits() -> None:
     assert {value: format_number(value) for value in words} == words
 
 
-class Gate(BaseHTTPRequestHandler):
-    """Refuses everything, with the code that is the first part of the path."""
-
-    def do_HEAD(self) -> None:
-        self.send_error(int(self.path.split("/")[1]))
-
-    def do_GET(self) -> None:
-        self.do_HEAD()
-
-    def log_message(self, *_: object) -> None:
-        return
-
-
-@pytest.mark.parametrize("code", [401, 404, 503, None])
-def test_why_a_model_cannot_be_had_is_the_servers_code_or_that_there_is_none(tmp_path, monkeypatch, code):
-    client = pytest.importorskip("huggingface_hub")
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
-    with HTTPServer(("127.0.0.1", 0), Gate) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        place = "http://127.0.0.1:9" if code is None else f"http://127.0.0.1:{server.server_port}/{code}"
-        with pytest.raises(OSError) as caught:
-            client.snapshot_download("owner/model", cache_dir=tmp_path, endpoint=place)
-        server.shutdown()
-    assert download_failure(caught.value) == (
-        "the server cannot be reached" if code is None else f"the server answered with code {code}"
-    )
-
-
 def test_an_owner_and_a_model_are_a_name_and_a_path_is_none(tmp_path: Path) -> None:
     assert model_folder("laion/clap-htsat-unfused", "a model", raising=SceneError) is None
     assert model_folder(tmp_path, "a model", raising=SceneError) == tmp_path
@@ -163,3 +133,10 @@ def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(monkeypatch: pyte
     made = compiled(error_model="numpy")(twice)
     assert made(1.5) == 3.0
     assert made.stats.cache_path is None
+
+
+@pytest.mark.parametrize("cause", [ImportError, RuntimeError])
+def test_a_package_of_an_extra_is_named_with_how_to_install_it(cause: type[Exception]) -> None:
+    with raises(SceneError, name="pyuff") as caught, from_extra("uff", "pyuff", raising=SceneError):
+        raise cause
+    assert "pip install 'avmsf[uff]'" in str(caught.value)

@@ -3,7 +3,6 @@
 import errno
 import fcntl
 import os
-import pickle
 import resource
 import signal
 import subprocess
@@ -198,9 +197,3 @@ def test_a_disk_without_locks_gets_no_file_that_outlives_its_process(tmp_path, m
         monkeypatch.undo()
         with hold(tmp_path) as other:
             other.communicate()
-
-
-def test_a_refusal_can_be_sent_between_processes() -> None:
-    error = FolderInUseError.expected("a free folder", {"command": "avmsf splat"}, file=Path("mug"))
-    again = pickle.loads(pickle.dumps(error))
-    assert (str(again), again.attributes) == (str(error), error.attributes)

@@ -11,7 +11,7 @@ import pytest
 
 from avmsf._utils.parallel import MAX_STARTS, run_tasks, workers_at
 from avmsf._utils.processes import start_child
-from avmsf.errors import AvmsfError, FitError, WorkerError
+from avmsf.errors import FitError, WorkerError
 from factories.raising import raises
 from factories.running import gone
 
@@ -127,10 +127,6 @@ def test_workers_end_with_their_parent_however_that_ends(tmp_path: Path) -> None
     assert gone(numbers_in(file))
 
 
-def test_workers_that_cannot_be_had_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_cannot_be_had_are_named() -> None:
     with raises(FitError, name="workers", value=0):
         run(told, {}, count=0)
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with raises(AvmsfError, name="ray") as caught:
-        run(told, {}, address="auto")
-    assert "pip install 'avmsf[scale]'" in str(caught.value)

@@ -18,10 +18,9 @@ from avmsf.capture import read_capture
 from avmsf.cli import VERBS, main
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.paths import OutputError
-from avmsf.cli.report import mode_rows, mode_table
 from avmsf.errors import FitError
 from avmsf.field.store import load, save
-from avmsf.modal.modes import ForcePulse, ModalBank
+from avmsf.modal.modes import ForcePulse
 from factories.made_fields import directional, sounding
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.plate_field import CONTACT_TIME, HIGHEST, RATE
@@ -101,17 +100,6 @@ def test_modes_prints_the_plates(capture: Path, tmp_path: Path, capsys: Streams)
     assert sum(shares) == pytest.approx(1.0)
     assert (found["recordings"], found["sample_rate"]) == (8, RATE)
     assert (tmp_path / "modes.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_modes_of_most_energy_are_listed_or_all() -> None:
-    """The energy over time is proportional to the squared amplitude and to the decay time: here it rises with both."""
-    steps = torch.arange(20, dtype=torch.float64)
-    bank = ModalBank(100.0 * (steps + 1.0), 10.0 / (steps + 1.0))
-    rows, supporting = mode_rows(bank, steps - 19.0, steps > 0)
-    assert [row["number"] for row in supporting] == [1]
-    for every, numbers in ((False, range(20, 5, -1)), (True, range(20, 1, -1))):
-        lines = mode_table("", rows, 1, every=every).splitlines()[2:-1]
-        assert [int(line.split()[0]) for line in lines] == [*numbers]
 
 
 def test_a_quiet_verb_prints_its_table_alone(capture: Path, capsys: Streams) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import soundfile
 import torch
 from PIL import Image
 
@@ -21,9 +20,8 @@ from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.mesh.surface import Surface, surface_points
 from avmsf.photographs.folder import read_camera_file, write_frames
 from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced
-from factories.capture_folder import fill, ring
-from factories.plate_capture import PLATE, fill_plate
-from factories.plate_field import rectangle
+from factories.capture_folder import fill
+from factories.plate_capture import fill_plate
 from factories.raising import raises
 from factories.small_scene import slab, slab_views
 from factories.verbs import results_of
@@ -37,37 +35,6 @@ def test_no_settings_are_written_into_a_dataset(tmp_path: Path) -> None:
     fill(tmp_path / "cup")
     assert main(["check", str(tmp_path)]) == 0
     assert main(["check", str(tmp_path), "--write-settings"]) == 2
-
-
-@pytest.mark.parametrize(
-    ("replace", "words", "silent_words"),
-    [
-        # Which of two microphones holds the sound nothing tells, and nothing is measured that a table could show.
-        (
-            {f"{name}.wav": np.stack([ring(seed=row), ring(seed=9)], axis=1) for row, name in enumerate("abc")},
-            ("got different ones, 1 and 2; choose one by response_channel",),
-            ("proposed", "length (s)"),
-        ),
-        ({"b.wav": np.zeros(4000)}, ("remove its row", "length (s)"), ("response_channel",)),
-        # As docs/capture-format.md has it.
-        ({"b.wav": np.stack([ring(seed=1)] * 2, axis=1)}, (), ("b.wav: its channels",)),
-        ({"b.wav": np.stack([ring(seed=1), 0.5 * ring(seed=1)], axis=1)}, ("b.wav: its channels hold one sound",), ()),
-    ],
-)
-def test_what_is_said_of_channels_is_what_can_be_done(tmp_path, capsys, replace, words, silent_words):
-    main(["check", str(fill(tmp_path, replace=replace))])
-    said = capsys.readouterr().out
-    assert [each for each in words if each not in said] == []
-    assert [each for each in silent_words if each in said] == []
-
-
-def test_each_file_is_named_with_its_error_where_nothing_is_measured(tmp_path: Path, capsys: Streams) -> None:
-    folder = fill(tmp_path, sounds={f"{number}.wav": ring(seed=number) for number in range(6)})
-    for path in folder.glob("*.wav"):
-        path.write_bytes(b"no sound")
-    assert main(["check", str(folder)]) == 2
-    out = capsys.readouterr().out
-    assert [out.count(f"{number}.wav") for number in range(6)] == [1] * 6
 
 
 def fill_five(folder: Path, *, own_phases: int | None = None) -> Path:
@@ -92,23 +59,14 @@ def test_check_and_modes_report_one_alignment(tmp_path: Path, capsys: Streams) -
     assert found["not_aligned"] == []
 
 
-def test_what_is_wrong_with_the_alignment_or_the_decay_is_a_problem(tmp_path: Path, capsys: Streams) -> None:
+def test_what_is_wrong_with_the_alignment_is_a_problem(tmp_path: Path, capsys: Streams) -> None:
     folder = fill_five(tmp_path / "phases", own_phases=3)
     report, err = results_of(capsys, "check", folder)
     assert report["alignment"]["not_aligned"] == ["3.wav"]
     assert "no problem found" not in err
-    folder = fill_five(tmp_path / "faded")
-    for path in folder.glob("*.wav"):
-        sound, rate = soundfile.read(path)
-        soundfile.write(path, sound * np.minimum(1.0, np.linspace(2.0, 0.0, len(sound))), rate, subtype="FLOAT")
-    assert main(["check", str(folder)]) == 0
-    out = capsys.readouterr().out
-    assert "fade-out" in out
-    assert "no problem found" not in out
 
 
-STAGES = ("gaussians", "features", "surface")
-COMMANDS = ("check", "modes", "fit -o OUT.safetensors", *(f"fit --until {stage}" for stage in STAGES))
+COMMANDS = ("check", "fit -o OUT.safetensors")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -241,19 +199,6 @@ def in_centimeters(folder: Path) -> Path:
              (row.split(",") for row in rows)]  # fmt: skip
     (folder / "impacts.csv").write_text("\n".join([head, *map(",".join, cells), ""]))
     return folder
-
-
-def test_a_proposed_unit_is_a_problem_and_said_once(tmp_path: Path, capsys: Streams) -> None:
-    folder = in_centimeters(fill_plate(tmp_path / "plate", surface=False))
-    mesh = rectangle(PLATE)
-    Surface(100 * mesh.vertices, mesh.faces).write(folder / "surface.ply")
-    assert main(["check", str(folder)]) == 0
-    out = capsys.readouterr().out
-    assert out.splitlines()[-1] == "readable, with 1 warning"
-    assert (out.count('unit = "cm"'), out.count("20.4 m")) == (1, 1)
-    report, _ = results_of(capsys, "check", folder)
-    assert ["20.4 m apart" in each for each in report["problems"]] == [True]
-    assert [each["key"] for each in report["proposals"]] == ["unit"]
 
 
 def test_check_leads_to_the_unit_without_which_fit_refuses(tmp_path: Path, capsys: Streams) -> None:

@@ -24,7 +24,7 @@ from avmsf.errors import AvmsfError
 from avmsf.evaluation.clap import Clap
 from avmsf.fem.material import CERAMIC, GLASS, STEEL, WOOD
 from avmsf.field.gains.kernels import Sites
-from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
+from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ModalBank
 from factories.made_clap import save_clap
@@ -101,16 +101,6 @@ def test_a_material_by_its_name_with_pictures_sounds_and_numbers(field: Path, ca
     points = ceramic().gain_field.points[::2].double()
     ratios = new.render(2 * points).abs().amax(1) / ceramic().render(points).abs().amax(1)
     assert float((ratios - levels[1] / levels[0]).abs().min()) < 1e-4 * levels[1] / levels[0]
-
-
-def test_supporting_poles_are_no_modes_in_the_table(field: Path, capsys: Streams) -> None:
-    save(replace(ceramic(), origin=Origin("plate", report={SUPPORTING: [1]})), field)
-    told, shown = results_of(capsys, "edit", field, "-o", field.with_name("new.safetensors"), "--pitch", "1.1")
-    assert [row["frequency_before"] for row in told["supporting_poles"]] == pytest.approx([850.0])
-    assert len(told["modes"]) == 4
-    assert "4 modes, before and after" in shown
-    assert "390.00" in shown
-    assert "850.00" not in shown
 
 
 def of_corners(values: torch.Tensor) -> SoundField:

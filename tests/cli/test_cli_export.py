@@ -68,12 +68,6 @@ def table_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_mesh_goes_into_the_glb(field_file: Path, tmp_path: Path) -> None:
-    mesh, output = box(tmp_path / "plate.stl", 1000.0), tmp_path / "a.glb"
-    export(field_file, "gltf", output, "--object", mesh, "--object-unit", "mm", "--contacts", 20, "--up", "x")
-    assert shown_in(output).extents == pytest.approx([SIDES[1], SIDES[0], SIDES[2]], rel=1e-5)
-
-
 def gaussians(path: Path) -> GaussianCloud:
     cloud = random_cloud(positional().points[:40])
     write_splats(cloud, path)

@@ -185,15 +185,6 @@ def test_a_surface_is_drawn_with_two_cuts_through_its_middle(tmp_path: Path) -> 
         draw_surface(Surface(slab().vertices, torch.zeros(0, 3, dtype=torch.int64)), title="points")
 
 
-def test_contacts_are_drawn_in_the_view_and_near_each_cut() -> None:
-    a, b = PLATE.length, PLATE.width
-    contacts = torch.tensor([[0.1 * a, 0.5 * b, 0.0], [0.9 * a, 0.0, 0.0]], dtype=torch.float64)
-    whole, across_y, across_x = draw_surface(slab(), title="slab", contacts=contacts).axes
-    assert len(whole.lines[0].get_xdata()) == 2
-    assert np.asarray(across_y.lines[0].get_xydata()) == pytest.approx(np.array([[100 * a, 0.0]]))
-    assert len(across_x.lines[0].get_xdata()) == 0
-
-
 def test_the_picture_is_written_beside_the_surface_and_with_a_field(tmp_path: Path, capsys: Streams) -> None:
     folder = tmp_path / "slab"
     folder.mkdir()

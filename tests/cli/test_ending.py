@@ -271,19 +271,6 @@ def test_ctrl_c_keeps_what_is_done(fields, tmp_path, capsys, monkeypatch):
     assert states(capsys, *words) == {"a": "as before", "b": "done"}
 
 
-def test_a_long_stage_says_every_minute_how_far_it_is(capsys, monkeypatch):
-    now = 0.0
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
-    with ProgressDisplay() as shown:
-        for now in range(0, 150, 10):
-            shown.listener.step("gaussians", now, 200, "")
-        shown.listener.log("bodies: a wall")
-        now = 200.0
-        shown.listener.log("solving for 60 modes")
-    said = ["gaussians (60 of 200)", "gaussians (120 of 200)", "bodies: a wall ...", "solving for 60 modes"]
-    assert capsys.readouterr().err.splitlines() == said
-
-
 def test_of_many_a_file_that_the_command_did_not_make_is_not_replaced(captures, tmp_path):
     words = [*map(str, captures[:2]), "--until", "surface", "-o", str(tmp_path / "many")]
     made = tmp_path / "many" / f"{captures[0].name}.ply"

@@ -15,11 +15,9 @@ from avmsf.cli import VERBS, main, options_of
 from avmsf.cli.edit import Options as EditOptions
 from avmsf.cli.evaluate import Options as EvaluateOptions
 from avmsf.cli.fit import Options as FitOptions
-from avmsf.cli.paths import Existing, InputError
 from avmsf.cli.simulate import Options as SimulateOptions
 from avmsf.errors import AvmsfError
 from avmsf.field.store import save
-from avmsf.pipeline.config import CACHE, CACHED_FIELD
 from avmsf.simulate.recipe import named_recipe
 from factories.made_fields import positional, sounding
 from factories.plate_capture import fill_plate
@@ -94,17 +92,6 @@ def test_settings_that_cannot_be_meant_are_refused(words: str) -> None:
         options = options_of(verb, arguments)
         _ = options.all_settings
         options.check_inputs()
-
-
-def test_options_that_are_settings_now_lead_to_these() -> None:
-    for options, needed, old, new in (
-        (FitOptions, ["mug"], "--body.wall", "--set body.wall="),
-        (EvaluateOptions, ["farthest", "x"], "--geometry", "--set geometry="),
-        (EditOptions, ["field", "-o", "new"], "--steps", "--set guide.steps="),
-    ):
-        with raises(AvmsfError) as caught:
-            options.parse([*needed, old, "3"])
-        assert new in str(caught.value)
 
 
 def test_values_are_numbers_words_truth_values_and_lists_of_these() -> None:
@@ -237,13 +224,3 @@ def test_no_early_refusal_loads_torch(place: Path) -> None:
     command = [sys.executable, "-c", CODE, json.dumps([*EARLY])]
     ran = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=120, check=False)
     assert ran.returncode == 0, ran.stderr
-
-
-def test_the_field_that_a_folder_keeps_is_named(tmp_path: Path) -> None:
-    kept = tmp_path / CACHE / CACHED_FIELD
-    kept.parent.mkdir(parents=True)
-    for there in (False, True):
-        with raises(InputError, file=tmp_path, value="a folder") as caught:
-            Existing("a field", ("a sound field",)).check(tmp_path)
-        assert (str(kept) in str(caught.value)) == there
-        kept.touch()

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 import math
 import re
 from dataclasses import replace
@@ -184,11 +183,6 @@ def test_the_papers_ratio_is_of_its_own_rows() -> None:
     assert sum(map(len, PUBLISHED.values())) == 44
 
 
-def test_markdown_escapes_what_would_be_markup() -> None:
-    words = markdown([Section("a|b", ("x * y < z",), ("a", "b"), (("p|q", "1"),), frozenset({(0, 1)}))])
-    assert words == "# a\\|b\n\nx \\* y &lt; z\n\n| a | b |\n|---|---:|\n| p\\|q | **1** |\n"
-
-
 def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) -> None:
     time = torch.arange(4000) / 8000.0
     recorded = 3.0 * torch.sin(2 * math.pi * 440 * time)
@@ -261,11 +255,3 @@ def test_the_page_is_the_same_each_time_and_stays_small(evaluated: Path, monkeyp
     smaller = (evaluated / "report.html").read_text()
     assert len(smaller) < len(whole) / 2
     assert 0 < smaller.count("<audio") < whole.count("<audio")
-
-
-def test_times_and_failures_are_told(evaluated: Path) -> None:
-    times = json.loads((evaluated / "times.json").read_text())
-    assert set(times["a"]["methods"]) == {"knn3", "nearest", "paper"}
-    assert times["a"]["methods"]["knn3"]["render"] > 0
-    words = (evaluated / "report.md").read_text()
-    assert "| a | farthest | paper | a: nothing shows its look |" in words

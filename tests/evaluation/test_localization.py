@@ -13,7 +13,6 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from avmsf.baselines.diffsound.renderer import DiffSound
 from avmsf.capture import Impacts, read_capture
 from avmsf.cli import main
 from avmsf.datasets import CaptureCollection
@@ -22,7 +21,7 @@ from avmsf.editing.stable_audio import StableAudio
 from avmsf.errors import EvaluationError, LocationError
 from avmsf.evaluation import report
 from avmsf.evaluation.editing import PROMPTS, REALIMPACT_26, Edits, audible_modes, spectral_distance
-from avmsf.evaluation.localization import MAX_VERTICES, located, nearest_spectrum, published_distance, rendered_gains
+from avmsf.evaluation.localization import located, nearest_spectrum, published_distance, rendered_gains
 from avmsf.evaluation.methods import FieldMethod
 from avmsf.evaluation.mode_embedding import FEATURES, MaterialSpace
 from avmsf.evaluation.objects import ObjectInputs
@@ -129,26 +128,6 @@ def test_a_network_of_the_published_form_finds_its_own_recordings() -> None:
     found = located(field, train, train, points, published=True)[0]["rmed"]
     # Of what the network puts out, without regard to how it sounds, two thirds are off by more.
     assert sorted(found)[8] < 0.02
-
-
-def test_diffsound_searches_the_vertices_of_the_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
-    searched = []
-
-    def simulated(renderer: DiffSound, points: torch.Tensor) -> torch.Tensor:
-        searched.append(points)
-        return points
-
-    monkeypatch.setattr(DiffSound, "gains", simulated)
-    monkeypatch.setattr(DiffSound, "distance", lambda renderer, gains, sound: torch.zeros(len(gains)))
-    train, points = plate_impacts(), plate_features().points
-    vertices = torch.rand(MAX_VERTICES + 5000, 3, generator=torch.Generator().manual_seed(0))
-    renderer = object.__new__(DiffSound)
-    object.__setattr__(renderer, "sample_rate", train.sample_rate)
-    for given in (None, vertices[:100], vertices):
-        located(renderer, train, train, points, vertices=given)
-    assert [len(each) for each in searched] == [min(2000, len(points)), 100, MAX_VERTICES]
-    assert torch.equal(searched[1].float(), vertices[:100])
-    assert len(searched[2].unique(dim=0)) == MAX_VERTICES
 
 
 @pytest.mark.slow

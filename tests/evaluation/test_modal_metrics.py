@@ -309,7 +309,6 @@ def test_like_is_near_unlike_far_and_a_seed_gives_the_same_space():
     assert np.array_equal(again.embedding, space.embedding)
     assert {"umap-learn", "numba", "scikit-learn"} <= space.record()["versions"].keys()
     assert np.array_equal(again.place(random_bank(25, seed=99)), wood)
-    assert not np.array_equal(space_of(*labelled(), seed=4).embedding, space.embedding)
 
 
 @pytest.mark.parametrize(

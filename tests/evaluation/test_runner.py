@@ -1,13 +1,10 @@
 """Running an evaluation: kept as it goes, gone on with, never mixed, and the same however it is run."""
 
 import json
-import os
 import shutil
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -41,7 +38,7 @@ from avmsf.mesh import Surface
 from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.fit import fit
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
-from factories.delayed_plate import ALIGNED, delays, distance, strikes, without_delays
+from factories.delayed_plate import delays, strikes
 from factories.plate_field import QUICK
 from factories.plate_set import PlateInputs, fill_plates, plate_named
 from factories.raising import raises
@@ -282,19 +279,6 @@ def run_of(impacts: Impacts, folder: Path, own_starts: Impacts | None = None) ->
     return CaseRun(evaluation, ObjectData(evaluation, "a"), case, folder=folder, number=1, stores_sounds=False)
 
 
-def test_errors_of_baselines_do_not_depend_on_delays(tmp_path: Path) -> None:
-    starts = delays(STRIKES)
-    run = run_of(strikes(STRIKES, starts=starts), tmp_path / "delayed")
-    methods = [method_named(name) for name in ("nearest", "knn3", "knn-gains")]
-    found = [run.outcome(method) for method in methods]
-    other = run_of(without_delays(run.data.impacts, run.scored.modes(), starts), tmp_path / "exact")
-    for one, expected in zip(found, map(other.outcome, methods), strict=True):
-        assert one.failure is None
-        for metric in ("relative_stft", "l1", "envelope"):
-            assert one.values[metric] == pytest.approx(expected.values[metric], rel=2 * ALIGNED), (one.method, metric)
-    assert distance(run.scored.test.sounds, other.scored.test.sounds) < ALIGNED
-
-
 class NearestThree:
     """The built-in knn3 as somebody else would write it."""
 
@@ -358,73 +342,18 @@ def test_a_field_is_fitted_once_for_all_methods_of_a_case_and_its_time_is_its_ow
     assert paper > max(before, after)
 
 
-def evaluate_plates(data: Path, results: Path) -> None:
-    evaluation = planned(data, protocol="leave-one-out")
-    run_objects(evaluation, evaluation.inputs.dataset.objects(), ResultsFolder(results))
-    summed(results)
-
-
 @pytest.mark.slow
-def test_killed_twice_it_comes_to_the_same_summary(tmp_path: Path) -> None:
-    plates, place, counts = fill_plates(tmp_path / "plates", count=6), tmp_path / "killed", [0]
-
-    def kept() -> int:
-        return sum(path.read_text().count('"method"') for path in place.glob("objects/[!.]*.json"))
-
-    evaluate_plates(plates, tmp_path / "whole")
-    for _ in range(2):
-        child = get_context("spawn").Process(target=evaluate_plates, args=(plates, place))
-        child.start()
-        while child.is_alive() and kept() == counts[-1]:
-            time.sleep(0.001)
-        child.kill()
-        child.join()
-        assert child.exitcode == -signal.SIGKILL, "it came midway"
-        counts.append(kept())
-    # Nothing that was there was lost.
-    assert counts == sorted(counts)
-    evaluate_plates(plates, place)
-    whole, resumed = (json.loads((folder / "summary.json").read_text()) for folder in (tmp_path / "whole", place))
-    assert resumed == whole
-    assert set(whole["methods"]) == set(CHEAP)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("address", [None, "local"])
-def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path, address: str | None) -> None:
-    if address is not None:
-        pytest.importorskip("ray")
+def test_many_at_a_time_come_to_the_same_figures(plates: Path, tmp_path: Path) -> None:
     heard = list[int]()
     evaluation = planned(plates, *CHEAP, "spline-gains")
-    # Workers of ray find what the package holds, and not what lies beside the tests.
-    dataset, kept = evaluation.inputs.dataset, tmp_path / "features"
-    evaluation = replace(evaluation, inputs=ObjectInputs(dataset, kept))
-    objects = dataset.objects()
+    objects = evaluation.inputs.dataset.objects()
     run_objects(evaluation, objects, ResultsFolder(tmp_path / "one"))
     many = ResultsFolder(tmp_path / "many")
     listen: Progress = lambda message, done, total: heard.append(done)  # noqa: E731
-    run_objects(evaluation, objects, many, workers=2, address=address, progress=listen)
+    run_objects(evaluation, objects, many, workers=2, progress=listen)
     assert heard == sorted(heard)
     assert {*heard} == {0, 1, 2, 3}
     one, other = summed(tmp_path / "one"), summed(tmp_path / "many")
     for method, figures in one["methods"].items():
         assert other["methods"][method] == figures
     assert one["failures"] == other["failures"] == []
-
-
-@pytest.mark.slow
-def test_an_object_whose_processes_are_killed_costs_no_other_its_results(plates: Path, tmp_path: Path) -> None:
-    results, evaluation = ResultsFolder(tmp_path), planned(plates, "knn3", FunctionMethod("dying", die_at_b))
-    run_objects(evaluation, ("a", "b"), results, workers=2)
-    (failure,) = summed(tmp_path)["failures"]
-    assert (failure["object"], failure["method"]) == ("b", None)
-    assert "SIGKILL" in failure["failure"]
-    assert [[each.method for each in record.outcomes] for record in results.records()] == [["knn3", "dying"], ["knn3"]]
-    run_objects(planned(plates, "knn3"), ("a", "b"), results)
-    assert summed(tmp_path)["failures"] == []
-
-
-def die_at_b(task: Task) -> Renderer:
-    if task.name == "b":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return NearestRecording(task.train)

@@ -163,15 +163,6 @@ def test_few_sites_make_a_function_that_does_not_run_away() -> None:
         assert float(gains_of(few, far).abs().max()) < 20.0
 
 
-def test_a_spline_belongs_to_the_object_and_not_to_its_frame_or_order() -> None:
-    points, elsewhere = scattered(20), scattered(30, seed=1)
-    straight = gains_of(spline(points, bumps(points)), elsewhere)
-    moved = [each @ rotation().T + torch.tensor([1.0, -2.0, 0.5]) for each in (points, elsewhere)]
-    assert torch.allclose(gains_of(spline(moved[0], bumps(points)), moved[1]), straight, rtol=0, atol=1e-9)
-    rows = torch.randperm(20, generator=torch.Generator().manual_seed(0))
-    assert torch.allclose(gains_of(spline(points[rows], bumps(points)[rows]), elsewhere), straight, rtol=0, atol=1e-9)
-
-
 def test_impacts_in_one_position_count_as_their_mean() -> None:
     points, elsewhere = scattered(10), scattered(30, seed=1)
     values = bumps(points)

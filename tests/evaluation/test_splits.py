@@ -31,7 +31,6 @@ from avmsf.evaluation.splits import (
     Predefined,
     Shots,
     align_split,
-    evenly_spaced,
     split,
 )
 from avmsf.features.encoder import Encoder, ImageDescriptors
@@ -193,14 +192,6 @@ def test_what_cannot_be_split_is_refused(what: str) -> None:
     call, name, value = REFUSED[what]
     with raises(EvaluationError, name=name, value=value):
         call()
-
-
-@pytest.mark.parametrize(("count", "wanted"), [(10, 3), (3, 3), (2, 8), (7, 1), (33, 8)])
-def test_evenly_spaced_rows_are_distinct_and_within(count: int, wanted: int) -> None:
-    rows = evenly_spaced(count, wanted)
-    assert rows == sorted(set(rows))
-    assert len(rows) == min(count, wanted)
-    assert set(rows) <= set(range(count))
 
 
 def test_all_methods_of_all_protocols_are_known_and_the_baseline_takes_part() -> None:

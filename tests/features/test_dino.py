@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -131,10 +130,3 @@ def test_a_folder_that_is_no_model_is_refused(folder, tmp_path, damage, file, na
     with raises(SceneError, file=file) as caught:
         load(copy)
     assert (name or "") in (caught.value.name or "")
-
-
-def test_a_missing_package_is_named(folder, monkeypatch):
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    for source in (folder, MODELS[1]):
-        with raises(SceneError, name="transformers"):
-            DinoEncoder.load(source)

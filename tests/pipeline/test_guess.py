@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import avmsf
-from avmsf.cli import main
 from avmsf.editing.material import infer_material
 from avmsf.errors import FitError, SimulationError
 from avmsf.export import SampledField
@@ -22,7 +21,6 @@ from avmsf.pipeline.bodies import expect_no_recordings, guess_field
 from avmsf.pipeline.config import BodyConfig, PipelineConfig
 from factories.made_modes import breathing_sphere
 from factories.raising import raises
-from factories.verbs import sets
 from oracles.block import block
 
 LENGTH, WIDTH, HEIGHT = 0.3, 0.02, 0.012
@@ -143,13 +141,3 @@ def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):
     for each in made:
         torch.testing.assert_close(each.bank.frequency, bar().bank.frequency, rtol=1e-4, atol=0)
     assert [path.name for path in tmp_path.iterdir()] == ["bar.ply"]
-
-
-def test_a_mesh_and_a_material_give_a_field_from_the_command_line(tmp_path: Path):
-    box(LENGTH, WIDTH, HEIGHT).write(tmp_path / "surface.ply")
-    words = ["fit", str(tmp_path), "--material", "steel", *sets("modes=12 body.dofs=6000")]
-    words += ["--output", str(tmp_path / "field.safetensors")]
-    assert main(words) == 0
-    found = load(tmp_path / "field.safetensors").bank.frequency
-    torch.testing.assert_close(found, bar().bank.frequency, rtol=5e-3, atol=0)
-    assert main([*words, "--train-count", "3"]) == 2

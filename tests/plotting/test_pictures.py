@@ -17,12 +17,11 @@ from avmsf.localization.contact_map import ContactPosterior
 from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank, synthesize
 from avmsf.plotting.edits import draw_clap_curves
-from avmsf.plotting.objects import ALL_SIDES, AROUND, component_colors, draw_cloud, view_from
+from avmsf.plotting.objects import ALL_SIDES, component_colors, draw_cloud, view_from
 from avmsf.plotting.pictures import draw_gains, draw_modes, draw_spectrograms, log_spectrogram, save_picture
 from avmsf.plotting.style import FIRST, SECOND
 from avmsf.plotting.uncertainty import contact_colors, draw_contact, draw_uncertainty
 from avmsf.symmetry.symmetries import MirrorSymmetry, RotationalSymmetry, Symmetries
-from factories.believing_field import bar_contacts, bar_points, drawn_gains, elastic_field, sound_field
 from factories.made_fields import BANK, positional, sounding
 from factories.raising import raises
 
@@ -105,19 +104,6 @@ FOUND = Symmetries(
 )
 
 
-def test_a_sheet_has_a_row_for_each_set_of_colors_and_a_column_for_each_side():
-    rows = {"color": torch.rand(300, 3), "features": component_colors(torch.randn(300, 8, generator=GENERATOR))}
-    figure = draw_cloud(POINTS, rows, title="a box", symmetries=FOUND, sides=((0.0, 25.0), (90.0, 25.0)))
-    titles = [axes.get_title() for axes in figure.axes]
-    assert titles == [
-        f"{name}\nazimuth {azimuth}°, elevation 25°"
-        for name in ("color", "features", "symmetries")
-        for azimuth in (0, 90)
-    ]
-    assert all(len(axes.collections[0].get_offsets()) == 300 for axes in figure.axes)
-    assert [len(axes.lines) for axes in figure.axes] == [0] * 4 + [2, 2]
-
-
 def test_an_axis_and_a_plane_are_drawn_where_they_are():
     figure = draw_cloud(POINTS, {}, title="a box", symmetries=FOUND, sides=((90.0, 25.0),))
     plane, axis = figure.axes[0].lines
@@ -171,11 +157,6 @@ def test_colors_follow_the_principal_components():
     # Two components fill two colors; the third stays gray.
     assert bool((colors[:, 2] == 0.5).all())
     assert bool((component_colors(torch.ones(9, 4)) == 0.5).all())
-
-
-def test_what_cannot_be_drawn_is_refused():
-    with raises(EvaluationError, value=(len(POINTS), 0, len(AROUND))):
-        draw_cloud(POINTS, {}, title="")
 
 
 SAMPLES = 3000
@@ -280,31 +261,10 @@ def test_every_sound_is_scaled_to_a_peak_of_one() -> None:
     assert recorded.max() == pytest.approx(20 * math.log10(0.01 / 7.0), abs=1e-4)
 
 
-def test_slow_recordings_end_at_half_their_rate() -> None:
-    # Kept sounds of slow recordings are resampled to a rate that browsers play.
-    sounds = {"recorded": tone(100, seconds=0.5, rate=8000.0)}
-    figure = draw_spectrograms({"wing": sounds}, ["recorded"], sample_rate=8000.0, highest=200.0, title="wing")
-    axes = figure.axes[0]
-    assert axes.get_ylim() == pytest.approx((4.0, 200.0))
-    assert axes.get_xlim() == pytest.approx((0.0, 0.5))
-
-
 def test_a_full_scale_sine_reads_a_quarter_of_the_fft_size() -> None:
     levels = log_spectrogram(tone(1000 * RATE / 44100), sample_rate=RATE, lowest=20.0, highest=20000.0)
     # A sine between two bins of a Hann window loses at most 1.42 dB.
     assert float(levels.max()) == pytest.approx(20 * math.log10(2048 / 4), abs=1.43)
-
-
-def test_pictures_are_drawn_of_solids_and_of_sheets() -> None:
-    contacts = bar_contacts(8)
-    field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=9)))
-    points = bar_points()
-    std = field.relative_gain_std(points)
-    sheet = draw_uncertainty(points, std, title="bar", contacts=contacts, suggested=contacts[:2])
-    assert len(sheet.axes) == 2  # the sheet and its colors
-    bent = points + torch.tensor([0.0, 0.0, 1.0]) * points[:, :1].square()
-    solid = draw_uncertainty(bent, std, title="bent", suggested=contacts[:3])
-    assert len(solid.axes) == 7
 
 
 def test_marks_behind_the_object_are_not_drawn() -> None:

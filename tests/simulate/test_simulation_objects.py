@@ -14,7 +14,7 @@ from avmsf._utils.caching import key_of
 from avmsf.capture import read_capture
 from avmsf.capture.audio import read_recording
 from avmsf.capture.onset import find_onset
-from avmsf.cli import main, simulate
+from avmsf.cli import simulate
 from avmsf.errors import SimulationError
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
@@ -285,16 +285,6 @@ def test_a_set_killed_half_way_goes_on_and_refuses_to_mix(recipe, cache, tmp_pat
         simulate_set({"first": replace(recipes["first"], seed=9, noise_db=-20.0)}, tmp_path)
 
 
-def test_the_command_says_whether_it_wrote(simulation, recipe, tmp_path, capsys):
-    write_simulation(simulation, tmp_path / "tile")
-    names = ("thickness", "detail", "elastic_modes", "impacts", "seconds", "sample_rate", "views", "view_size")
-    settings = (word for name in names for word in ("--set", f"{name}={getattr(recipe, name)}"))
-    assert main(["simulate", "--mesh", str(recipe.mesh), "-o", str(tmp_path / "tile"), *settings]) == 0
-    said = capsys.readouterr()
-    assert "nothing was written" in said.out
-    assert "wrote" not in said.out.replace("nothing was written", "") + said.err
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -345,11 +335,6 @@ def test_the_command_makes_an_object_of_a_mesh_and_keeps_it(recipe: ObjectRecipe
     assert len(read_capture(tmp_path / "mine").impacts) == 4
     with raises(SimulationError, file=tmp_path / "mine", value=["seed"]):
         simulate.run(simulate.Options.parse([*words, "--seed", "3"]))
-
-
-def test_the_command_refuses_what_it_does_not_know() -> None:
-    with raises(SimulationError, name="object", value="mug-ceramics"):
-        simulate.run(simulate.Options.parse(["mug-ceramics", "--output", "nowhere"]))
 
 
 def test_what_is_asked_of_a_named_object_holds_though_it_is_the_usual() -> None:

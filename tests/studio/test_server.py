@@ -1,6 +1,5 @@
 """The server as the page uses it: struck, located, edited, recorded, and ended."""
 
-import base64
 import io
 import json
 import os
@@ -22,13 +21,9 @@ import soundfile
 import torch
 import trimesh
 
-from avmsf.editing.material import change_material
 from avmsf.editing.modal_edit import adjust_modes
 from avmsf.errors import StudioError
-from avmsf.fem.material import CERAMIC, WOOD
-from avmsf.field.store import load, save
-from avmsf.localization.locate import locate_impacts
-from avmsf.localization.locator import Locator
+from avmsf.field.store import save
 from avmsf.studio.opening import open_target
 from avmsf.studio.server import listen, serve
 from avmsf.studio.studio import StudioConfig
@@ -57,64 +52,6 @@ def tensor(running: Served, manifest: Any, name: str) -> np.ndarray:
     content = running.get(told["file"]).content[told["offset"] :]
     count = int(np.prod(told["shape"]))
     return np.frombuffer(content, np.dtype(told["dtype"]).newbyteorder("<"), count).reshape(told["shape"])
-
-
-def test_the_page_gets_the_field_that_is_open(plate: Served) -> None:
-    manifest = plate.manifest()
-    assert manifest["live"]["revision"] == 1
-    assert manifest["live"]["rows"] == [0, 1, 2, 3, 4]
-    assert {"locate", "edit", "save"} <= set(manifest["live"]["abilities"])
-    assert "capture" not in manifest["live"]["abilities"]
-    field = plate_field("elastic")
-    for name in ("frequency", "damping"):
-        assert np.array_equal(tensor(plate, manifest, name), getattr(field.bank, name).numpy())
-    points, sine, cosine = (tensor(plate, manifest, name) for name in ("points", "sine", "cosine"))
-    gains = field.known(torch.from_numpy(points.copy())).mean.numpy()
-    np.testing.assert_allclose(sine + 1j * cosine, gains, rtol=0, atol=1e-5 * np.abs(gains).max())
-    assert np.array_equal(tensor(plate, manifest, "noise"), field.noise().numpy())
-
-
-def test_a_recorded_blow_is_located_as_the_task_does(plate: Served) -> None:
-    manifest = plate.manifest()
-    points = torch.from_numpy(tensor(plate, manifest, "points").copy())
-    field = plate_field("elastic")
-    for row in (5, 80):
-        sound = torch.cat([torch.zeros(200), field.render(points[row : row + 1])[0]])
-        answer = plate.ask("POST", "locate", wav(sound.numpy()))
-        assert answer.status == 200
-        [found] = answer.words["impacts"]
-        [(seconds, expected)] = locate_impacts(field, sound, locator=Locator.of(field, points=points))
-        assert (found["row"], found["seconds"]) == (expected.most_probable, seconds)
-        probability = np.frombuffer(base64.b64decode(found["probability"]), "<f4")
-        assert np.array_equal(probability, expected.probability.float())
-        assert found["explained_energy"] > 0.95
-
-
-def test_an_edit_is_heard_undone_and_saved(plate: Served) -> None:
-    before = plate.manifest()
-    words = {"base": 1, "material": {"from": "ceramic", "to": "wood"}, "size": 2.0}
-    told = plate.ask("POST", "edit", words).words
-    assert told["revision"] == 2
-    assert "Poisson's ratio" in told["remarks"][0]
-    after = plate.manifest()
-    expected = change_material(plate_field("elastic"), CERAMIC, WOOD, size=2.0)
-    assert np.allclose(tensor(plate, after, "frequency"), expected.bank.frequency, rtol=1e-12)
-    # The page shows the object as it was; where a place sounds is on the object as it is now.
-    points = torch.from_numpy(tensor(plate, before, "points").copy())
-    assert np.array_equal(tensor(plate, after, "points"), points)
-    gains = expected.known(2.0 * points.double())
-    assert np.allclose(tensor(plate, after, "sine"), gains.mean.real, atol=1e-5 * float(gains.mean.abs().max()))
-    assert after["live"]["undo"]
-    assert after["live"]["sliders"]["size"] == 2.0
-    # Who still reads the revision before gets its own numbers.
-    assert np.array_equal(tensor(plate, before, "frequency"), plate_field("elastic").bank.frequency)
-
-    saved = plate.ask("POST", "save", {"base": 2, "name": "wooden"})
-    assert saved.status == 201
-    assert torch.equal(load(saved.words["file"]).bank.frequency, expected.bank.frequency)
-    undone = plate.ask("POST", "undo", {"base": 3}).words
-    assert undone["revision"] == 4
-    assert np.array_equal(tensor(plate, plate.manifest(), "frequency"), plate_field("elastic").bank.frequency)
 
 
 def test_a_blow_on_an_edited_object_is_located_in_the_pages_frame(plate: Served) -> None:

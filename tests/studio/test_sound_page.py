@@ -373,20 +373,6 @@ def test_resampling_keeps_a_tone(any_page: "Page", tone: int, rate: int) -> None
 
 
 @pytest.mark.parametrize(
-    ("impact", "words"),
-    [
-        ({"row": 6}, "expected 0 to 5, got 6"),
-        ({"row": 0.5}, "expected 0 to 5, got 0.5"),
-        ({"row": 0, "contactTime": -1}, "expected 0 to 10 s, got -1"),
-        ({"row": 0, "shape": "box"}, "expected half-sine or hertz, got box"),
-    ],
-)
-def test_impacts_that_are_none_are_refused(any_page: "Page", impact: dict[str, Any], words: str) -> None:
-    said = any_page.evaluate("(impact) => renderOffline(bundle, [impact]).catch((error) => error.message)", impact)
-    assert words in said
-
-
-@pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"format": 2}, "expected a field of format 1, got 2"),

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import torch
@@ -14,8 +13,7 @@ from torch import Tensor
 
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError
-from avmsf.modal.config import ExtractionMethod
-from avmsf.modal.extraction.extract import FINDERS, Extraction, extract_modes, extract_once, extract_sounds
+from avmsf.modal.extraction.extract import Extraction, extract_modes, extract_once, extract_sounds
 from avmsf.modal.extraction.finders import HighResolution, lowest_frequency
 from avmsf.modal.extraction.stft import ShortTime
 from avmsf.modal.modes import ModalBank, synthesize
@@ -156,15 +154,6 @@ def test_a_single_sound_is_enough_without_its_contact():
     assert float((found.bank.frequency[:, None] / truth.frequency - 1).abs().amin(1).median()) < 1e-4
 
 
-def test_the_papers_method_finds_the_plates_strong_modes():
-    impacts, truth = recorded(-40.0)
-    found = extract_modes(impacts, ShortTime())
-    energy = matched(found.bank, truth)[2]
-    strongest = truth.frequency[energy.argsort(descending=True)[:6]]
-    # A bin is 8 Hz wide.
-    assert float((found.bank.frequency[:, None] - strongest).abs().amin(0).max()) < 4.0
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("contacts", [2, 8])
 def test_noise_is_blamed(seed: int, contacts: int):
@@ -227,7 +216,3 @@ def test_the_same_sounds_give_the_same_modes_to_the_last_bit() -> None:
     first, second = (extract_sounds(each, sample_rate=20000.0).bank for each in (sounds, shifted))
     assert torch.equal(first.frequency, second.frequency)
     assert torch.equal(first.damping, second.damping)
-
-
-def test_every_named_method_has_a_finder():
-    assert set(FINDERS) == set(get_args(ExtractionMethod))
