@@ -39,7 +39,7 @@ from avmsf.evaluation.registry import METHODS, MethodEntry
 from avmsf.evaluation.task import Task
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.mesh.points import farthest_points
-from avmsf.modal.clips import resampled, with_length
+from avmsf.modal.spectra import resampled, with_length
 
 RATE = 32_000.0
 """Hz."""

@@ -9,7 +9,7 @@ import torch
 from avmsf.editing.config import DistillationConfig
 from avmsf.editing.distillation import DecoderDistillation, noised, partial_denoising
 from avmsf.errors import EditError
-from avmsf.modal.clips import levelled
+from avmsf.modal.spectra import levelled
 from factories.raising import raises
 from factories.ringing_field import RATE, ringing_field, sound_of
 

@@ -15,7 +15,7 @@ from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.reference import Reference, band_spectrum, gain_slope
 from avmsf.errors import AvmsfWarning, EditError
 from avmsf.fem.material import CERAMIC, WOOD
-from avmsf.modal.clips import level, levelled, with_length
+from avmsf.modal.spectra import level, levelled, with_length
 from factories.raising import raises, warns
 from factories.ringing_field import RATE, SameGains, ringing_field, sound_of
 

@@ -31,8 +31,7 @@ from avmsf.evaluation.registry import MetricSettings, resolve
 from avmsf.evaluation.scores import Scores, evaluate, metric_values
 from avmsf.evaluation.simple_methods import MeanWaveform, NearestRecording, WhiteNoise
 from avmsf.evaluation.splits import split
-from avmsf.modal.clips import resampled
-from avmsf.modal.spectra import magnitude_stft
+from avmsf.modal.spectra import magnitude_stft, resampled
 from factories.plate_field import plate_impacts
 from factories.raising import raises
 

@@ -33,7 +33,7 @@ def field() -> SoundField:
 
 def test_a_sound_is_its_modes_and_the_noise():
     sound_field = field()
-    assert float(sound_field.dampings(CONTACTS).std(0).min()) > 1e-3
+    assert float(sound_field.known(CONTACTS).dampings(sound_field.bank.damping).std(0).min()) > 1e-3
     sounds = sound_field.render(CONTACTS)
     noise = (sounds - sound_field.render(CONTACTS, noise=False)).double()
     # Float32 sounds: the same noise is left at all contacts, to a millionth of the loudest sample.

@@ -213,15 +213,13 @@ def test_only_the_beginning_counts_where_only_that_is_asked_for():
     assert bool((made.grad[:, :300] != 0).all())
 
 
-def test_other_sounds_and_odd_transforms_are_refused():
+def test_other_sounds_are_refused():
     target = spectral_target(sounds(), fft_sizes=SIZES, hops=HOPS, samples=5000)
     # A beginning longer than the sound is the sound.
     assert target.samples == 1000
     for other in (sounds(2), sounds(samples=900)):
         with pytest.raises(ValueError):
             spectral_loss(other, target)
-    with pytest.raises(ValueError):
-        spectral_target(sounds(), fft_sizes=(64, 63), hops=(16, 16))
 
 
 def test_a_step_has_the_loss_and_gradient_of_the_plain_product_of_gains_and_atoms():

@@ -1,6 +1,5 @@
 """Bodies behind a surface as hypotheses: what they predict, and which of them is made finer."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -19,7 +18,7 @@ from avmsf.field.config import FitConfig, GainModelName
 from avmsf.field.fit import fit
 from avmsf.field.gains.data import GainData, gain_data, gain_variance
 from avmsf.field.gains.estimator import MixtureEstimator, estimator_for
-from avmsf.field.probable_body import ProbableBody
+from avmsf.field.quality import ProbableBody
 from avmsf.mesh.level_set import difference
 from avmsf.mesh.surface import Surface
 from avmsf.modal.extraction.extract import Extraction
@@ -162,33 +161,24 @@ def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
         assert float(gain_variance(made)) == pytest.approx(scatter, rel=0.1)
 
 
-def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> CandidateBody:
-    """Return the true wall's body with its surface elsewhere."""
-    body = bodies()[1]
-    return replace(body, elastic=replace(body.elastic, nodes=move(body.elastic.nodes)))
-
-
-def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_told() -> None:
-    body = moved_body(lambda x: 1000.0 * x)
-    report = estimator(body).solve(case())[0].report
-    assert report["bodies"] == []
+def test_contacts_that_do_not_lie_on_the_surface_have_no_bodies_and_the_remedy_is_told() -> None:
     with raises(FitError, name="contacts") as caught:
-        estimator(body, kinds=("elastic",)).solve(case())
-    assert report["unavailable"]["elastic"] == str(caught.value)
+        candidate_bodies(Surface(1000.0 * dome().vertices, dome().faces), impacts=recorded(12)[0])
     assert 'unit "mm"' in str(caught.value)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 12])
 def test_bodies_take_part_despite_rough_surfaces_thick_glue_and_a_wrong_row(count: int) -> None:
-    generator = torch.Generator().manual_seed(4)
-    contacts = recorded(count)[0].contacts
+    impacts, generator = recorded(count)[0], torch.Generator().manual_seed(4)
     size = float((points().amax(0) - points().amin(0)).norm())
-    rough = moved_body(lambda x: x + 0.02 * size * torch.randn(x.shape, generator=generator, dtype=x.dtype))
-    above = contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
+    noise = torch.randn(dome().vertices.shape, generator=generator)
+    rough = Surface(dome().vertices + 0.02 * size * noise, dome().faces)
+    above = impacts.contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
     above[-1] += 0.5 * size
-    for body, each in ((rough, contacts), (bodies()[1], above)):
-        assert estimator(body).solve(case(count, contacts=each))[0].report["bodies"]
+    for surface, contacts in ((rough, impacts.contacts), (dome(), above)):
+        config = BodyConfig(wall=0.004, shapes=6, dofs=2000)
+        assert candidate_bodies(surface, config, impacts=replace(impacts, contacts=contacts)).bodies
 
 
 def no_symmetries() -> None:

@@ -17,7 +17,7 @@ from avmsf.editing.config import DistillationConfig, check_prompt
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
 from avmsf.editing.stable_audio import Latents, StableAudio
 from avmsf.errors import EditError
-from avmsf.modal.clips import Sounds, levelled, resampled, with_length
+from avmsf.modal.spectra import Sounds, levelled, resampled, with_length
 
 
 def noised(clean: Latents, noise: Latents, level: Float[Tensor, " contacts"]) -> Latents:

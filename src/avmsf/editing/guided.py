@@ -19,8 +19,8 @@ from avmsf.errors import EditError
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.points import farthest_points
-from avmsf.modal.clips import Sounds, level
 from avmsf.modal.config import scaled_fft_size
+from avmsf.modal.spectra import Sounds, level
 
 _DEVIATIONS = {"shift": 0.05, "damping_shift": 0.3, "scale": 1.0}
 """Standard deviations of what single modes have of their own, logarithms: of frequencies, almost a semitone; of

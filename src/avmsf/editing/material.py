@@ -20,7 +20,7 @@ from avmsf._utils.text import counted
 from avmsf.editing.modal_edit import EDITS, Slider, adjust_modes, edited, muted
 from avmsf.errors import EditError
 from avmsf.fem.material import MATERIALS, Material, material_named
-from avmsf.field.probable_body import ProbableBody
+from avmsf.field.quality import ProbableBody
 from avmsf.field.sound_field import Origin, SoundField
 from avmsf.modal.modes import ModalBank
 

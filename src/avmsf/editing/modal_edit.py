@@ -14,8 +14,8 @@ from avmsf.errors import EditError
 from avmsf.field.gains.model import Gains
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.clips import Sounds
 from avmsf.modal.modes import ModalBank
+from avmsf.modal.spectra import Sounds
 
 EDITS = "edits"
 """Key of a field's report that lists its edits, in order."""

@@ -22,9 +22,9 @@ from avmsf.errors import AvmsfWarning, CaptureError, EditError
 from avmsf.fem.material import Material
 from avmsf.field.losses import spectral_loss, spectral_target
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.clips import Sounds, levelled, resampled, with_length
 from avmsf.modal.config import scaled_fft_size
 from avmsf.modal.modes import synthesize
+from avmsf.modal.spectra import Sounds, levelled, resampled, with_length
 
 _HELD = 0.9
 """Part of half a recording's rate up to which it still holds all of a sound."""

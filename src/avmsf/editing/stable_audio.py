@@ -24,7 +24,7 @@ from avmsf._utils.device import usable_device
 from avmsf._utils.files import model_folder
 from avmsf.editing.config import STABLE_AUDIO, check_prompt
 from avmsf.errors import EditError, download_failure, from_extra
-from avmsf.modal.clips import with_length
+from avmsf.modal.spectra import with_length
 
 Latents = Float[Tensor, "contacts dim frames"]
 """What the autoencoder makes of waveforms."""

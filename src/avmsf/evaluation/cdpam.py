@@ -19,7 +19,7 @@ from torch.nn.functional import conv1d, leaky_relu, normalize
 
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.metrics import PerContact, validate, validate_sounds
-from avmsf.modal.clips import resampled
+from avmsf.modal.spectra import resampled
 
 SAMPLE_RATE = 22050.0
 """Hz that sounds are resampled to (polyphase)."""

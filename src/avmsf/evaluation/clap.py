@@ -22,7 +22,7 @@ from avmsf._utils.files import model_folder
 from avmsf.editing.guided import PreviewScore
 from avmsf.errors import EvaluationError, download_failure, from_extra
 from avmsf.evaluation.metrics import PerContact, validate_sounds
-from avmsf.modal.clips import resampled
+from avmsf.modal.spectra import resampled
 
 DEFAULT: Final = "laion/clap-htsat-unfused"
 """The hub's name of the network that scores are taken with unless another is named."""

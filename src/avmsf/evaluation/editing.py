@@ -43,10 +43,10 @@ from avmsf.evaluation.splits import Case
 from avmsf.evaluation.task import Contacts, Sounds, Task
 from avmsf.fem.material import material_named
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.clips import level, with_length
 from avmsf.modal.extraction.extract import extract_once, extract_sounds
 from avmsf.modal.extraction.finders import ModeFinder
 from avmsf.modal.modes import ModalBank
+from avmsf.modal.spectra import level, with_length
 
 _AUDIBLE_DB = -60.0
 """Energy relative to the strongest mode's, decibels, below which a mode is inaudible."""

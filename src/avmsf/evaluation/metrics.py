@@ -22,7 +22,7 @@ from torch import Tensor
 
 from avmsf.errors import EvaluationError
 from avmsf.modal.config import scaled_fft_size
-from avmsf.modal.spectra import envelope, htk_filters, log_mel, magnitude_stft
+from avmsf.modal.spectra import envelope, htk_filters, magnitude_stft
 
 # `validate` reports shapes that differ, so the annotations leave them open.
 Sounds = Float[Tensor, "..."]
@@ -131,10 +131,10 @@ def log_mel_distance(predicted: Sounds, truth: Sounds, *, sample_rate: float) ->
     sizes = PAPER_FFT_SIZE, PAPER_HOP, PAPER_MELS
     size, step, bands = (scaled_fft_size(each, sample_rate=sample_rate) for each in sizes)
     bands = min(bands, PAPER_MELS)
-    filters = htk_filters(bands, fft_size=size, sample_rate=sample_rate, lowest=0.0, highest=sample_rate / 2)
+    filters = htk_filters(bands, fft_size=size, sample_rate=sample_rate)
 
     def mels(sounds: Float64[Tensor, "contacts samples"]) -> Float64[Tensor, "contacts mels frames"]:
-        return log_mel(sounds, filters, fft_size=size, hop=step, floor=PAPER_FLOOR)
+        return torch.log(torch.clamp(filters @ magnitude_stft(sounds, fft_size=size, hop=step), min=PAPER_FLOOR))
 
     return _blockwise(lambda a, b: (mels(a) - mels(b)).abs().mean(dim=(1, 2)), predicted, truth)
 

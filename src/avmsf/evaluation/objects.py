@@ -27,7 +27,7 @@ from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import read_splats
 from avmsf.mesh.surface import Surface
-from avmsf.modal.clips import resampled, with_length
+from avmsf.modal.spectra import resampled, with_length
 from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, PRESETS, BodyConfig, Geometry, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages

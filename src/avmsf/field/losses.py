@@ -59,12 +59,9 @@ def spectral_target(
 ) -> SpectralTarget:
     """Return the magnitudes of `sounds`, or of their first `samples`, at several resolutions (sizes in samples).
 
-    Hann windows, frames centered, silence beyond the ends, as in `avmsf.modal.spectra`. Raises ValueError for an odd
-    FFT size.
+    Sizes are even, so that half a window lies before a frame's center. Hann windows, frames centered, silence beyond
+    the ends, as in `avmsf.modal.spectra`.
     """
-    odd = [size for size in fft_sizes if size % 2]
-    if odd:
-        raise ValueError(f"expected even FFT sizes, got {odd[0]}: half a window lies before a frame's center")
     cut = sounds[:, :samples]
     peak = float(cut.abs().max()) if cut.numel() else 0.0
     resolutions = []

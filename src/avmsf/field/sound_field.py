@@ -17,8 +17,7 @@ from avmsf.errors import FitError, PositionWarning
 from avmsf.field.config import FitConfig
 from avmsf.field.gains.mixture_gains import NEIGHBORS, MixtureGains
 from avmsf.field.gains.model import GainModel, Gains, expect_near, off_surface
-from avmsf.field.probable_body import ProbableBody
-from avmsf.field.quality import FieldQuality
+from avmsf.field.quality import FieldQuality, ProbableBody
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ForcePulse, ModalBank, synthesize
 from avmsf.modal.residual_noise import MEDIAN_LEVEL, Residual, low_fluctuation_noise, missing_background, shape_noise
@@ -246,11 +245,6 @@ class SoundField:
         vectors = None if directions is None else as_directions(directions, "directions", count=len(points))
         with torch.no_grad():
             return self.gain_field.point_estimate(points, vectors)
-
-    def dampings(self, contacts: ArrayLike) -> Float[Tensor, "contacts modes"]:
-        """Return the dampings at the contacts, 1/s: the bank's where they are shared."""
-        points, _ = self._impacts(contacts, None)
-        return self.known(points).dampings(self.bank.damping).expand(len(points), -1)
 
     def render(
         self,

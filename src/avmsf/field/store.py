@@ -31,8 +31,7 @@ from avmsf.fem.material import Material
 from avmsf.field.config import ADDED_SETTINGS, FIELD, REMOVED_SETTINGS, FitConfig
 from avmsf.field.gains.model import GainModel
 from avmsf.field.gains.scaled import FITTED, ScaledGains
-from avmsf.field.probable_body import ProbableBody
-from avmsf.field.quality import FieldQuality
+from avmsf.field.quality import FieldQuality, ProbableBody
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.modal.extraction.alignment import Alignment
 from avmsf.modal.modes import ModalBank
@@ -78,14 +77,14 @@ def load(path: str | Path) -> SoundField:
     text, tensors = read_tensors(path, FIELD)
     record = FIELD.parse(text, path)
     with _reporting_damage(path):
-        origin, force = _checked(record, tensors, path), _background_force(record)
+        origin = _checked(record, tensors, path)
         gains = _KINDS[record["gains"]["kind"]].restore(record["gains"], _named(_GAINS, tensors))
     kept = record["alignment"]
     return SoundField(
         ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
         gains,
         tensors["phase"],
-        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings"), force),
+        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings"), record.get("background_force")),
         float(record["sample_rate"]),
         record["samples"],
         origin,
@@ -113,6 +112,10 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
     if samples > MAX_SAMPLES:
         raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
+    # Not in files of versions before 0.9, whose noise grows with the force.
+    force = record.get("background_force")
+    if force is not None and not 0.0 < like(force, 1.0, "background_force") < math.inf:
+        raise RecordError.expected("a force above 0, or null", force, name="background_force")
     skeleton = _skeleton(record)
     origin, config = dict(like(record["origin"], {}, "origin")), like(record["config"], {}, "config")
     config = {name: value for name, value in config.items() if name not in REMOVED_SETTINGS}
@@ -162,16 +165,6 @@ def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
                 if not 0.0 < like(factor, 1.0, f"{name}.{key}") < math.inf:
                     raise RecordError.expected("a number above 0", factor, name=f"{name}.{key}")
     return {**known, "edit": kind}
-
-
-def _background_force(record: Mapping[str, Any]) -> float | None:
-    """Return the force of `Residual.force`; None for files of versions before 0.9, whose noise grows with the force."""
-    if (given := record.get("background_force")) is None:
-        return None
-    force: float = like(given, 1.0, "background_force")
-    if not 0.0 < force < math.inf:
-        raise RecordError.expected("a force above 0, or null", force, name="background_force")
-    return force
 
 
 def _skeleton(record: Mapping[str, Any]) -> dict[str, Tensor]:

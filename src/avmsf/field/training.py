@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -46,16 +45,10 @@ class Targets:
         early = spectral_target(sounds, fft_sizes=sizes, hops=hops, samples=length)
         if config.spectral_norm == "common":
             mean = sum(float(each.norms.sum()) for each in whole.resolutions) / len(sizes)
-            whole, early = (_with_norm(each, mean) for each in (whole, early))
+            # Divided evenly among a resolution's frames.
+            for each in (*whole.resolutions, *early.resolutions):
+                each.norms[:] = mean / len(each.norms)
         return cls(rows.to(device), data.gains.to(device), whole, early)
-
-
-def _with_norm(target: SpectralTarget, norm: float) -> SpectralTarget:
-    """Return a target whose resolutions all have this norm, divided evenly among their frames."""
-    frames = [(each, len(each.norms)) for each in target.resolutions]
-    return replace(
-        target, resolutions=tuple(replace(each, norms=np.full(count, norm / count)) for each, count in frames)
-    )
 
 
 class AdamW:

@@ -7,9 +7,9 @@ sound of an impact is the sum over modes of Im(c exp((-d + 2 pi i f) t)), plus n
 - `modes`: the bank, the phase that all contacts have in common, the cosine distance of gains at any delay, the pulse of
   a hammer's force, and from gains and modes to sounds, with gradients.
 - `residual_noise`: the noise beside the modes, its estimate and its synthesis.
-- `spectra`: short-time and mel spectra, one convention for losses, metrics and pictures.
+- `spectra`: short-time and mel spectra, one convention for losses, metrics and pictures; sounds at a common rate,
+  length and level.
 - `inner_products`: closed forms of damped sines' inner products over time.
-- `clips`: sounds at a common sample rate, length and level.
 - `config`: the names of methods in settings, and sizes of transforms at any sample rate.
 """
 

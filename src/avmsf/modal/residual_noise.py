@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from scipy.fft import next_fast_len
 from torch import Tensor
 
@@ -26,13 +26,9 @@ MEDIAN_LEVEL = 1.054
 def white_sequence() -> Float[Tensor, " samples"]:
     """Return one period of white noise with little fluctuation of its short-time spectra, `PERIOD` samples.
 
-    STFT magnitudes of two draws of Gaussian noise differ by .586 of their mean; the constant nearest to them is their
-    median, at .419. The magnitudes of this sequence lie closer to the median (docs/decisions/low-fluctuation-noise.md).
+    Its STFT magnitudes are near the median of those of Gaussian white noise of variance one, a little below by
+    `MEDIAN_LEVEL` at their median, and its root mean square is .78 (docs/decisions/low-fluctuation-noise.md).
     Do not write into it: all callers share it.
-
-    It is white. Its level is such that its STFT magnitudes are near the median of those of Gaussian white noise of
-    variance one; its root mean square is .78, because the median of a Rayleigh distribution is below its root mean
-    square (sqrt(ln 2) = .83) and because the magnitudes are a little below it, by `MEDIAN_LEVEL` at their median.
     """
     with files(__package__).joinpath("low_fluctuation_noise.npy").open("rb") as file:
         return torch.from_numpy(np.load(file).astype(np.float32))
@@ -183,8 +179,19 @@ def estimate_residual(
     # Spectra are real at 0 Hz and at half the rate, where log power has another mean.
     inside = (columns > 0) & (columns < fft_size // 2)
     columns = columns.clamp(0, fft_size // 2)
-    power = _noise_power_given_modes(recorded[:, columns], ringing[:, columns], inside)
-    return Residual(power.sqrt().to(sounds.dtype))
+    if not len(recorded):
+        return Residual(sounds.new_zeros(bins))
+    recorded_log, ringing = torch.log(recorded[:, columns]), ringing[:, columns]
+    noise = (recorded[:, columns] * inside).amax((0, 2))
+    for _ in range(_ROUNDS):
+        ratio = (ringing / noise[:, None]).clamp(1e-12, 1e6)
+        expected = torch.log(noise)[:, None] + torch.log(ratio) + torch.from_numpy(scipy.special.exp1(ratio.numpy()))
+        slope = inside * torch.exp(-ratio)
+        step = (slope * (recorded_log - expected)).sum((0, 2)) / slope.square().sum((0, 2)).clamp_min(1.0)
+        noise = noise * torch.exp(step.clamp(-2.0, 2.0))
+        if float(step.abs().max()) < _CONVERGED:
+            break
+    return Residual(noise.sqrt().to(sounds.dtype))
 
 
 def _weakest_frames(
@@ -204,27 +211,6 @@ def _weakest_frames(
     frames = min(len(ringing), max(1, round(0.25 * len(ringing))))
     weakest = torch.sort(ringing, dim=0, stable=True).indices[:frames]
     return recorded.gather(0, weakest), ringing.gather(0, weakest)
-
-
-def _noise_power_given_modes(
-    recorded: Float64[Tensor, "frames bins columns"],
-    ringing: Float64[Tensor, "frames bins columns"],
-    inside: Bool[Tensor, "bins columns"],
-) -> Float64[Tensor, " bins"]:
-    """Return the noise's power in each band by Gauss-Newton steps, from the powers recorded and those of the modes."""
-    if not len(recorded):
-        return recorded.new_zeros(len(inside))
-    recorded_log = torch.log(recorded)
-    noise = (recorded * inside).amax((0, 2))
-    for _ in range(_ROUNDS):
-        ratio = (ringing / noise[:, None]).clamp(1e-12, 1e6)
-        expected = torch.log(noise)[:, None] + torch.log(ratio) + torch.from_numpy(scipy.special.exp1(ratio.numpy()))
-        slope = inside * torch.exp(-ratio)
-        step = (slope * (recorded_log - expected)).sum((0, 2)) / slope.square().sum((0, 2)).clamp_min(1.0)
-        noise = noise * torch.exp(step.clamp(-2.0, 2.0))
-        if float(step.abs().max()) < _CONVERGED:
-            break
-    return noise
 
 
 def _frame_power(sounds: Float[Tensor, "contacts samples"], fft_size: int) -> Float[Tensor, "contacts frames bins"]:

@@ -8,9 +8,12 @@ average. Gradients are finite everywhere, at silence too.
 """
 
 import math
+from fractions import Fraction
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.signal import hilbert, resample_poly
 from torch import Tensor
 
 from avmsf.errors import ArrayError
@@ -34,47 +37,16 @@ def envelope(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contac
 
     The transform takes each sound as periodic, so that one which does not end in silence wraps round at its ends.
     """
-    samples = sounds.shape[1]
-    # The analytic signal keeps positive frequencies twice; 0 Hz and, of an even length, half the rate are their own
-    # mirror images and stay once.
-    weights = torch.zeros(samples, dtype=sounds.dtype, device=sounds.device)
-    weights[: (samples + 1) // 2] = 2.0
-    weights[0] = 1.0
-    if samples % 2 == 0:
-        weights[samples // 2] = 1.0
-    return torch.fft.ifft(torch.fft.fft(sounds) * weights).abs()
+    return torch.from_numpy(np.abs(hilbert(sounds.detach().cpu().numpy(), axis=1))).to(sounds)
 
 
-def log_mel(
-    sounds: Float[Tensor, "contacts samples"],
-    filters: Float[Tensor, "mels bins"],
-    *,
-    fft_size: int,
-    hop: int,
-    floor: float,
-) -> Float[Tensor, "contacts mels frames"]:
-    """Return the natural logarithm of filtered magnitudes, which are taken as `floor` where they lie below it.
+def htk_filters(count: int, *, fft_size: int, sample_rate: float) -> Float[Tensor, "mels bins"]:
+    """Return triangles of height one, evenly spaced on the mel scale 2595 log10(1 + f / 700) up to half the rate, Hz.
 
-    `filters` as `htk_filters` makes them for the same `fft_size`.
+    In float64. Raises ArrayError where a triangle is so narrow that it falls between two bins.
     """
-    return torch.log(torch.clamp(filters @ magnitude_stft(sounds, fft_size=fft_size, hop=hop), min=floor))
-
-
-def htk_filters(
-    count: int, *, fft_size: int, sample_rate: float, lowest: float, highest: float
-) -> Float[Tensor, "mels bins"]:
-    """Return triangles of height one, evenly spaced on the mel scale 2595 log10(1 + f / 700).
-
-    They fill the band from `lowest` to `highest`. Frequencies in Hz; float64. Raises ArrayError for a band outside 0 Hz
-    to half the rate, and where a triangle is so narrow that it falls between two bins.
-    """
-    ends = [2595.0 * math.log10(1.0 + frequency / 700.0) for frequency in (lowest, highest)]
-    mels = torch.linspace(ends[0], ends[1], count + 2, dtype=torch.float64)
-    edges = 700.0 * (10.0 ** (mels / 2595.0) - 1.0)
-    # Edges come back from the mel scale with rounding, so that the top may exceed half the rate by its last digit.
-    if not 0.0 <= edges[0] < edges[-1] <= 0.5 * sample_rate * (1.0 + 1e-9):
-        wanted = f"mel filters from 0 Hz or above to {0.5 * sample_rate:g} Hz, half the sample rate, at most"
-        raise ArrayError.expected(wanted, f"{edges[0]:g} to {edges[-1]:g} Hz", name="highest")
+    top = 2595.0 * math.log10(1.0 + 0.5 * sample_rate / 700.0)
+    edges = 700.0 * (10.0 ** (torch.linspace(0.0, top, count + 2, dtype=torch.float64) / 2595.0) - 1.0)
     bins = torch.arange(fft_size // 2 + 1, dtype=torch.float64) * (sample_rate / fft_size)
     rising = (bins - edges[:-2, None]) / (edges[1:-1] - edges[:-2])[:, None]
     falling = (edges[2:, None] - bins) / (edges[2:] - edges[1:-1])[:, None]
@@ -85,3 +57,41 @@ def htk_filters(
         got = f"{count} filters, of which number {int(empty[0]) + 1} falls between two bins"
         raise ArrayError.expected(wanted, count, got=got, name="count", advice="use fewer filters or a longer FFT")
     return triangles
+
+
+Sounds = Float[Tensor, "contacts samples"]
+"""One a row."""
+
+
+def resampled(sounds: Sounds, *, sample_rate: float, wanted: float) -> Float[Tensor, "contacts resampled"]:
+    """Return sounds at another sample rate, Hz, by a polyphase filter; they are not differentiable in what was given.
+
+    What lies above half the lower of the two rates is lost. Dtype and device stay. The ratio of the rates is the
+    nearest with a denominator up to 20,000, exact for all rates in use.
+    """
+    if sample_rate == wanted:
+        return sounds
+    ratio = (Fraction(wanted) / Fraction(sample_rate)).limit_denominator(20_000)
+    found = resample_poly(sounds.detach().cpu().double().numpy(), ratio.numerator, ratio.denominator, axis=1)
+    return torch.from_numpy(found).to(sounds)
+
+
+def with_length(sounds: Sounds, samples: int) -> Float[Tensor, "contacts lasting"]:
+    """Return sounds of `samples` samples: cut at the end, or continued by silence."""
+    missing = samples - sounds.shape[1]
+    return torch.nn.functional.pad(sounds, (0, missing)) if missing > 0 else sounds[:, :samples]
+
+
+def level(sounds: Sounds, *, sample_rate: float) -> Float[Tensor, " contacts"]:
+    """Return each sound's root mean square over its loudest 20 ms, which does not depend on its decay time.
+
+    That is about how long loudness integrates a click. Differentiable; never zero, so that it can be a divisor.
+    """
+    window = min(sounds.shape[1], max(1, round(0.02 * sample_rate)))
+    power = torch.nn.functional.avg_pool1d(sounds.square()[:, None], window, max(1, window // 4))[:, 0]
+    return power.amax(dim=1).clamp_min(torch.finfo(sounds.dtype).tiny).sqrt()
+
+
+def levelled(sounds: Sounds, like: Sounds, *, sample_rate: float) -> Sounds:
+    """Return sounds scaled, row for row, to the level of `like`."""
+    return sounds * (level(like, sample_rate=sample_rate) / level(sounds, sample_rate=sample_rate))[:, None]

@@ -23,7 +23,6 @@ from avmsf.field.gains.elastic import (
     RESIDUALS,
     WIDTHS,
     Elastic,
-    frequency_log_prior,
 )
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, fit_mixture, hypotheses_of, weigh_factors
 from avmsf.field.gains.kernels import Sites
@@ -241,7 +240,8 @@ def test_the_density_of_a_frequency_is_averaged_over_factors_and_errors():
 
 
 def test_the_factors_prior_is_a_probability_of_units_and_materials():
-    probability = frequency_log_prior(3).exp().reshape(3, len(FACTORS), -1).sum(2)
+    prior = Elastic(impacts(4, seed=1), SIZE, plate(), unit_ratios=(1.0, 1000.0, 10.0)).factor_log_prior
+    probability = prior.exp().reshape(3, len(FACTORS), -1).sum(2)
     assert float(probability.sum()) == pytest.approx(1.0)
     assert float(FACTORS[probability[0].argmax()]) == pytest.approx(1.0)
     # Materials are as probable in all units, and each other unit is as probable as the next.

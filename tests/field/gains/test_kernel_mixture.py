@@ -9,7 +9,6 @@ import torch
 from scipy.optimize import minimize
 
 from avmsf.field.gains import mixture as module
-from avmsf.field.gains.fitting import active_series
 from avmsf.field.gains.mixture import (
     LEVEL_DEVIATION,
     NOISE_SHARES,
@@ -32,7 +31,7 @@ def posterior(
 ) -> tuple[KernelMixture, torch.Tensor]:
     """Weigh hypotheses, their prior learned from all series that have any energy."""
     evidence = log_evidence(kernels, values, floor)
-    weights = posterior_weights(evidence, given, active_series(values))
+    weights = posterior_weights(evidence, given, values.any(0))
     kept = torch.nonzero(weights.sum((1, 2)) > 0).flatten()
     return KernelMixture(kernels[kept], values, floor, weights[kept]), kept
 
@@ -249,12 +248,6 @@ def test_the_prior_is_learned_by_five_rounds_of_expectation_maximization():
         likelihood + log_prior[:, None], given.category.tolist(), start, rounds=5, pseudo_count=0.1
     )
     assert learned_prior(torch.from_numpy(likelihood), given).numpy() == pytest.approx(expected, rel=1e-6)
-
-
-def test_rounding_is_no_energy():
-    values = torch.tensor([[1.0, 1e-9, 1e-12, 0.0]], dtype=torch.float64)
-    assert active_series(values).tolist() == [True, True, False, False]
-    assert not active_series(torch.zeros(3, 2, dtype=torch.float64)).any()
 
 
 def test_thousands_of_equally_probable_kernels_keep_their_weights():

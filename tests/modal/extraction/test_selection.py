@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from avmsf.modal.extraction.extract import extract_sounds
-from avmsf.modal.extraction.finders import HighResolution
+from avmsf.modal.extraction.finders import HighResolution, Selection, chance_ratio, choose, merge
 from avmsf.modal.extraction.least_squares import NormalEquations
-from avmsf.modal.extraction.selection import Selection, chance_ratio, choose, merge
 from avmsf.modal.inner_products import gram, poles_of
 from avmsf.modal.modes import ModalBank, synthesize
 

@@ -27,8 +27,8 @@ from avmsf.errors import EvaluationError
 from avmsf.fem.elastic_modes import ElasticModes
 from avmsf.fem.isotropic import IsotropicModes
 from avmsf.fem.material import MATERIALS, Material, material_named
-from avmsf.modal.clips import resampled, with_length
 from avmsf.modal.modes import ModalBank, synthesize
+from avmsf.modal.spectra import resampled, with_length
 
 PerMode = Float64[Tensor, " modes"]
 Point = Float64[Tensor, "3"]

@@ -40,7 +40,7 @@ from avmsf.baselines.sonicgauss.training import (
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import EvaluationError, from_extra
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.modal.clips import resampled, with_length
+from avmsf.modal.spectra import resampled, with_length
 
 FRAMES: Final = 64
 """Of latents, and tokens of Gaussians."""

@@ -41,10 +41,7 @@ RESIDUALS = (0.03, 0.1, 0.3, 0.6)
 PROFILE_PRIOR = (0.56, 0.28, 0.1, 0.027, 0.003, 0.015, 0.004, 0.008, 0.007)
 """Typical share of the modes of a body with each of `PERTURBATIONS`, then of `WIDTHS`."""
 RESIDUAL_PRIOR = (0.96, 0.04, 7e-4, 1e-4)
-"""Typical share of the modes of a body with each of `RESIDUALS`.
-
-Both are of an earlier measurement whose script was not kept: narrower than the mean posterior probabilities over the
-modes of seven simulated objects with 8 impacts each, which are a worse prior (docs/decisions/few-impacts.md)."""
+"""Typical share of the modes of a body with each of `RESIDUALS` (docs/decisions/few-impacts.md)."""
 EQUAL_PRIOR = 0.2
 """Probability that a body is not typical, so that all profiles and remainders are equally probable."""
 REACH = 0.15
@@ -95,8 +92,16 @@ class Elastic(KernelFamily):
         ratios = torch.tensor(unit_ratios, dtype=torch.float64)[:, None]
         self.frequency_factors = (FACTORS / ratios).flatten()
         """Factors on the frequencies that are considered, of a body in each unit and of each material in a row."""
-        self.factor_log_prior = frequency_log_prior(len(ratios))
-        """Log probability of each pair in `frequency_weights` before any measurement."""
+        terms = [
+            math.log(weight / deviation) - 0.5 * ((torch.log(FACTORS) - mean) / deviation).square()
+            for weight, mean, deviation in _FACTOR_PRIOR
+        ]
+        material = torch.log_softmax(torch.logsumexp(torch.stack(terms), dim=0), dim=0)
+        odds = torch.tensor([1.0] + [UNIT_ODDS] * (len(ratios) - 1), dtype=torch.float64)
+        density = torch.log(odds / odds.sum())[:, None] + material - math.log(len(FREQUENCY_ERRORS))
+        self.factor_log_prior = density.flatten().repeat_interleave(len(FREQUENCY_ERRORS))
+        """Log probability of each pair in `frequency_weights` before any measurement: units, the present one first, and
+        materials as a mixture of normal distributions of the log factor."""
         # As a file keeps them, so that a field that was read renders what the saved one does.
         self.modes = replace(modes, shapes=modes.shapes.float().double(), perturbations=None)
         self.frequency_weights = torch.exp(self.factor_log_prior)
@@ -257,19 +262,3 @@ def _inside(nominal: Float64[Tensor, "factors shapes"], low: float, high: float)
 def _range(log_frequency: Float64[Tensor, " modes"]) -> tuple[float, float]:
     """Return the ends of the range of measured modes, widened."""
     return float(log_frequency.min()) - _MARGIN, float(log_frequency.max()) + _MARGIN
-
-
-def frequency_log_prior(units: int = 1) -> Float64[Tensor, " pairs"]:
-    """Return the log probability of each pair in `Elastic.frequency_weights` before any measurement.
-
-    The first of the `units` is the present one. In each the log factor of the material is distributed as a mixture of
-    normal distributions within the range of materials.
-    """
-    terms = [
-        math.log(weight / deviation) - 0.5 * ((torch.log(FACTORS) - mean) / deviation).square()
-        for weight, mean, deviation in _FACTOR_PRIOR
-    ]
-    material = torch.log_softmax(torch.logsumexp(torch.stack(terms), dim=0), dim=0)
-    odds = torch.tensor([1.0] + [UNIT_ODDS] * (units - 1), dtype=torch.float64)
-    density = torch.log(odds / odds.sum())[:, None] + material - math.log(len(FREQUENCY_ERRORS))
-    return density.flatten().repeat_interleave(len(FREQUENCY_ERRORS))

@@ -76,7 +76,8 @@ class MeasuredGains:
         """
         power = torch.stack([self.values.real.square().sum(0), self.values.imag.square().sum(0)])
         substantial = (power >= _SUBSTANTIAL * power.sum(0)) & self.distinct
-        return active_series(series_of(self.values)) & substantial.flatten()
+        # Energy is more than rounding leaves of none.
+        return ((power > 1e-20 * power.max()) & substantial).flatten()
 
     @property
     def distinct(self) -> Bool[Tensor, " modes"]:
@@ -118,12 +119,6 @@ class WeighedFamily:
             expected=family.visibility()[:, None] * measured.level,
         )  # fmt: skip
         return cls(family, kernels, evidence)
-
-
-def active_series(values: Float64[Tensor, "contacts series"]) -> Bool[Tensor, " series"]:
-    """Return which series have any energy, over the strongest's: more than rounding leaves of none."""
-    power = values.square().sum(0)
-    return power > 1e-20 * power.max()
 
 
 def fit_mixture(

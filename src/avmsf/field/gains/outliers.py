@@ -15,8 +15,7 @@ section 5.4.2, for blocks),
 
     Q -> Q - a_B' P_BB^-1 a_B,   log|C| -> log|C| + log|P_BB|,
 
-of one contact or of two in closed form. Standardized leave-one-out errors do not serve: those of the kernels' misfit
-are as large as a wrong label's, while the ratio to gains without places measures both on one scale.
+of one contact or of two in closed form.
 
 The contacts S that are set aside maximize
 

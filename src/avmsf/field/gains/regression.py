@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
 from operator import itemgetter
 from typing import Any
@@ -136,11 +136,24 @@ class Regression:
         best with one patch more for as long as that is more probable, then other stiffnesses. Where both bodies are far
         from the object, evidence between them means little: the held one also has to predict contacts left out better.
         """
-        patches, most_probable = modes.patches, partial(self._most_probable, rows, body, modes)
+        patches, count, scale = modes.patches, len(modes.patches), modes.stiffness_scale
+
+        def most_probable(
+            choices: Iterable[tuple[Patch, ...]], *ratios: float
+        ) -> tuple[float, tuple[Patch, ...], CandidateBody]:
+            """Return the most probable of choices of patches at ratios of stiffness: log probability, patches, body."""
+            supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
+            bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
+            # Numbers of patches share the probability of being held alike, and so do stiffnesses.
+            counts = [math.comb(count, len(each.patches)) * count * len(STIFFNESS_RATIOS) for each in supports]
+            logs = [each - math.log(number) for each, number in zip(self.evidence(rows, bodies), counts, strict=True)]
+            found = zip(logs, [each.patches for each in supports], bodies, strict=True)
+            return max(found, key=itemgetter(0), default=(-math.inf, (), body))
+
         if stated:
             return most_probable([patches], *STIFFNESS_RATIOS)[2]
         typical, *others = STIFFNESS_RATIOS
-        best = most_probable([each for count in (1, 2) for each in combinations(patches, count)], typical)
+        best = most_probable([each for size in (1, 2) for each in combinations(patches, size)], typical)
         while True:
             more = most_probable([(*best[1], patch) for patch in patches if patch not in best[1]], typical)
             if more[0] <= best[0]:
@@ -152,24 +165,6 @@ class Regression:
             return None
         new, old = (self(rows, [each]).model.leave_one_out() for each in (best[2], free))
         return best[2] if predicts_better(new, old, self.measured.take(rows)) else None
-
-    def _most_probable(
-        self,
-        rows: Int[Tensor, " rows"],
-        body: CandidateBody,
-        modes: HeldModes,
-        choices: Iterable[tuple[Patch, ...]],
-        *ratios: float,
-    ) -> tuple[float, tuple[Patch, ...], CandidateBody]:
-        """Return the most probable of choices of patches at ratios of stiffness: log probability, patches, body."""
-        count, scale = len(modes.patches), modes.stiffness_scale
-        supports = [Support(choice, ratio * scale) for choice in choices for ratio in ratios]
-        bodies = [CandidateBody(body.thickness, modes.on(each), fine=False, support=each) for each in supports]
-        # Numbers of patches share the probability of being held alike, and so do stiffnesses.
-        counts = [math.comb(count, len(each.patches)) * count * len(STIFFNESS_RATIOS) for each in supports]
-        logs = [evidence - math.log(each) for evidence, each in zip(self.evidence(rows, bodies), counts, strict=True)]
-        found = zip(logs, [each.patches for each in supports], bodies, strict=True)
-        return max(found, key=itemgetter(0), default=(-math.inf, (), body))
 
     def updated(self, rows: Int[Tensor, " rows"], body: CandidateBody) -> CandidateBody | None:
         """Return the body with its stiffness and density updated; None where that has no higher evidence."""

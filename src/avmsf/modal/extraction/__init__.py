@@ -2,11 +2,8 @@
 
 In go `Impacts`; out comes an `Extraction`: a `ModalBank`, each recording's complex gains, and the residual noise.
 
-1. `alignment`: the common time zero. The onset that `avmsf.capture.prepare` found in each recording alone is off by a
-   few samples. Here each recording gets one delay, so that every mode has one phase (modulo pi) in all of them, by
-   maximum a posteriori with von Mises phases (`phase_likelihood`); then the start common to all is set where their mean
-   power leaves the noise. `Impacts.delayed` cuts the recordings anew, between samples by a windowed sinc.
-   `Alignment.apply` aligns recordings that were held out; `alignment_report` says what was done.
+1. `alignment`: the common time zero, by one delay a recording (`phase_likelihood`) and where the mean power leaves the
+   noise. `Alignment.apply` aligns recordings that were held out.
 2. `finders`: frequencies and dampings, by one of two methods. `HighResolution`: matrix pencils (ESPRIT) in subbands
    (`esprit`), forward selection by orthogonal least squares (`selection`) and variable projection
    (`least_squares.refine`). `ShortTime`: the paper's regression in each bin of a short-time spectrum (`stft`).

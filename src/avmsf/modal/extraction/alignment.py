@@ -57,9 +57,8 @@ _MAX_JITTER_SAMPLES = 2.0
 _LAST_REACH_SAMPLES = 1.0
 """Longest delay of the last search, samples."""
 _STILL_LOG_ODDS = 3.0
-"""Log odds, per recording, of no delays at all where every file starts with its impact, as impulse responses do. The
-aircraft's and the ruler's, whose modes have no exact phases, seem to have delays by up to 2.5 in 4 of 49 splits; files
-of 20 modes that were trimmed 1 to 2 samples apart gain 6 to 25."""
+"""Log odds, per recording, of no delays at all where every file starts with its impact, as impulse responses do:
+without common phases delays gain up to 2.5, files trimmed 1 to 2 samples apart 6 to 25."""
 _USUAL_RECORDINGS = 2.0
 """Recordings of the usual spread that a mode's own is mixed with: of few, some modes agree by chance."""
 _MIN_JITTER_SAMPLES = 0.5

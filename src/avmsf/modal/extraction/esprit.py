@@ -8,13 +8,11 @@ in narrow bands, and ever shorter beginnings, for modes that die early, in ever 
 """
 
 import math
-from typing import no_type_check
 
 import torch
 from jaxtyping import Complex, Complex128, Float, Float64
 from torch import Tensor
 
-from avmsf._utils.compiled import compiled
 from avmsf.modal.modes import ModalBank
 
 _DEPTH = 512
@@ -170,8 +168,16 @@ def _subspace(
 
     It is the sum of x x^H over all runs x of `span` samples: H^T H* of the signals' Hankel matrices H.
     """
-    signals, correlation = band.to(torch.complex128), torch.zeros(span, span, dtype=torch.complex128)
-    _correlate(signals.numpy(), signals.conj().resolve_conj().numpy(), correlation.numpy())
+    signals, times = band.to(torch.complex128), band.shape[1]
+    correlation = torch.zeros(span, span, dtype=torch.complex128)
+    first = torch.fft.fft(signals[:, : times - span + 1], times).conj() * torch.fft.fft(signals)
+    correlation[:, 0] = torch.fft.ifft(first.sum(0))[:span]
+    correlation[0] = correlation[:, 0].conj()
+    # From one entry to the next along a diagonal one product leaves the sum and one enters it.
+    enters, leaves = signals[:, times - span + 1 :], signals[:, : span - 1]
+    change = enters.T @ enters.conj() - leaves.T @ leaves.conj()
+    for row in range(span - 1):
+        correlation[row + 1, 1:] = correlation[row, :-1] + change[row]
     values, vectors = torch.linalg.eigh(correlation)
     return values.flip(0), vectors.flip(1)
 
@@ -183,33 +189,3 @@ def _rotation(subspace: Complex128[Tensor, "span order"]) -> Complex128[Tensor, 
     upper, lower = subspace[:-1], subspace[1:]
     poles = torch.linalg.eigvals(torch.linalg.solve(upper.mH @ upper, upper.mH @ lower))
     return poles[torch.isfinite(poles.abs()) & (poles != 0)]
-
-
-@compiled(error_model="numpy", nogil=True, fastmath={"reassoc", "contract"})
-@no_type_check
-def _correlate(band, conjugate, whole):
-    """Write the correlation of signals into zeros.
-
-    From one entry to the next along a diagonal one product leaves the sum and one enters it, so that only the first
-    row is summed in full.
-    """
-    contacts, times = band.shape
-    span = len(whole)
-    runs = times - span + 1
-    for contact in range(contacts):
-        for column in range(span):
-            total = 0.0j
-            for time in range(runs):
-                total += band[contact, time] * conjugate[contact, column + time]
-            whole[0, column] += total
-        for row in range(span - 1):
-            enters, leaves = band[contact, runs + row], band[contact, row]
-            for column in range(row, span - 1):
-                one, other = conjugate[contact, runs + column], conjugate[contact, column]
-                whole[row + 1, column + 1] += enters * one - leaves * other
-    for row in range(1, span):
-        for column in range(row, span):
-            whole[row, column] += whole[row - 1, column - 1]
-            whole[column, row] = whole[row, column].conjugate()
-    for column in range(1, span):
-        whole[column, 0] = whole[0, column].conjugate()

@@ -282,7 +282,10 @@ class _Band:
             information = torch.diagonal(hessian, dim1=1, dim2=2).real / noise
             precision = torch.zeros_like(variance)
             if turn >= _FREE_ITERATIONS:
-                mean, precision = _mean_pole(poles, information, variance, drift), 1.0 / variance
+                # The poles without their drift, each weighted by its precision about their mean.
+                weight = 1.0 / (1.0 / information.clamp_min(torch.finfo(torch.float64).tiny) + variance)
+                settled = torch.complex(poles.real, poles.imag / (1.0 + drift[:, None]))
+                mean, precision = (weight * settled).sum(0) / weight.sum(0), 1.0 / variance
                 # Where the prior expects each recording's poles.
                 center = torch.complex(mean.real.expand_as(poles.real), mean.imag * (1.0 + drift[:, None]))
             penalty = noise * precision
@@ -334,15 +337,6 @@ class _Band:
         basis = torch.linalg.qr(self._atoms(poles)[0])[0]
         explained = (basis.mH @ self.spectra[..., None])[..., 0]
         return (self.spectra.abs().square().sum(1) - explained.abs().square().sum(1)).clamp_min(0.0)
-
-
-def _mean_pole(
-    poles: PerPole, information: Float64[Tensor, "contacts modes"], variance: PerMode, drift: PerContact
-) -> CommonPoles:
-    """Return the mean of the recordings' poles without their drift, each weighted by its precision about the mean."""
-    weight = 1.0 / (1.0 / information.clamp_min(torch.finfo(torch.float64).tiny) + variance)
-    settled = torch.complex(poles.real, poles.imag / (1.0 + drift[:, None]))
-    return (weight * settled).sum(0) / weight.sum(0)
 
 
 def _needed(

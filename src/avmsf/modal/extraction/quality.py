@@ -69,21 +69,28 @@ def measure_quality(
 ) -> ModeQuality:
     """Return the quality of each pole, from the sounds that an extraction's gains are of (`Extraction.aligned`)."""
     bank, sounds = extraction.bank, extraction.at_common_poles(sounds, sample_rate=sample_rate)
-    level = (sounds - sounds.mean(1, keepdim=True)).square().mean(1).sqrt()
-    audible = level > 0
-    scaled = ((sounds - sounds.mean(1, keepdim=True))[audible] / level[audible, None]).double()
+    centered = sounds - sounds.mean(1, keepdim=True)
+    loudness = centered.square().mean(1).sqrt()
+    audible = loudness > 0
+    scaled = (centered[audible] / loudness[audible, None]).double()
     system = NormalEquations.of(scaled, poles_of(bank, sample_rate), weighted=True)
     explained, _ = system.lost_without()
     unexplained, spread, explained_left_out = _own_moves(*system.own_step(sample_rate), explained)
     amplitudes = extraction.gains.to(torch.complex128)
     energy = (amplitudes.abs().square() / bank.damping).sum(0)
     # Loud recordings count no more than others for phases and shapes.
-    amplitudes = amplitudes[audible] / level[audible, None]
-    pitched, noise = bank.damping < bank.frequency, background_power(scaled, bank, sample_rate)
-    standing = torch.nonzero(pitched & _stands_out(explained, unexplained, noise)).flatten()
+    amplitudes = amplitudes[audible] / loudness[audible, None]
+    pitched, contacts, level = bank.damping < bank.frequency, len(scaled), _MAX_FALSE_MODES / len(bank)
+    logarithms = torch.log1p(explained / unexplained.clamp_min(torch.finfo(torch.float64).tiny)).sum(0)
+    by_energy = torch.from_numpy(gammaincc(contacts, logarithms.numpy())) < level
+    # Noise alone gains its power times a chi-squared variable of two degrees of freedom in each recording; of a pole
+    # that has no more misfit than that, selection has already tested what it explains.
+    noise = unexplained / background_power(scaled, bank, sample_rate)
+    only_noise = torch.from_numpy(gammaincc(contacts, noise.sum(0).numpy() / 2)) > level
+    standing = torch.nonzero(pitched & (by_energy | only_noise)).flatten()
     # A double of what is no mode itself may be the mode that both are of.
     part = bank.take(standing)
-    double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=_MAX_FALSE_MODES / len(bank))
+    double = _doubles(part, amplitudes[:, standing], explained[:, standing].sum(0), level=level)
     is_mode = torch.zeros(len(bank), dtype=torch.bool)
     is_mode[standing[~double]] = True
     return ModeQuality(
@@ -118,24 +125,6 @@ def _own_moves(
     # Never less than nothing: a recording may give the mode no amplitude.
     left_out = (explained + 2 * (alone * others).sum(-1) - bent).clamp_min(0)
     return unexplained, spread, left_out.sum(0) / (explained + unexplained).sum(0)
-
-
-def _stands_out(
-    explained: Float64[Tensor, "contacts modes"],
-    unexplained: Float64[Tensor, "contacts modes"],
-    noise: Float64[Tensor, "contacts modes"],
-) -> Bool[Tensor, " modes"]:
-    """Return which poles explain more than their misfit, or have no more misfit than the noise, given its power.
-
-    Noise alone gains its power times a chi-squared variable of two degrees of freedom in each recording; of a pole that
-    has no more misfit than that, selection has already tested what it explains.
-    """
-    contacts, modes = explained.shape
-    level = _MAX_FALSE_MODES / modes
-    logarithms = torch.log1p(explained / unexplained.clamp_min(torch.finfo(torch.float64).tiny)).sum(0)
-    by_energy = torch.from_numpy(gammaincc(contacts, logarithms.numpy())) < level
-    only_noise = torch.from_numpy(gammaincc(contacts, (unexplained / noise).sum(0).numpy() / 2)) > level
-    return by_energy | only_noise
 
 
 def _doubles(
