@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
@@ -156,3 +157,11 @@ def test_meshes_that_threads_thin_at_a_time_are_those_of_one_thread():
     finally:
         sys.setswitchinterval(interval)
     assert all(np.array_equal(one, other) for one, other in zip(found, 20 * alone, strict=True))
+
+
+def test_corners_have_the_texels_of_their_faces_own_corners_of_the_texture() -> None:
+    texture = torch.randint(0, 256, (2, 2, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    corners, faces = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
+    mesh = TexturedMesh.build(corners, faces, coordinates=corners[faces][..., :2], textures=[texture])
+    # Rows of an image count downwards.
+    assert torch.equal(mesh.corner_colors, (texture[[1, 1, 0, 0], [0, 1, 1, 0]] / 255.0)[faces])

@@ -58,8 +58,8 @@ def test_components_are_centered_and_have_the_length_that_is_asked_for() -> None
     features, report = finish_features(lifted(SAID), LiftConfig(components=4, positions=False))
     assert features.features.shape == (300, 4)
     assert (report["length"], report["variation"]) == pytest.approx((1.0, 1.0))
-    beside, _ = finish_features(lifted(SAID), LiftConfig(components=4, feature_size=0.2))
-    assert float(beside.features[:, 3:].norm(dim=1).square().mean().sqrt()) == pytest.approx(0.2)
+    beside, _ = finish_features(lifted(SAID), LiftConfig(components=4))
+    assert float(beside.features[:, 3:].norm(dim=1).square().mean().sqrt()) == pytest.approx(0.3)
 
 
 def test_standardized_features_have_mean_zero_and_length_one() -> None:

@@ -234,7 +234,7 @@ def test_the_table_of_the_docs_selects_the_preset_but_for_what_the_paper_leaves_
 
 
 def test_settings_out_of_range_and_another_start_of_sounds_than_the_presets_are_refused() -> None:
-    for config, name in ((ViewsConfig, "count"), (LiftConfig, "reach"), (LiftConfig, "feature_size")):
+    for config, name in ((ViewsConfig, "count"), (LiftConfig, "reach")):
         with raises(SceneError, name=name, value=-1):
             config(**{name: -1})
     with raises(AvmsfError, name="fit"):

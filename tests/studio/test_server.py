@@ -138,12 +138,12 @@ def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(tmp_
         "import json, shutil, sys; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
         "print(json.dumps({'result': {'field': 'replaced', 'task': task, 'output': task['output']}}))"
     )
-    config = StudioConfig(modes=7, preset="paper")
+    config = StudioConfig(preset="paper")
     with served(open_target(fill(tmp_path / "struck")), tmp_path / "files", config=config) as running:
         running.studio.jobs.command = (sys.executable, "-c", script, str(tmp_path / "made"))
         last = running.events(running.ask("POST", "reconstruct", {}).words["job"])[-1]
         assert last["field"] == "replaced"
-        assert (last["task"]["modes"], last["task"]["preset"]) == (7, "paper")
+        assert last["task"]["preset"] == "paper"
         assert torch.equal(running.studio.session.current.require_field().bank.frequency, made.bank.frequency)
 
 

@@ -1,7 +1,6 @@
 """Files that only save time: where one cannot be written, the work goes on without it."""
 
 import hashlib
-import json
 import re
 import warnings
 from collections.abc import Callable, Iterator
@@ -114,8 +113,3 @@ def content_digest(*parts: Any) -> str:
         plain = not hasattr(array, "tobytes")
         digest.update(f"{array!r}\0".encode() if plain else f"{array.dtype} {array.shape}\0".encode() + array.tobytes())
     return digest.hexdigest()
-
-
-def key_of(values: dict[str, Any]) -> str:
-    """Return a short digest of plain values."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]

@@ -83,10 +83,10 @@ def copy_whole(source: Path, path: Path, *, raising: type[AvmsfError] = FieldFil
 def new_folder(folder: Path, *, raising: type[AvmsfError], replace: bool = False) -> Iterator[Path]:
     """Yield a temporary folder, which in the end takes the name `folder`: that is complete, or as it was.
 
-    With `replace` all that was in the folder is deleted then. Raises `raising` where the folder cannot be written, and
-    without `replace` where it exists and is not empty.
+    With `replace` all that was in the folder is deleted then. Raises `raising` where the folder cannot be written or is
+    a file, and without `replace` where it is not empty.
     """
-    if not replace and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or (not replace and any(folder.iterdir()))):
         raise raising.expected(
             "a new or empty folder", got="an existing one", file=folder, advice="choose another name or remove it"
         )

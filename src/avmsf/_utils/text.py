@@ -11,7 +11,7 @@ import math
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -133,6 +133,15 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ValueError("expected a few levels of tables, got hundreds") from error
 
 
+def flat(table: Mapping[str, Any], owner: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested tables by dotted names, such as `outer.inner`, after the `owner`'s name and dot."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{owner}{name}.")
+        else:
+            yield owner + name, value
+
+
 class RecordError(AvmsfError, ValueError):
     """A value of a file's record is missing, unknown or of another type or size: `name` is its key."""
 
@@ -166,7 +175,7 @@ def as_type(value: Any, hint: Any) -> Any:
         return next((each for part in arguments if (each := as_type(value, part)) is not OTHER), OTHER)
     if kind is Literal:
         return value if value in arguments else OTHER
-    if kind is tuple and isinstance(value, list):
+    if kind is tuple and isinstance(value, list | tuple):
         parts = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
         found = tuple(map(as_type, value, parts)) if len(parts) == len(value) else (OTHER,)
         return OTHER if OTHER in found else found

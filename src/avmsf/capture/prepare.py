@@ -146,7 +146,13 @@ def deconvolve(
     push, from filters that ring ahead and from a force that is late in its channel, is at negative times, at the end of
     the transform; no more of it is returned than the sound held before the push.
     """
-    begin, isolated = isolate(force, pulse)
+    # All else in the channel, an amplifier's drift and the object's ringing in the hammer, stays out of the response.
+    # There is room for ringing of the recorder's filter (16 and 24 samples) and for the slow end of a soft push.
+    width = pulse.stop - pulse.start
+    begin = max(0, pulse.start - 16 - width)
+    isolated = force[begin : min(len(force), pulse.stop + 24 + 2 * width)] - pulse.rest
+    fade = min(12 + width, len(isolated))
+    isolated[len(isolated) - fade :] *= np.cos(0.5 * np.pi * (np.arange(fade) + 1) / (fade + 1)) ** 2
     later = sound[begin:]
     size = next_fast_len(len(later) + len(isolated), real=True)
     push, recorded = rfft(isolated / pulse.height, size), rfft(later, size)
@@ -155,19 +161,3 @@ def deconvolve(
     # What the last samples hold of the response is the part of the push that came before its peak.
     # The zeros keep negative times, of which there are at most the window's length, apart from these.
     return whole[size - (pulse.start - begin) :], whole[: len(sound) - pulse.peak]
-
-
-def isolate(force: Float64[np.ndarray, " frames"], pulse: Pulse) -> tuple[int, Float64[np.ndarray, " window"]]:
-    """Return where the window about a push begins, and the force above rest in it.
-
-    All else in the channel, an amplifier's drift and the object's ringing in the hammer, stays out of the response.
-    There is room for ringing of the recorder's filter (16 and 24 samples) and for the slow end of a soft push.
-    """
-    width = pulse.stop - pulse.start
-    begin = max(0, pulse.start - 16 - width)
-    fade = 12 + width
-    end = min(len(force), pulse.stop + 2 * fade)
-    window = force[begin:end] - pulse.rest
-    fade = min(fade, len(window))
-    window[len(window) - fade :] *= np.cos(0.5 * np.pi * (np.arange(fade) + 1) / (fade + 1)) ** 2
-    return begin, window

@@ -17,7 +17,6 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -55,7 +54,8 @@ _WIDEST = 120
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return its exit code.
 
-    It is 0, 1 where methods of `evaluate` failed, 2 for input that cannot be used, 130 after Ctrl-C, 143 after SIGTERM.
+    It is 0, 1 where methods of `evaluate` failed, 2 for input that cannot be used, 130 after Ctrl-C, 141 where nobody
+    reads the output any more, 143 after SIGTERM.
     Raises SystemExit(0), as command lines do, for a verb's help.
     """
     for name in ("stdout", "stderr"):
@@ -158,9 +158,7 @@ def _interrupting() -> Iterator[list[int]]:
 def _explain(words: list[str]) -> int:
     """Print the list of verbs and return 0, or print that there is no such verb and return 2."""
     if words and words[0] not in ("-h", "--help"):
-        near = get_close_matches(words[0], VERBS, n=1)
-        advice = f"did you mean {near[0]}? `avmsf --help` lists all" if near else "`avmsf --help` lists all"
-        return _fail(AvmsfError.expected("a command", words[0], name="avmsf", advice=advice))
+        return _fail(AvmsfError.unknown(words[0], VERBS, name="avmsf"))
     indent = max(map(len, VERBS)) + 4
     width = min(shutil.get_terminal_size().columns, _WIDEST)
     print("usage: avmsf COMMAND [OPTIONS]\n")

@@ -1,13 +1,12 @@
 """`avmsf edit`: a field in, the field of another material, size, pitch or sound out."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from avmsf.cli.options import Configured, Flag, with_settings
+from avmsf.cli.options import Configured, Flag
 from avmsf.cli.output import next_command, print_json, show
 from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.editing.config import STABLE_AUDIO, EditSettings
@@ -63,11 +62,6 @@ class Options(Configured):
     """Contact of these sounds, meters; by default the loudest."""
 
     usual = EditSettings()
-
-    @cached_property
-    def all_settings(self) -> EditSettings:
-        """The settings."""
-        return with_settings(self.usual, self.set, self.config)
 
     @property
     def changes_material(self) -> bool:

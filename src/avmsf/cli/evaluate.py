@@ -4,14 +4,14 @@ import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from avmsf._utils.text import counted
-from avmsf.cli.options import Configured, Device, Flag, with_settings
+from avmsf.cli.options import Configured, Device, Flag
 from avmsf.cli.output import display, next_command, next_step, note, print_json, say, show, table
 from avmsf.cli.paths import CacheFolder, ContactData, Existing, OutputFolder, arg
 from avmsf.datasets.detect import detect_dataset
@@ -81,11 +81,6 @@ class Options(Configured):
     """Also draw spectrograms, and heat maps with localize."""
 
     usual = EvaluationSettings()
-
-    @cached_property
-    def all_settings(self) -> EvaluationSettings:
-        """What methods share."""
-        return with_settings(self.usual, self.set, self.config)
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> "Options":

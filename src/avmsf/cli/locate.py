@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,7 +16,7 @@ from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.cli.options import Common, Flag, Number, Unit
 from avmsf.cli.output import doing, next_command, note, print_json, say, show
 from avmsf.cli.paths import Existing, FieldFile, OutputError, PictureFolder, SettingsFile, TruthTable, arg
-from avmsf.errors import AvmsfError, LocationError
+from avmsf.errors import AvmsfError, CaptureError, LocationError
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
@@ -180,7 +181,9 @@ def _is_training(field: "SoundField", path: Path) -> bool:
     """Return whether a field was fitted to a file: a recording of its capture, the folder of that name around it."""
     path, origin = path.resolve(), field.origin
     owners = [each for each in path.parents if path.relative_to(each).as_posix() in origin.trained_on]
-    return any((settings_of(each).name or each.name) == origin.capture for each in owners)
+    with suppress(CaptureError):
+        return any((settings_of(each).name or each.name) == origin.capture for each in owners)
+    return False
 
 
 def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:

@@ -145,7 +145,7 @@ def _make(verb: str, options: Many) -> dict[str, Any]:
     given = {each.name: getattr(options, each.name) for each in fields(options) if each.name not in ignored}
 
     def recipe() -> dict[str, Any]:
-        read = [digest_of(path, hidden=False) for path in options.read()]
+        read = [digest_of(path) for path in options.read()]
         plain = json.loads(json.dumps(given, default=str))
         return {"source": source_digest(f"{__package__}.{verb}"), "options": plain, "read": read}
 

@@ -55,6 +55,7 @@ def run(options: Options) -> int:
     from avmsf.capture import read_capture
     from avmsf.cli.report import levels, mode_rows, mode_table
     from avmsf.modal.extraction.alignment_report import AlignmentReport
+    from avmsf.modal.extraction.esprit import stable_orders
     from avmsf.modal.extraction.extract import FINDERS, extract_modes
     from avmsf.modal.extraction.quality import measure_quality
 
@@ -65,8 +66,10 @@ def run(options: Options) -> int:
     doing(f"finding the modes of {count}, {impacts.duration:.3g} s at {impacts.sample_rate:g} Hz")
     extraction = extract_modes(impacts, FINDERS[config.extraction](modes=config.modes))
     level = levels(extraction.gains.abs().square().mean(0).sqrt())
-    quality = measure_quality(extraction.aligned(impacts).sounds, extraction, sample_rate=impacts.sample_rate)
-    modes, supporting = mode_rows(extraction.bank, level, quality.is_mode, quality)
+    sounds, rate = extraction.aligned(impacts).sounds, impacts.sample_rate
+    quality = measure_quality(sounds, extraction, sample_rate=rate)
+    stable = stable_orders(extraction.at_common_poles(sounds, sample_rate=rate), extraction.bank, sample_rate=rate)
+    modes, supporting = mode_rows(extraction.bank, level, quality.is_mode, quality, stable)
     aligned = AlignmentReport.of(extraction, impacts)
     shifts = None if extraction.shifts is None else extraction.shifts.relative
     shifted = "" if shifts is None else f"frequencies differ between recordings by {100 * shifts:.2g} %, fitted in each"

@@ -10,19 +10,18 @@ import json
 import math
 import re
 import textwrap
-import tomllib
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
-from avmsf._utils.text import OTHER, as_type
+from avmsf._utils.text import OTHER, as_type, flat, read_toml
 from avmsf.capture.issues import Issues
 from avmsf.capture.settings import settings_of
 from avmsf.capture.table import present_impacts, read_impacts
@@ -113,7 +112,7 @@ def parse_options(kind: type[T], words: Sequence[str], default: T | None = None)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Configured(Common, ABC):
+class Configured(Common):
     """Options of the verbs that have more settings than options."""
 
     set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], arg("NAME=VALUE", name="set")] = ()
@@ -122,30 +121,18 @@ class Configured(Common, ABC):
     """Take settings from a file; options come after it."""
     print_config: Flag = False
     """Print all settings as such a file, and stop."""
-    usual: ClassVar[object]
+    usual: ClassVar[Any]
     """The settings where nothing changes them."""
     resumes: ClassVar[bool] = True
 
-    @property
-    @abstractmethod
-    def all_settings(self) -> object:
+    @cached_property
+    def all_settings(self) -> Any:
         """The settings by the options."""
+        return with_settings(self.usual, self.set, self.config)
 
     @classmethod
     def parse(cls: type[S], words: Sequence[str]) -> S:
-        """Return the options that the words spell; with --print-config print the settings and leave by SystemExit.
-
-        Raises `InputError` also for a setting that is written as an option.
-        """
-        own = {each.name for each in fields(cls)}
-        for word in words:
-            name = word.partition("=")[0].replace("-", "_").lstrip("_")
-            if not word.startswith("--") or name in own:
-                continue
-            meant = [full for full, *_ in nested_settings(cls.usual) if f".{full}".endswith(f".{name}")]
-            if meant:
-                forms = " or ".join(f"--set {full.removeprefix('scene.')}=VALUE" for full in meant)
-                raise InputError.expected(forms, got=word, name=word)
+        """Return the options that the words spell; with --print-config print the settings and leave by SystemExit."""
         if "--print-config" not in words:
             return super().parse(words)
         # What has no default is not read.
@@ -235,17 +222,9 @@ def _read(file: Path | None) -> list[tuple[str, Any]]:
     if file is None:
         return []
     try:
-        return list(_flat(tomllib.loads(file.read_text(encoding="utf-8"))))
+        return list(flat(read_toml(file)))
     except (OSError, ValueError) as error:
         raise InputError.expected("settings as TOML", got=str(error), file=file, advice="correct the line") from error
-
-
-def _flat(table: Mapping[str, Any], owner: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{owner}{name}.")
-        else:
-            yield owner + name, value
 
 
 def _assigned(text: str) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from avmsf._utils.text import counted, format_number
@@ -237,6 +237,7 @@ def mode_rows(
     level_db: Float[Tensor, " modes"],
     is_mode: Bool[Tensor, " modes"],
     quality: ModeQuality | None = None,
+    stable_orders: Float64[Tensor, " modes"] | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return the modes and the supporting poles as plain values, numbered together from 1 by frequency."""
     columns = {
@@ -245,11 +246,11 @@ def mode_rows(
         "t60_seconds": bank.t60,
         "level_db": level_db,
     }
-    if quality is not None:
+    if quality is not None and stable_orders is not None:
         columns |= {
             "frequency_spread_hertz": quality.frequency_spread,
             "damping_spread_per_second": quality.damping_spread,
-            "stable_orders": quality.stable_orders,
+            "stable_orders": stable_orders,
             "phase_coherence": quality.coherence,
             "energy_share": quality.energy_share,
             "explained_left_out": quality.explained_left_out,

@@ -13,7 +13,6 @@ from avmsf.cli.options import Common, Flag, Int
 from avmsf.cli.output import print_json, say
 from avmsf.cli.paths import Existing, FileKind, ShapeFile, arg
 from avmsf.errors import StudioError, from_extra
-from avmsf.modal.config import expect_modes
 from avmsf.pipeline.config import Preset
 
 _SHOWN = "a field, a capture folder, a folder of images or a mesh"
@@ -42,13 +41,10 @@ class Options(Common):
     any free one if that is taken."""
     no_browser: Flag = False
     """Do not open the browser."""
-    modes: int = 128
-    """Maximum number of modes of a reconstruction."""
     preset: Preset = "default"
     """Settings of a reconstruction; paper: as published, takes hours."""
 
     def _check(self) -> None:
-        expect_modes(self.modes)
         if self.target is None:
             raise StudioError.expected(_SHOWN, name="target")
 
@@ -69,7 +65,7 @@ def run(options: Options) -> int:
         port=options.port,
         browser=not options.no_browser,
         log=_print,
-        config=StudioConfig(options.modes, preset=options.preset),
+        config=StudioConfig(preset=options.preset),
     )
     say("closed")
     sys.stdout.flush()

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from avmsf._utils.caching import content_digest, key_of, source_digest
+from avmsf._utils.caching import content_digest, source_digest
 from avmsf._utils.checkpoint import Checkpoint
 from avmsf.editing.config import GuidedEditConfig
 from avmsf.editing.modal_edit import FieldAtContacts, ModalEdit
@@ -218,7 +218,7 @@ class _Optimization:
         made_by = [version("avmsf"), source_digest("avmsf.editing.guided")]
         values = {"field": [field.sample_rate, field.samples, content], "guide": self.guide.describe()}
         values |= {"settings": settings, "version of avmsf": made_by}
-        identity = {name: key_of({name: each}) for name, each in values.items()}
+        identity = {name: content_digest(name, each) for name, each in values.items()}
         return identity if self.score is None else identity | {"network": self.score.digest}
 
     def _optimizer(self) -> torch.optim.Adam:

@@ -21,12 +21,12 @@ from torch import Tensor
 from avmsf._utils.device import usable_device
 from avmsf.baselines.diffsound.material_fit import DiffSoundConfig
 from avmsf.baselines.diffsound.renderer import DiffSound, fit_diffsound
-from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published, folder_digest
+from avmsf.baselines.sonicgauss.published import PublishedSonicGauss, fit_published
 from avmsf.baselines.sonicgauss.training import TunedRenderer
 from avmsf.capture.audio import read_recording
 from avmsf.capture.filenames import files_in
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import CaptureError, EvaluationError, FitError
+from avmsf.errors import EvaluationError, FitError
 from avmsf.evaluation.metrics import envelope_distance
 from avmsf.evaluation.registry import VisualInput, kind_of, method_entry, resolve
 from avmsf.evaluation.simple_methods import MeanGains
@@ -80,7 +80,7 @@ def method_named(name: str) -> Method:
     if entry.path:
         given = name.partition(":")[2]
         path = Path(given).expanduser()
-        if not given or not (path.is_dir() if entry.is_folder else path.is_file()):
+        if not given or not path.exists():
             wanted = f"{entry.path} after `{kind_of(name)}:`"
             raise EvaluationError.expected(wanted, name, file=path if given else None, name="method")
         # However it is written: results of one path are those of one method.
@@ -89,7 +89,7 @@ def method_named(name: str) -> Method:
         made: Method = resolve(entry.make)(name, **entry.settings, **settings)
         return made
     if entry.path:
-        weights = folder_digest(path) if entry.is_folder else digest_of(path)[:16]
+        weights = digest_of(path)[:16]
     # Of a class method ray would send the code, not the name.
     fit = partial(_fit_with, entry.fit, **entry.settings, **settings)
     return FunctionMethod(name, fit, weights, entry.visual_input)
@@ -204,10 +204,7 @@ class Recorded:
         )
 
     def _read(self, path: Path) -> Float[Tensor, " samples"]:
-        try:
-            recording = read_recording(path)
-        except CaptureError as error:
-            raise EvaluationError(str(error), **{**error.attributes, "file": path}) from error
+        recording = read_recording(path)
         found = recording.frames, recording.sample_rate, len(np.unique(recording.channels, axis=0))
         if found != (self.task.train.sounds.shape[1], self.sample_rate, 1):
             shown = f"{found[0]} samples at {found[1]:g} Hz in {found[2]} different channels"

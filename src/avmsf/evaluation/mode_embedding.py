@@ -35,10 +35,10 @@ def pitches(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
     """Return the frequencies alone, as in the paper: 32 evenly spaced quantiles of log2 f, by Hazen's rule.
 
     Over the square root of their number, so that the distance of two sets is the root mean square of their quantiles'
-    differences in octaves. Raises EvaluationError for a set that is empty or not of numbers above 0.
+    differences in octaves.
     """
     levels = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    return np.quantile(_logarithms(bank)[0], levels, method="hazen") / math.sqrt(_QUANTILES)
+    return np.quantile(bank.frequency.log2().numpy(), levels, method="hazen") / math.sqrt(_QUANTILES)
 
 
 def pitches_and_dampings(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
@@ -48,7 +48,7 @@ def pitches_and_dampings(bank: ModalBank) -> Float64[np.ndarray, " dim"]:
     pitches follows log2 of the damping there, the mean over all modes weighted by exp(-(distance in octaves /
     width)^2 / 2), over the square root of their number.
     """
-    frequency, damping = _logarithms(bank)
+    frequency, damping = bank.frequency.log2().numpy(), bank.damping.log2().numpy()
     exponent = np.linspace(math.log2(125.0), math.log2(16000.0), _PITCHES)[:, None] - frequency
     exponent = -0.5 * (exponent / _WIDTH) ** 2
     # Relative to the nearest mode's, lest all weights vanish far away from every mode.
@@ -62,17 +62,6 @@ FEATURES: dict[str, Callable[[ModalBank], Float64[np.ndarray, " dim"]]] = {
     "umap_dampings": pitches_and_dampings,
 }
 """What makes a vector of a set of modes, by the metrics that rest on it."""
-
-
-def _logarithms(bank: ModalBank) -> tuple[Float64[np.ndarray, " modes"], Float64[np.ndarray, " modes"]]:
-    """Return log2 of frequencies and dampings."""
-    if not len(bank):
-        raise EvaluationError.expected("one mode or more", 0, got="none", name="bank")
-    for name in ("frequency", "damping"):
-        for row, value in enumerate(getattr(bank, name).tolist()):
-            if not 0.0 < value < math.inf:
-                raise EvaluationError.expected(f"a {name} above 0", value, row=row, name=name)
-    return bank.frequency.log2().numpy(), bank.damping.log2().numpy()
 
 
 def check_materials(known: Collection[str], *, name: str = "materials") -> None:

@@ -14,7 +14,7 @@ from avmsf.errors import EvaluationError
 from avmsf.evaluation.editing import Edits
 from avmsf.evaluation.objects import ObjectInputs
 from avmsf.evaluation.published import PUBLISHED
-from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, VisualInput, table_modules
+from avmsf.evaluation.registry import METRICS, EvaluationSettings, MetricSettings, Protocol, VisualInput
 from avmsf.evaluation.results import SPACES, ResultsFolder, write_json
 from avmsf.evaluation.scores import shared_cdpam
 from avmsf.evaluation.task import Method
@@ -39,7 +39,7 @@ class Evaluation:
     finder: ModeFinder = field(default_factory=HighResolution)
     """Extraction of modes, once per case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the features, as plain values."""
+    """Settings of what methods share (`EvaluationSettings`), as plain values."""
     encoder: str | None = None
     """Encoder that `auto` in the settings stands for; None where the settings name it, or no method reads features."""
     time_zero: str | None = None
@@ -59,7 +59,7 @@ class Evaluation:
             shared_cdpam()
         identity = {
             "version": version("avmsf"),
-            "source": [source_digest(module) for module in (f"{__package__}.runner", *table_modules())],
+            "source": source_digest(f"{__package__}.runner"),
             "protocol": self.protocol.name,
             "choosing": repr(self.protocol.choosing),
             "dataset": self.title,

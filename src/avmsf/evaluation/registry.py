@@ -91,8 +91,6 @@ class MethodEntry:
     """The features that a function with `fit` reads, by the field that it asks for."""
     path: str = ""
     """The folder or file that it reads, as the setting `path`, for a method whose name goes on with `:` and a path."""
-    is_folder: bool = False
-    """Whether that is a folder."""
     is_edit: bool = False
     """Whether it edits sounds, of the protocol `edit` alone; its function gets an `editing.EditTask`."""
 
@@ -187,13 +185,11 @@ METHODS: dict[str, MethodEntry] = {
         "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
         "methods:sonicgauss",
         path="a folder with the published weights",
-        is_folder=True,
     ),
     "recorded": MethodEntry(
         "sounds of another system, from files",
         make="methods:RecordedMethod",
         path="a folder with a folder of wav files for every object",
-        is_folder=True,
     ),
     "unedited": _edit("the field before the edit", "editing:unedited"),
     "generation": _edit("a sound that the model generates from the prompt alone", "editing:generation"),
@@ -297,12 +293,6 @@ PROTOCOLS: dict[str, Protocol] = {
     )
 }
 """All experiments by name."""
-
-
-def table_modules() -> list[str]:
-    """Return the names of all modules that the import paths of methods and metrics lead to."""
-    paths = [*(each.make or each.fit for each in METHODS.values()), *(each.function for each in METRICS.values())]
-    return sorted({f"{__package__}.{path.partition(':')[0]}" for path in paths if isinstance(path, str)})
 
 
 def protocol_named(name: str) -> Protocol:

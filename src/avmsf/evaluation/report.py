@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import format_number, read_json
-from avmsf.capture.audio import Recording
+from avmsf.capture.audio import Recording, read_recording
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.localization import read_map
 from avmsf.evaluation.registry import METRICS
@@ -29,7 +29,6 @@ from avmsf.evaluation.results import (
     Outcome,
     ResultsFolder,
     file_word,
-    read_sound,
     write_json,
 )
 from avmsf.evaluation.splits import evenly_spaced
@@ -135,11 +134,11 @@ def _listening(records: Sequence[ObjectRecord], folder: Path) -> dict[str, list[
 
 def _cards(contact: _StoredContact, folder: Path) -> Iterator[_Card]:
     name, file, made = contact
-    recorded = read_sound(folder / file)
+    recorded = read_recording(folder / file)
     loudest = float(picture_levels(recorded).max())
 
     def card(title: str, caption: str, path: Path) -> _Card:
-        picture = draw_spectrogram(picture_levels(read_sound(path)), loudest=loudest)
+        picture = draw_spectrogram(picture_levels(read_recording(path)), loudest=loudest)
         sound = _address("audio/flac", path.read_bytes())
         return {"title": title, "caption": caption, "picture": picture, "sound": sound}
 
@@ -225,7 +224,7 @@ def _write_spectrograms(record: ObjectRecord, folder: Path) -> Iterator[Path]:
             made = {each.method: each.sounds[recording] for case, each in predicted if case.label == label}
             if made:
                 files = {RECORDED: recorded, **made}
-                sounds = {name: read_sound(folder / file) for name, file in files.items()}
+                sounds = {name: read_recording(folder / file) for name, file in files.items()}
                 rate = sounds[RECORDED].sample_rate
                 rows[recording] = {name: torch.tensor(sound.channels[0]) for name, sound in sounds.items()}
         if rows:

@@ -10,7 +10,6 @@ import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from itertools import chain, permutations
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,8 @@ from scipy.signal import resample_poly
 from torch import Tensor
 
 from avmsf._utils.files import write_whole
-from avmsf._utils.text import in_order, json_text, read_json_object
-from avmsf.capture.audio import Recording, read_recording
-from avmsf.errors import AvmsfError, CaptureError, EvaluationError
+from avmsf._utils.text import flat, in_order, json_text, read_json_object
+from avmsf.errors import AvmsfError, EvaluationError
 from avmsf.evaluation.splits import Case
 
 IDENTITY, SPACES, OBJECTS = "protocol.json", "spaces.json", "objects"
@@ -135,19 +133,14 @@ class ResultsFolder:
         known = self.identity() if path.exists() else {**wanted, "methods": {}}
         stored = known.pop("methods")
         shared = {name: dict(methods[name]) for name in methods if name in stored}
-        asked = _flat({**wanted, "methods": shared})
-        found = _flat({**known, "methods": {name: stored[name] for name in shared}})
+        asked = dict(flat({**wanted, "methods": shared}))
+        found = dict(flat({**known, "methods": {name: stored[name] for name in shared}}))
         name = next((each for each in (*asked, *found) if asked.get(each) != found.get(each)), None)
         if name is not None:
             theirs = found.get(name)
             made, got = f"results of {name} {_brief(asked.get(name))}", _brief(theirs)
             if name == "source":
                 made, got = "results made by this version of avmsf", "those of another, whose code differs"
-            if name == "columns":
-                lacks, more = ({*ones} - {*others} for ones, others in permutations((wanted[name], theirs or ())))
-                named = {"without": lacks, "with": more}.items()
-                parts = [f"{word} {', '.join(in_order(names))}" for word, names in named if names]
-                made, got = "results of the same metrics", f"those {' and '.join(parts)}"
             advice = "give the same options, or choose another --output"
             raise EvaluationError.expected(made, theirs, got=got, file=self.path, name=name, advice=advice)
         write_json(path, {**wanted, "methods": {**stored, **methods}})
@@ -209,16 +202,6 @@ def write_flac(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: flo
     write_whole(path, memory.getvalue(), raising=EvaluationError)
 
 
-def read_sound(path: Path) -> Recording:
-    """Read a stored sound. Raises EvaluationError where it is gone or damaged."""
-    try:
-        return read_recording(path)
-    except CaptureError as error:
-        advice = "delete the object's file to compute it again"
-        got = "none" if not path.exists() else "a damaged one"
-        raise EvaluationError.expected("a stored sound", got=got, file=path, advice=advice) from error
-
-
 _AGAIN = "delete the file to compute them again, or choose another --output"
 _read = partial(read_json_object, raising=EvaluationError, advice=_AGAIN, max_bytes=_MAX_BYTES)
 
@@ -243,14 +226,6 @@ def failure_of(error: Exception) -> str:
 def file_word(name: str) -> str:
     """Return a name for files: methods that read a folder have its path in their name."""
     return re.sub(r"[^\w-]", "-", name)
-
-
-def _flat(values: Any, name: str = "") -> dict[str, Any]:
-    """Return nested settings by names such as `outer.inner`."""
-    if not isinstance(values, Mapping):
-        return {name: values}
-    parts = (_flat(each, f"{name}.{key}" if name else key) for key, each in values.items())
-    return dict(chain.from_iterable(part.items() for part in parts))
 
 
 def _brief(value: object) -> str:

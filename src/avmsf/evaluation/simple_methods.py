@@ -17,7 +17,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from avmsf.capture.impacts import Impacts, places_of
-from avmsf.errors import EvaluationError
 from avmsf.evaluation.task import Amplitudes, Contacts, Sounds, Task
 from avmsf.field.gains.data import orientation_signs
 from avmsf.field.gains.kernels import Axes, Sites
@@ -46,12 +45,6 @@ class _Trained:
         """Samples per second, Hz."""
         return self.train.sample_rate
 
-    def neighbors(self, count: int) -> int:
-        """Return how many training impacts are averaged: at most all. Raises EvaluationError for none."""
-        if count < 1:
-            raise EvaluationError.expected("1 or more training impacts", count, name="count")
-        return min(count, len(self.train))
-
 
 @dataclass(frozen=True, eq=False)
 class ModalBaseline(_Trained, ABC):
@@ -63,12 +56,6 @@ class ModalBaseline(_Trained, ABC):
     """Whether the extraction's residual is added to the modes, as it is in a field: one draw for all contacts."""
     seed: int = field(default=0, kw_only=True)
     """Start of the noise's chance."""
-
-    def __post_init__(self) -> None:
-        wanted, count = f"gains of {len(self.train)} training impacts", len(self.extraction.gains)
-        if count != len(self.train):
-            advice = "extract the modes from these impacts"
-            raise EvaluationError.expected(wanted, count, name="extraction", advice=advice)
 
     @classmethod
     def of(cls: type[_Baseline], task: Task, **settings: Any) -> _Baseline:
@@ -162,7 +149,7 @@ class MeanWaveform(_Trained):
 
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the mean of the nearest training contacts' sounds."""
-        count = self.neighbors(self.count)
+        count = min(self.count, len(self.train))
         if not self.by_direction or directions is None or self.train.directions is None:
             return self.train.sounds[nearest_points(self.train.contacts, contacts, count=count)].mean(dim=1)
         known = Sites(self.train.contacts.double(), normalize(self.train.directions.double()))
@@ -181,7 +168,7 @@ class MeanGains(ModalBaseline):
 
     def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return the mean of the nearest training contacts' amplitudes."""
-        count = self.neighbors(self.count)
+        count = min(self.count, len(self.train))
         nearest = self.amplitudes[nearest_points(self.train.contacts, contacts, count=count)]
         return torch.complex(nearest.real.mean(dim=1), nearest.imag.mean(dim=1))
 
@@ -227,10 +214,11 @@ class SplineGains(ModalBaseline):
     def complex_gains(self, contacts: Contacts, *, directions: Contacts | None = None) -> Amplitudes:
         """Return the splines' amplitudes."""
         positions, means = self._positions
-        along, asked = self._axes.along(positions), self._axes.along(contacts.double())
+        axes = Axes(positions)
+        along, asked = axes.along(positions), axes.along(contacts.double())
         if len(positions) == 1 or not along.shape[1]:
             return means.mean(0, keepdim=True).expand(len(contacts), -1).to(self.amplitudes)
-        kernel, degree = ("thin_plate_spline", 1) if self._bends else ("linear", 0)
+        kernel, degree = ("thin_plate_spline", 1) if len(positions) >= 2 * (along.shape[1] + 1) else ("linear", 0)
         spline = RBFInterpolator(along.numpy(), means.numpy(), kernel=kernel, degree=degree)
         return torch.from_numpy(np.asarray(spline(asked.numpy()))).to(self.amplitudes)
 
@@ -241,12 +229,3 @@ class SplineGains(ModalBaseline):
         members = (owner[None, :] == torch.arange(int(owner.max()) + 1)[:, None]).double()
         mean = members / members.sum(1, keepdim=True)
         return mean @ self.train.contacts.double(), mean.to(torch.complex128) @ self.amplitudes.to(torch.complex128)
-
-    @cached_property
-    def _axes(self) -> Axes:
-        return Axes(self._positions[0])
-
-    @property
-    def _bends(self) -> bool:
-        positions = self._positions[0]
-        return len(positions) >= 2 * (self._axes.along(positions).shape[1] + 1)

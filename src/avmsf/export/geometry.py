@@ -142,20 +142,7 @@ def read_vertices(
         mesh = read_textured_mesh(source, meters=meters)
     _check_fits(mesh.vertices.double().numpy(), sampled.points, source)
     # Vertices are split where normals or colors differ between faces.
-    corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, _corner_colors(mesh)], dim=2).reshape(-1, 9)
+    corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, mesh.corner_colors], dim=2).reshape(-1, 9)
     table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)
     position, normal, color = torch.split(torch.from_numpy(table).float(), 3, dim=1)
     return {"POSITION": position, "NORMAL": normal, "COLOR_0": color, "indices": torch.from_numpy(rows.ravel())}, None
-
-
-def _corner_colors(mesh: TexturedMesh) -> Float[Tensor, "faces 3 3"]:
-    """Return each corner's color times that of its texture there."""
-    colors = mesh.colors.clone()
-    for number, texture in enumerate(mesh.textures):
-        chosen = mesh.materials == number
-        height, width = texture.shape[:2]
-        across, up = mesh.coordinates[chosen].unbind(2)
-        column = (across.remainder(1.0) * width).long().clamp(max=width - 1)
-        row = ((1.0 - up.remainder(1.0)) * height).long().clamp(0, height - 1)
-        colors[chosen] *= texture[row, column].float() / 255.0
-    return colors

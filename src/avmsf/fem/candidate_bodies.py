@@ -21,7 +21,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from avmsf._utils.caching import content_digest, key_of, once, source_digest
+from avmsf._utils.caching import content_digest, once, source_digest
 from avmsf._utils.compiled import lane_count
 from avmsf.errors import SimulationError
 from avmsf.fem.body_meshes import (
@@ -334,7 +334,7 @@ class CandidateBodies:
             "support": None if support is None else asdict(support), "material": asdict(self._material),
             "surface": surface.digest(), "version": version("avmsf"), "source": source_digest(__name__),
         }  # fmt: skip
-        return modes_once(self._cache / f"nominal-{key_of(values)}.safetensors", compute, log=self._log)
+        return modes_once(self._cache / f"nominal-{content_digest(values)[:24]}.safetensors", compute, log=self._log)
 
     def _make_solid(self, thickness: float | None, dofs: int, *, closed: bool = False) -> Solid:
         """Return about so many degrees of freedom of a wall of a thickness, meters, or of all that is enclosed."""

@@ -306,23 +306,28 @@ def restored_modes(tensors: Mapping[str, Tensor], prefix: str) -> ElasticModes:
     return ElasticModes(frequency, nodes, rows, shapes.double(), NOMINAL, mass=0.0)
 
 
-def save_modes(modes: ElasticModes, path: Path) -> None:
-    """Write modes to one file, which `load_modes` reads back to the last bit.
+def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: Callable[[str], None]) -> ElasticModes:
+    """Return the modes that `path` keeps, or compute them and keep them there, where that is possible; None keeps none.
 
-    A file that is there stays whole until the new one is. Raises SimulationError where it cannot be written.
+    A damaged file is made again, and `log` is called. Raises as `compute`.
     """
-    tensors = mode_tensors(modes) | {"shapes": modes.shapes}
-    if modes.perturbations is not None:
-        tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
-    header = json.dumps({"mass": modes.mass, "material": asdict(modes.material)}, allow_nan=False)
-    write_tensors(path, tensors, header, _KIND)
+    # Unlike Path.is_file, this is False where the folder cannot be read.
+    if path is not None and os.path.isfile(path):
+        try:
+            return _read(path)
+        except SimulationError as error:
+            log(f"computing the modes again ({error})")
+    modes = compute()
+    if path is not None:
+        tensors = mode_tensors(modes) | {"shapes": modes.shapes}
+        if modes.perturbations is not None:
+            tensors |= {name: torch.from_numpy(getattr(modes.perturbations, name)) for name in _PERTURBATIONS}
+        header = json.dumps({"mass": modes.mass, "material": asdict(modes.material)}, allow_nan=False)
+        keep_if_possible(lambda: write_tensors(path, tensors, header, _KIND), path)
+    return modes
 
 
-def load_modes(path: Path) -> ElasticModes:
-    """Read modes that `save_modes` wrote.
-
-    Raises SimulationError for a file that is missing, cut short or of another kind.
-    """
+def _read(path: Path) -> ElasticModes:
     header, tensors = read_tensors(path, _KIND)
     try:
         record = parse_json(header)
@@ -333,20 +338,3 @@ def load_modes(path: Path) -> ElasticModes:
         )  # fmt: skip
     except (ValueError, TypeError, KeyError) as error:
         raise _KIND.damaged(path, error, name="modes") from error
-
-
-def modes_once(path: Path | None, compute: Callable[[], ElasticModes], *, log: Callable[[str], None]) -> ElasticModes:
-    """Return the modes that `path` keeps, or compute them and keep them there, where that is possible; None keeps none.
-
-    A damaged file is made again, and `log` is called. Raises as `compute`.
-    """
-    # Unlike Path.is_file, this is False where the folder cannot be read.
-    if path is not None and os.path.isfile(path):
-        try:
-            return load_modes(path)
-        except SimulationError as error:
-            log(f"computing the modes again ({error})")
-    modes = compute()
-    if path is not None:
-        keep_if_possible(lambda: save_modes(modes, path), path)
-    return modes

@@ -42,12 +42,6 @@ def adjacency(mesh: Trimesh) -> scipy.sparse.csr_array:
     return joined + joined.T
 
 
-def components(pairs: Int[np.ndarray, "pairs 2"], count: int) -> Int[np.ndarray, " items"]:
-    """Return the number of the connected component of each of `count` items, given pairs that are connected."""
-    links = scipy.sparse.csr_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    return scipy.sparse.csgraph.connected_components(links, directed=False)[1]
-
-
 def even_points(mesh: Trimesh, count: int = 2000) -> Float64[np.ndarray, "samples 3"]:
     """Return points of even density on a mesh, always the same."""
     reached = np.cumsum(mesh.area_faces)
@@ -56,12 +50,6 @@ def even_points(mesh: Trimesh, count: int = 2000) -> Float64[np.ndarray, "sample
     u, v = (np.arange(1, count + 1)[:, None] * np.array([0.7548776662466927, 0.5698402909980532]) % 1.0).T
     weights = np.stack([1.0 - np.sqrt(u), np.sqrt(u) * (1.0 - v), np.sqrt(u) * v], axis=1)
     return np.einsum("pc,pcd->pd", weights, mesh.triangles[rows])
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors of length 1 along the last axis; what has no length stays."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1.0)
 
 
 def remeshed(mesh: Trimesh, length: float) -> Trimesh:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from avmsf._utils.text import like
+from avmsf._utils.text import like, record_of
 from avmsf.capture.impacts import Impacts
 from avmsf.fem.material import MATERIALS, NOMINAL, STIFFEST, Material, factor_range
 from avmsf.fem.supports import FREE
@@ -45,9 +45,9 @@ class FieldQuality:
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> "FieldQuality":
-        """Return it from plain values, as they are in a file."""
-        contact = record.get("next_contact")
-        return cls(**{**record, "next_contact": None if contact is None else tuple(contact)})
+        """Return it from plain values, as they are in a file. Raises RecordError."""
+        added = dict.fromkeys(("next_contact", "next_distance", "nearest")) | {"standard_error": 0.0}
+        return record_of(cls, record, "quality", added=added)
 
     def __str__(self) -> str:
         """Return the verdict, and the advice if there is any."""

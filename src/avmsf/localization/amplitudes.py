@@ -89,9 +89,24 @@ class Extractor:
     def separated(self) -> tuple[Complex128[Tensor, "modes modes"], Float64[Tensor, " modes"]]:
         """Mixing, unitary, whose conjugate transpose makes mixtures of amplitudes with uncorrelated errors; and spread.
 
-        Spread is the variance of each mixture's error where the noise has variance one.
+        Spread is the variance of each mixture's error where the noise has variance one. Only modes that hang together
+        are mixed. What tells sine from cosine in a mode's errors is left out: it is little for a mode that turns more
+        than once before it ends.
         """
-        return _separate(self.inverse)
+        modes = len(self.bank)
+        sine, cosine = self.inverse[:modes, :modes], self.inverse[modes:, modes:]
+        mixed = self.inverse[modes:, :modes]
+        covariance = torch.complex(sine + cosine, mixed - mixed.T)
+        spread = torch.diagonal(covariance).real.clone()
+        coherence = covariance.abs() / (spread.sqrt()[:, None] * spread.sqrt())
+        mixing = torch.eye(modes, dtype=torch.complex128)
+        _, groups = connected_components(csr_array((coherence > _COHERENT).numpy()), directed=False)
+        for label in np.flatnonzero(np.bincount(groups) > 1):
+            group = torch.from_numpy(np.flatnonzero(groups == label))
+            values, vectors = torch.linalg.eigh(covariance[group][:, group])
+            spread[group] = values.clamp_min(torch.finfo(torch.float64).tiny)
+            mixing[group[:, None], group[None]] = vectors
+        return mixing, spread
 
     def extract(self, sound: Float[Tensor, " samples"], *, color: Residual | None) -> Amplitudes:
         """Return the amplitudes in a sound; `color` is the noise to expect, of which the shape alone counts.
@@ -178,10 +193,14 @@ class Extractor:
         self, sound: Float[Tensor, " samples"], values: Complex128[Tensor, " modes"], color: Residual
     ) -> tuple[Float64[Tensor, " bands"], float]:
         """Return the noise's power in bands up to half the sample rate, and on the mean what is there throughout."""
-        modelled = self._sounds(values[None])[0]
+        rest = sound.double() - self._sounds(values[None])[0]
         # Each amplitude takes its share of the noise away.
         free = self.samples / max(self.samples - 2 * len(self.bank), 0.5 * self.samples)
-        cells = free * _cell_power(sound.double() - modelled)
+        # Overlapping frames, in whose bands white noise of variance v has a mean power of v.
+        size = min(_BAND, 2 ** int(math.log2(max(self.samples // 2, 2))))
+        window = torch.hann_window(size, dtype=torch.float64)
+        power = torch.fft.rfft(rest.unfold(0, size, size // 2) * window).abs().square()
+        cells = free * (power / window.square().sum())
         own = cells.mean(0)
         shape = interpolate(color.magnitude.double()[None, None], len(own), mode="linear", align_corners=True)[0, 0]
         shape = shape.square()
@@ -191,52 +210,14 @@ class Extractor:
         # Bands that resampling has emptied are the quietest of all, and tell nothing of the noise in the others.
         held = max(2, int(self.highest / (0.5 * self.sample_rate) * len(own)))
         level = shape * torch.quantile((own / shape)[:held], _NOISE_QUANTILE)
-        floor = float(shape[:held].sum()) / len(shape) * _steady((cells / shape)[:, :held])
-        return torch.maximum(own, level), floor
+        # Noise's power in a cell is distributed exponentially, so that a quiet cell tells the mean. What dies away is
+        # no noise, however broad: its later cells are quiet.
+        even = (cells / shape)[:, :held].flatten()
+        quiet = float(torch.kthvalue(even, max(1, round(_NOISE_QUANTILE * len(even)))).values)
+        steady = quiet / -math.log1p(-_NOISE_QUANTILE)
+        return torch.maximum(own, level), float(shape[:held].sum()) / len(shape) * steady
 
 
 def _stretched(finer: Float64[np.ndarray, " finer"], factor: float, samples: int) -> Float64[Tensor, " samples"]:
     """Return the first samples of a sound with its time times a factor, of its values at `_FINER` times the rate."""
     return torch.from_numpy(np.interp(np.arange(samples) * (_FINER / factor), np.arange(len(finer)), finer))
-
-
-def _separate(
-    inverse: Float64[Tensor, "two_modes two_modes"],
-) -> tuple[Complex128[Tensor, "modes modes"], Float64[Tensor, " modes"]]:
-    """Return mixtures of complex amplitudes whose errors are uncorrelated, and the variances of these.
-
-    Only modes that hang together are mixed. What tells sine from cosine in a mode's errors is left out: it is little
-    for a mode that turns more than once before it ends.
-    """
-    modes = len(inverse) // 2
-    sine, cosine = inverse[:modes, :modes], inverse[modes:, modes:]
-    mixed = inverse[modes:, :modes]
-    covariance = torch.complex(sine + cosine, mixed - mixed.T)
-    spread = torch.diagonal(covariance).real.clone()
-    coherence = covariance.abs() / (spread.sqrt()[:, None] * spread.sqrt())
-    mixing = torch.eye(modes, dtype=torch.complex128)
-    _, groups = connected_components(csr_array((coherence > _COHERENT).numpy()), directed=False)
-    for label in np.flatnonzero(np.bincount(groups) > 1):
-        group = torch.from_numpy(np.flatnonzero(groups == label))
-        values, vectors = torch.linalg.eigh(covariance[group][:, group])
-        spread[group] = values.clamp_min(torch.finfo(torch.float64).tiny)
-        mixing[group[:, None], group[None]] = vectors
-    return mixing, spread
-
-
-def _cell_power(sound: Float64[Tensor, " samples"]) -> Float64[Tensor, "frames bands"]:
-    """Return the power in bands of overlapping frames: white noise of variance v gives v on the mean."""
-    size = min(_BAND, 2 ** int(math.log2(max(len(sound) // 2, 2))))
-    window = torch.hann_window(size, dtype=torch.float64)
-    frames = sound.unfold(0, size, size // 2) * window
-    return torch.fft.rfft(frames).abs().square() / window.square().sum()
-
-
-def _steady(cells: Float64[Tensor, "frames bands"]) -> float:
-    """Return the mean power of the noise that is there throughout, from the quiet ones among cells of even noise.
-
-    Noise's power in a cell is distributed exponentially, so that a quiet cell tells the mean. What dies away is no
-    noise, however broad: its later cells are quiet.
-    """
-    floor = torch.kthvalue(cells.flatten(), max(1, round(_NOISE_QUANTILE * cells.numel()))).values
-    return float(floor) / -math.log1p(-_NOISE_QUANTILE)

@@ -7,8 +7,7 @@ import manifold3d
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.surface import Surface
@@ -58,10 +57,8 @@ def enclose(
 def _without_specks(
     vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"]
 ) -> tuple[Float64[np.ndarray, "kept 3"], Int[np.ndarray, "remaining 3"]]:
-    ends = triangles[:, [0, 1]], triangles[:, [1, 2]]
-    rows, columns = np.concatenate(ends).T
-    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(len(vertices), len(vertices)))
-    part = connected_components(links, directed=False)[1][triangles[:, 0]]
+    ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    part = connected_component_labels(ends, len(vertices))[triangles[:, 0]]  # type: ignore[no-untyped-call]
     corners = vertices[triangles]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     size = np.bincount(part, weights=areas)

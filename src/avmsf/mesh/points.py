@@ -141,6 +141,6 @@ def _centers(
 
 def _expect_rows(points: Float[Tensor, "points 3"], count: int, start: int) -> None:
     if not 1 <= count <= len(points):
-        raise EvaluationError(f"expected 1 to {len(points)} points, got {count}", name="count", value=count)
+        raise EvaluationError.expected(f"1 to {len(points)} points", count, name="count")
     if not 0 <= start < len(points):
         raise EvaluationError.expected(f"a point from 0 to {len(points) - 1}", start, name="start")

@@ -98,6 +98,19 @@ class TexturedMesh:
         """The shape alone."""
         return Surface(self.vertices, self.faces)
 
+    @cached_property
+    def corner_colors(self) -> Float[Tensor, "faces 3 3"]:
+        """Each corner's color times that of the texel there, on the face's side of where two texels meet; 0 to 1."""
+        inside = torch.lerp(self.coordinates.double(), self.coordinates.double().mean(1, keepdim=True), 1e-4)
+        colors = self.colors.clone()
+        for number, texture in enumerate(self.textures):
+            chosen, size = self.materials == number, torch.tensor(texture.shape[1::-1])
+            # Images count rows downwards, v counts up.
+            places = torch.floor(inside[chosen] * torch.tensor([1, -1]) * size).long()
+            column, row = places.remainder(size).unbind(2)
+            colors[chosen] *= texture[row, column].float() / 255.0
+        return colors
+
 
 def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh:
     """Read a mesh whose coordinates count `meters` each, with its textures, vertex colors or face colors.
@@ -140,15 +153,15 @@ def corner_normals(vertices: Float[np.ndarray, "points 3"], faces: Int[np.ndarra
     Where a face leans more than `CREASE` from that mean, its corner keeps the face's own normal.
     """
     corners = vertices.astype(np.float64)[faces]
-    sides = _unit(np.roll(corners, -1, axis=1) - corners)
+    sides = unit(np.roll(corners, -1, axis=1) - corners)
     # At each corner, the side that leaves it and the one that arrives, turned round.
     angles = np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(axis=-1), -1, 1))
-    flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    flat = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     total = np.zeros((len(vertices), 3))
     for axis in range(3):
         weights = angles * flat[:, axis, None]
         total[:, axis] = np.bincount(faces.ravel(), weights=weights.ravel(), minlength=len(vertices))
-    smooth = _unit(total)[faces]
+    smooth = unit(total)[faces]
     sharp = (smooth * flat[:, None]).sum(axis=-1) < math.cos(math.radians(CREASE))
     return np.where(sharp[..., None], flat[:, None], smooth)
 
@@ -209,6 +222,7 @@ def _missing_images(path: Path) -> dict[str, str]:
     return lacking
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors of length 1 along the last axis; what has no length stays."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1.0)

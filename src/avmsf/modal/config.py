@@ -3,7 +3,7 @@
 import math
 from typing import Literal
 
-from avmsf.errors import ArrayError, ExtractionError
+from avmsf.errors import ArrayError
 
 ExtractionMethod = Literal["high-resolution", "short-time"]
 """high-resolution: ESPRIT in subbands. short-time: the paper's, bin by bin of a short-time spectrum.
@@ -13,12 +13,6 @@ PulseShape = Literal["half-sine", "hertz"]
 """How a hammer's force rises and falls: a mass on a linear spring, or on a Hertzian contact."""
 MAX_CONTACT_SECONDS = 0.02
 """Longest contact of an impact, seconds."""
-
-
-def expect_modes(modes: int) -> None:
-    """Raise `ExtractionError` unless at least one mode is asked for."""
-    if modes < 1:
-        raise ExtractionError.expected("1 or more", modes, name="modes")
 
 
 def scaled_fft_size(fft_size: int, *, sample_rate: float) -> int:

@@ -1,7 +1,7 @@
 """Views of a mesh, rendered by casting rays: what stands for photographs where there is a scan."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -206,15 +206,13 @@ def render_views(
     ambient: float = AMBIENT,
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     supersample: int = 3,
-    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[View, ...]:
     """Return one view of the mesh from each camera, called view_000, view_001, ..., with masks.
 
     Each pixel is the mean of `supersample` x `supersample` rays on an even grid; the mask says how many met the mesh,
     and `background` (red, green, blue, 0 to 1) fills what they left. Both sides of every face are seen. `ambient` is
-    the part of the light that comes from everywhere: with 1 the surface has its own colors (albedo). `progress` is
-    called with the number of views done and their total. Raises CaptureError for no camera and for values out of
-    range.
+    the part of the light that comes from everywhere: with 1 the surface has its own colors (albedo). Raises
+    CaptureError for no camera and for values out of range.
     """
     if not cameras:
         raise CaptureError.expected("cameras to render from", 0, name="cameras", advice="`orbit_cameras` makes some")
@@ -222,12 +220,8 @@ def render_views(
         raise CaptureError.expected("a supersample of at least 1", supersample, name="supersample")
     if not all(0 <= value <= 1 for value in background):
         raise CaptureError.expected("numbers from 0 to 1", background, name="background")
-    painter, views = _Painter(mesh, ambient, background, supersample), list[View]()
-    for number, camera in enumerate(cameras):
-        views.append(painter.view(camera, f"view_{number:03d}"))
-        if progress is not None:
-            progress(number + 1, len(cameras))
-    return tuple(views)
+    painter = _Painter(mesh, ambient, background, supersample)
+    return tuple(painter.view(camera, f"view_{number:03d}") for number, camera in enumerate(cameras))
 
 
 def orbit_cameras(

@@ -80,8 +80,6 @@ class LiftConfig:
     """Point spacings within which the nearest point is a symmetric counterpart; 0 takes it at any distance (paper)."""
     positions: bool = True
     """Begin the features with the points' positions relative to the object's size."""
-    feature_size: float = 0.3
-    """Root mean square length of the components after positions, which are about .5 long; without them it is 1."""
     onto: Literal["mesh", "gaussians"] = "mesh"
     """Points of the features for a folder with a mesh only: on its surface, or Gaussians fitted to images of it."""
     points: int = 8192
@@ -98,8 +96,6 @@ class LiftConfig:
         if self.standardize and self.components:
             advice = "set components to 0, or leave standardize out"
             raise SceneError.expected("no components", self.components, name="standardize", advice=advice)
-        if not 0 < self.feature_size < math.inf:
-            raise SceneError.expected("more than 0", self.feature_size, name="feature_size")
 
 
 @dataclass(frozen=True)

@@ -79,8 +79,8 @@ def finish_features(lifted: Lifted, config: LiftConfig) -> tuple[FeatureField, d
     """
     features = lifted.features
     if config.components:
-        # Before pooling, which is meant to shrink what is noise.
-        features = resize(reduce(features, config.components), config.feature_size if config.positions else 1.0)
+        # Before pooling, which is meant to shrink what is noise. Positions are about .5 long.
+        features = resize(reduce(features, config.components), 0.3 if config.positions else 1.0)
     else:
         expect_varied(features)
         if config.standardize:

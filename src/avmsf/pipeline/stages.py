@@ -6,10 +6,9 @@ made, after those that it depends on, when it is first asked for, unless a `Stag
 
 import hashlib
 import json
-import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,8 @@ from avmsf._utils.caching import discard, source_digest
 from avmsf._utils.files import write_whole
 from avmsf._utils.processes import WAIT, write_lock
 from avmsf._utils.progress import ProgressListener
-from avmsf._utils.text import read_json
+from avmsf._utils.text import read_json_object
+from avmsf.capture.filenames import files_in
 from avmsf.errors import CaptureError
 
 
@@ -94,7 +94,9 @@ class StageFolder:
         key = {"version": avmsf.__version__, "source": source_digest(stage.make.__module__), **stage.recipe()}
         key |= {"inputs": {each: kept.digest for each, kept in inputs.items()}}
         wanted = json.loads(json.dumps(key, sort_keys=True))
-        known = _read(record)
+        known: dict[str, Any] = {}
+        with suppress(CaptureError):
+            known = read_json_object(record, raising=CaptureError)
         same = known.get("recipe") == wanted
         current = same and path.exists() and digest_of(path) == known.get("digest")
         if not same:
@@ -139,26 +141,9 @@ class Pipeline:
         return self[stage.name]
 
 
-def digest_of(path: Path, *, hidden: bool = True) -> str:
-    """Return a digest of a file's content, or of the names and contents of all files in a folder, or all not `hidden`.
-
-    Hidden is what has a name that begins with a dot, or lies in such a folder, as in that of a cache.
-    """
-    if path.is_dir():
-        inside = ((each, each.relative_to(path).parts) for each in _files_in(path))
-        shown = (each for each, parts in inside if hidden or not any(part.startswith(".") for part in parts))
-        return digest_files(shown, root=path)
-    return digest_files([path], root=path.parent)
-
-
-def _files_in(folder: Path) -> Iterator[Path]:
-    """Yield the files in a folder and in those inside it, also behind symbolic links, each folder once."""
-    seen = {folder.resolve()}
-    for inside, folders, names in os.walk(folder, followlinks=True):
-        new = {name: Path(inside, name).resolve() for name in sorted(folders)}
-        folders[:] = [name for name, place in new.items() if place not in seen]
-        seen.update(new.values())
-        yield from (each for name in names if (each := Path(inside, name)).is_file())
+def digest_of(path: Path) -> str:
+    """Return a digest of a file's content, or of the names and contents of `files_in` a folder."""
+    return digest_files(files_in(path), root=path) if path.is_dir() else digest_files([path], root=path.parent)
 
 
 def digest_files(paths: Iterable[Path], *, root: Path) -> str:
@@ -170,13 +155,3 @@ def digest_files(paths: Iterable[Path], *, root: Path) -> str:
             # The digest of all goes on with each file, as the function returns it in place of a new one.
             hashlib.file_digest(file, lambda: digest)
     return digest.hexdigest()
-
-
-def _read(record: Path) -> dict[str, Any]:
-    """Return a record, or an empty one where there is none that can be read: its stage then runs again."""
-    try:
-        known = read_json(record)
-    except (OSError, ValueError):
-        return {}
-    complete = isinstance(known, dict) and {"recipe", "digest", "seconds"} <= known.keys()
-    return known if complete else {}

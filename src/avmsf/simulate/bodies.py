@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf._utils.caching import key_of
+from avmsf._utils.caching import content_digest
 from avmsf.errors import SimulationError
 from avmsf.fem.elastic_modes import ElasticModes, elastic_modes, modes_once
 from avmsf.fem.material import material_named
@@ -51,7 +51,7 @@ def make_body(recipe: ObjectRecipe, *, cache: Path | None, log: Callable[[str], 
     """
     mesh, make_solid = _shape(recipe)
     legs = support_places(mesh.surface.vertices.double(), up_of(recipe), generator=stream(recipe.seed, "supports"))
-    kept = None if cache is None else cache / f"modes-{key_of(recipe.elastic_values())}.safetensors"
+    kept = None if cache is None else cache / f"modes-{content_digest(recipe.elastic_values())[:24]}.safetensors"
 
     def compute() -> ElasticModes:
         log("dividing the body into tetrahedra")

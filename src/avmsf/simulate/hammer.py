@@ -73,29 +73,13 @@ def peak_forces(
 def pulse_spectrum(
     hammer: Hammer, poles: Complex128[Tensor, " modes"], times: Float64[Tensor, " contacts"]
 ) -> Complex128[Tensor, "contacts modes"]:
-    """Return the Laplace transform of each impact's pulse, scaled to a peak of one newton, at the poles; seconds."""
-    turns = times[:, None] * poles[None, :]
-    if hammer.pulse == "half-sine":
-        return times[:, None] * (2.0 / math.pi) * _half_sine(turns)
-    return times[:, None] * (_HERTZ_AREA / math.pi) * _hertz(turns)
+    """Return the Laplace transform of each impact's pulse, scaled to a peak of one newton, at the poles; seconds.
 
-
-def _half_sine(turns: Complex128[Tensor, "contacts modes"]) -> Complex128[Tensor, "contacts modes"]:
-    """Return the transform of the pulse of unit area; `turns` is s tau."""
-    below = math.pi**2 + turns.square()
-    # Zero over zero where the pulse lasts half a cycle of an undamped mode.
-    resonant = below.abs() < 1e-9
-    plain = (1.0 + torch.exp(-turns)) / torch.where(resonant, 1.0, below)
-    return 0.5 * math.pi**2 * torch.where(resonant, -torch.exp(-turns) / (2.0 * turns), plain)
-
-
-def _hertz(turns: Complex128[Tensor, "contacts modes"]) -> Complex128[Tensor, "contacts modes"]:
-    """Return the transform of the pulse of unit area.
-
-    The integral of sin(x)^(v - 1) exp(i b x) from 0 to pi is, with v = 5/2 and i b = -s tau / pi,
+    The integral of sin(x)^(v - 1) exp(i b x) from 0 to pi is, with i b = -s tau / pi,
     pi exp(i b pi / 2) Gamma(v + 1) / (2^(v - 1) v Gamma((v + b + 1) / 2) Gamma((v - b + 1) / 2)).
     """
-    b = 1j * turns.numpy() / math.pi
-    logarithm = loggamma((3.5 + b) / 2.0) + loggamma((3.5 - b) / 2.0)
-    scale = math.pi * math.gamma(3.5) / (2.0**1.5 * 2.5 * _HERTZ_AREA)
-    return torch.from_numpy(scale * np.exp(0.5j * math.pi * b - logarithm))
+    v, area = (2.0, 2.0) if hammer.pulse == "half-sine" else (2.5, _HERTZ_AREA)
+    b = 1j * (times[:, None] * poles[None, :]).numpy() / math.pi
+    logarithm = loggamma((v + 1.0 + b) / 2.0) + loggamma((v + 1.0 - b) / 2.0)
+    scale = math.pi * math.gamma(v + 1.0) / (2.0 ** (v - 1.0) * v * area)
+    return times[:, None] * (area / math.pi) * torch.from_numpy(scale * np.exp(0.5j * math.pi * b - logarithm))

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 
 from avmsf._utils.files import new_folder
@@ -22,15 +23,12 @@ _CIRCLES = 3
 """Circles of cameras around an object."""
 
 
-def write_simulation(
-    simulation: Simulation, folder: str | Path, *, progress: Callable[[int, int], None] | None = None
-) -> None:
+def write_simulation(simulation: Simulation, folder: str | Path) -> None:
     """Write a folder that `read_capture`, `read_views` and `read_truth` read, and any tool that takes captures.
 
     It holds impacts.csv, the wav files, capture.toml, truth.safetensors, and where the recipe asks for them the surface
     with the colors at its vertices (surface.ply) and transforms.json with images and masks. The folder appears whole or
-    not at all. `progress` is called with the number of pictures rendered and their total.
-    Raises SimulationError where the folder exists and is not empty, and where it cannot be written.
+    not at all. Raises SimulationError where the folder exists and is not empty, and where it cannot be written.
     """
     folder, recipe, mesh = Path(folder), simulation.recipe, simulation.mesh
     try:
@@ -46,7 +44,7 @@ def write_simulation(
                 cameras = orbit_cameras(
                     mesh.surface, size=recipe.view_size, azimuths=recipe.views // _CIRCLES, up=AXES[recipe.up]
                 )
-                write_frames(render_views(mesh, cameras, progress=progress), begun)
+                write_frames(render_views(mesh, cameras), begun)
             write_truth(simulation.truth, begun / TRUTH)
     except CaptureError as error:
         advice = "choose another folder"
@@ -77,14 +75,7 @@ def is_written(recipe: ObjectRecipe, folder: str | Path) -> bool:
 def write_painted(mesh: TexturedMesh, path: Path) -> None:
     """Write colors at vertices; where a vertex has another color in each face, every face gets corners of its own."""
     vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
-    pixels = np.zeros((*faces.shape, 3))
-    for number, texture in enumerate(mesh.textures):
-        chosen, size = mesh.materials.numpy() == number, np.array(texture.shape[1::-1])
-        # Images count rows downwards, v counts up.
-        places = np.floor(mesh.coordinates.numpy()[chosen] * (1, -1) * size).astype(np.int64)
-        column, row = np.moveaxis(places % size, -1, 0)
-        pixels[chosen] = texture.numpy()[row, column]
-    corners = np.rint(mesh.colors.numpy() * pixels).astype(np.uint8)
+    corners = (255.0 * mesh.corner_colors).round().to(torch.uint8).numpy()
     colors = np.zeros((len(vertices), 3), dtype=np.uint8)
     colors[faces.ravel()] = corners.reshape(-1, 3)
     if not np.array_equal(colors[faces], corners):

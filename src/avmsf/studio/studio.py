@@ -26,8 +26,6 @@ from avmsf.studio.session import Revision, Session
 class StudioConfig:
     """Options of the page other than what is opened."""
 
-    modes: int = 128
-    """Maximum number of modes of a reconstruction."""
     steps: int = 150
     """Steps towards a recording: half of the command line's, after which little changes."""
     preset: Preset = "default"
@@ -126,8 +124,7 @@ class Studio:
             raise bad_request("recordings", "one or more", 0, advice="record impacts first", status=409)
         # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
-        chosen = {"preset": self.config.preset, "modes": self.config.modes}
-        task = {"task": "make_field", "folder": str(editor.folder), "output": output, **chosen}
+        task = {"task": "make_field", "folder": str(editor.folder), "output": output, "preset": self.config.preset}
         return {"job": self.jobs.start("the reconstruction", task, self._take_field).identifier}
 
     async def make_object(self) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import sys
 import threading
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -73,7 +72,7 @@ def make_field(task: Values, events: EventWriter) -> Values:
     The copy is the field of this reconstruction, even if another one replaces `field` meanwhile.
     """
     folder = Path(task["folder"])
-    config = replace(PRESETS[task["preset"]], modes=int(task["modes"]))
+    config = PRESETS[task["preset"]]
     settings = settings_of(folder).starting(config.time_zero)
     events.log("capture: reading the recordings")
     capture, stages = read_capture(folder, settings), StageFolder(folder / CACHE)

@@ -78,7 +78,7 @@ def test_known_sines_in_noise_are_modes_and_nothing_else_is_found(contacts: int)
     assert float(quality.coherence.min()) > 0.99
     # Noise of a hundredth of the amplitude: a recording's own pole explains hardly more than the others' pole.
     assert float(quality.explained_left_out.min()) > 0.99
-    assert float(quality.stable_orders.min()) > 0.8
+    assert float(stable_orders(sounds, found.bank, sample_rate=RATE).min()) > 0.8
 
 
 def test_spreads_over_recordings_are_the_cramer_rao_bound() -> None:

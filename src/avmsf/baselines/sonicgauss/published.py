@@ -4,7 +4,6 @@ The folder is the one that the project's download makes: `model.safetensors` (Oo
 transformer with its pooled projection and duration), `model_2` (encoder of Gaussians), `model_3` (contact) and
 `model_4` (fusion). The text encoder and the decoder of Gaussians in these files are not used and not read."""
 
-import hashlib
 import math
 import warnings
 from collections.abc import Mapping
@@ -189,18 +188,6 @@ class PublishedSonicGauss(nn.Module):
             return_dict=False,
         )[0]
         return found
-
-
-def folder_digest(folder: Path) -> str:
-    """Return a digest of the names and sizes of a folder's weights and of the first and last mebibyte of each."""
-    digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.safetensors")):
-        digest.update(f"{path.name}\0{path.stat().st_size}\0".encode())
-        with open(path, "rb") as file:
-            digest.update(file.read(1 << 20))
-            file.seek(max(0, path.stat().st_size - (1 << 20)))
-            digest.update(file.read())
-    return digest.hexdigest()[:16]
 
 
 def _load(part: nn.Module, path: Path) -> None:

@@ -118,8 +118,11 @@ def stable_orders(
     """Return the part of the model orders at which each mode is found again, from 0 to 1: its stability diagram.
 
     Orders from 2 to 32 of a matrix pencil in a band about the mode, in a beginning of the sounds over which it dies.
+    All sounds count alike, however loud.
     """
     stable = torch.zeros(len(bank), dtype=torch.float64)
+    sounds = sounds.double() - sounds.double().mean(1, keepdim=True)
+    sounds = torch.nn.functional.normalize(sounds, dim=1)
     samples = sounds.shape[1]
     lengths = [samples]
     while lengths[-1] >= 2 * SHORTEST:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float64
 from scipy.special import gammainccinv
 from torch import Tensor
 
-from avmsf.modal.config import expect_modes
+from avmsf.errors import ExtractionError
 from avmsf.modal.extraction.esprit import SHORTEST, candidates
 from avmsf.modal.extraction.frequency_shifts import FrequencyShifts, find_shifts
 from avmsf.modal.extraction.least_squares import NormalEquations, refine
@@ -219,7 +219,8 @@ class ModeFinder(ABC):
     """Maximum number of modes, the strongest as the method has it."""
 
     def __post_init__(self) -> None:
-        expect_modes(self.modes)
+        if self.modes < 1:
+            raise ExtractionError.expected("1 or more", self.modes, name="modes")
 
     @abstractmethod
     def find(self, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> ModalBank:

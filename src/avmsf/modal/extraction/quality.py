@@ -31,7 +31,6 @@ from jaxtyping import Bool, Complex128, Float, Float64
 from scipy.special import betaincc, gammaincc
 from torch import Tensor
 
-from avmsf.modal.extraction.esprit import stable_orders
 from avmsf.modal.extraction.extract import Extraction
 from avmsf.modal.extraction.least_squares import NormalEquations
 from avmsf.modal.inner_products import poles_of
@@ -50,8 +49,6 @@ class ModeQuality:
     """Root mean square distance of the recordings' own frequencies, each weighted by how well it determines it, Hz."""
     damping_spread: Float64[Tensor, " modes"]
     """The same of the dampings, 1/s."""
-    stable_orders: Float64[Tensor, " modes"]
-    """Part of the model orders at which a matrix pencil finds the pole, from 0 to 1 (`esprit.stable_orders`)."""
     coherence: Float64[Tensor, " modes"]
     """Coherence of the phase over recordings: one if it is the same in all modulo pi, about n^(-1/2) if random."""
     energy_share: Float64[Tensor, " modes"]
@@ -96,7 +93,6 @@ def measure_quality(
     return ModeQuality(
         frequency_spread=spread[:, 0],
         damping_spread=spread[:, 1],
-        stable_orders=stable_orders(scaled, bank, sample_rate=sample_rate),
         coherence=amplitudes.square().sum(0).abs() / amplitudes.abs().square().sum(0),
         energy_share=energy / energy.sum(),
         explained_left_out=explained_left_out,
