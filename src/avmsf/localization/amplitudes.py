@@ -213,8 +213,8 @@ class Extractor:
         # Noise's power in a cell is distributed exponentially, so that a quiet cell tells the mean. What dies away is
         # no noise, however broad: its later cells are quiet.
         even = (cells / shape)[:, :held].flatten()
-        quiet = float(torch.kthvalue(even, max(1, round(_NOISE_QUANTILE * len(even)))).values)
-        steady = quiet / -math.log1p(-_NOISE_QUANTILE)
+        low = float(torch.kthvalue(even, max(1, round(_NOISE_QUANTILE * len(even)))).values)
+        steady = low / -math.log1p(-_NOISE_QUANTILE)
         return torch.maximum(own, level), float(shape[:held].sum()) / len(shape) * steady
 
 
