@@ -8,7 +8,8 @@ mathematics of the Gaussian process, docs/gain-models.md all formulas with their
 
 Types: `SoundField` (`sound_field`); `GainModel` with `AttentionGains` (the paper's network), `MixtureGains`,
 `BodyGains` (a guess without recordings) and `ScaledGains` (edits); `FitConfig` (`config`). `store` has the file.
-`next_contacts`: where to strike next, of the places that can be struck; `probable_body`: the body of most evidence.
+`next_contacts`: where to strike next, of the places that can be struck; `quality`: its errors by leave-one-out, and the
+body of most evidence.
 """
 
 import lazy_loader
