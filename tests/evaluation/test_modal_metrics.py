@@ -314,9 +314,6 @@ def test_like_is_near_unlike_far_and_a_seed_gives_the_same_space():
 @pytest.mark.parametrize(
     ("make", "attributes"),
     [
-        (lambda: pitches(bank([])), {"name": "bank", "value": 0}),
-        (lambda: pitches(bank([100.0, 0.0])), {"row": 1, "name": "frequency", "value": 0.0}),
-        (lambda: pitches_and_dampings(bank([100.0], -1.0)), {"row": 0, "name": "damping", "value": -1.0}),
         (lambda: check_materials(["wood"] * 4), {"name": "materials", "value": (4, 1)}),
         (lambda: space_of(*labelled()).embedding, {"name": "umap-learn"}),
     ],

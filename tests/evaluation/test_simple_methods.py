@@ -93,12 +93,6 @@ def test_the_floor_is_the_noise_alone():
     assert 10 * math.log10(float(left)) < -90.0
 
 
-def test_an_extraction_of_other_impacts_is_refused():
-    train, test = split(plate_impacts(), 0.2)
-    with raises(EvaluationError, name="extraction", value=24):
-        MeanGains(train, true_extraction(test))
-
-
 def scattered(count: int, seed: int = 0) -> torch.Tensor:
     """Return points in a box, none near to another along its longest side."""
     drawn = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
