@@ -20,7 +20,7 @@ from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.report import draw_spectrogram, markdown, picture_levels, write_page, write_summary
 from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, listening_gain, write_flac
 from avmsf.evaluation.runner import run_objects
-from avmsf.evaluation.tables import CHOSEN_ON_TEST, Section, missing_of, object_values, sections, summarize
+from avmsf.evaluation.tables import CHOSEN_ON_TEST, Section, missing_of, sections, summarize, values_of
 from factories.plate_set import fill_plates
 
 IDENTITY = {
@@ -97,7 +97,7 @@ def test_the_damping_of_lower_env_on_test_contacts_has_a_row_that_says_so_and_is
     best, part = best_of((shared, own))
     assert CHOSEN_ON_TEST in [row[0] for row in part.rows]
     assert set(best) == {"paper", "paper-per-contact"}
-    assert CHOSEN_ON_TEST not in object_values(tested("3", (1.0, 1.0)), "farthest")
+    assert CHOSEN_ON_TEST not in values_of([tested("3", (1.0, 1.0))], "farthest")
 
 
 def test_a_failure_is_not_missing_but_a_method_or_an_object_that_has_not_run_is() -> None:
@@ -132,9 +132,9 @@ def test_parts_of_one_experiment_are_pooled_and_one_that_failed_spoils_all() -> 
         Outcome(f"all: {name}", "knn3", {"l1": (value,)}, {"mac": 0.5}) for name, value in (("u", 1.0), ("v", 5.0))
     ]
     whole = ObjectRecord("1", cases=parts, outcomes=tuple(outcomes))
-    assert object_values(whole, "all") == {"knn3": {"l1": 3.0, "mac": 0.5}}
-    assert object_values(replace(whole, outcomes=tuple(outcomes[:1])), "all") == {}
-    assert object_values(whole.adding(Outcome("all: v", "knn3", failure="no")), "all") == {}
+    assert values_of([whole], "all") == {"knn3": {"l1": {"1": 3.0}, "mac": {"1": 0.5}}}
+    assert values_of([replace(whole, outcomes=tuple(outcomes[:1]))], "all") == {}
+    assert values_of([whole.adding(Outcome("all: v", "knn3", failure="no"))], "all") == {}
 
 
 def test_figures_of_which_more_is_better_have_no_ratio() -> None:

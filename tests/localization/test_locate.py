@@ -241,7 +241,7 @@ NOISE = torch.randn(7200, generator=torch.Generator().manual_seed(0))
         (lambda: Force(1.0, spread_db=-1.0), {"name": "force.spread_db", "value": -1.0}),
         (lambda: locator_of().locate(torch.zeros(5000)), {"name": "sound", "value": "silence"}),
         (lambda: locator_of().locate(NOISE[:300]), {"name": "samples", "value": 300}),
-        (lambda: locator_of().locate(torch.full((5000,), torch.nan)), {"name": "finite", "value": 5000}),
+        (lambda: locator_of().locate(torch.full((5000,), torch.nan)), {"name": "sound", "row": 0}),
         (lambda: locator_of().locate(NOISE), {"name": "noise", "value": pytest.approx(1.0, abs=0.5)}),
         (lambda: locator_of().locate(SOUND, highest=50.0), {"name": "modes", "value": 50.0}),
         (lambda: Locator.of(true_field(), points=torch.zeros(0, 3)), {"name": "points"}),

@@ -69,12 +69,12 @@ def as_forces(values: float | int | ArrayLike, name: str, *, count: int) -> Floa
 
 
 def as_samples(values: ArrayLike, name: str) -> Float[Tensor, " samples"]:
-    """Return the samples of one channel, finite or not. Raises ArrayError for another shape and what are no numbers."""
+    """Return the samples of one channel. Raises ArrayError for another shape and what are no finite numbers."""
     found = as_floats(values, name)
     if found.ndim != 1:
         wanted, shape = "samples of one channel, in shape [samples]", list(found.shape)
         raise ArrayError.expected(wanted, shape, name=name, advice="give one channel")
-    return found
+    return _finite(found, name)
 
 
 def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows columns"]:

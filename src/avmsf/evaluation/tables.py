@@ -42,42 +42,33 @@ def labels_of(records: Iterable[ObjectRecord]) -> tuple[str, ...]:
     return max(found, key=len, default=())
 
 
-def object_values(
-    record: ObjectRecord, label: str, average: Callable[[Sequence[float]], float] = fmean
-) -> dict[str, dict[str, float]]:
-    """Return an object's figures in one experiment by method and metric: means over its contacts, or other averages.
-
-    A method that failed in any of the experiment's parts has none. `CHOSEN_ON_TEST` counts as a method.
-    """
-    keys = {case.key for case in record.cases if case.label == label}
-    pooled: dict[str, dict[str, list[float]]] = {}
-    for method in dict.fromkeys(each.method for each in record.outcomes):
-        outcomes = [each for each in record.outcomes if each.method == method and each.case in keys]
-        if len(outcomes) < len(keys) or any(each.failure is not None for each in outcomes):
-            continue
-        found = pooled.setdefault(method, {})
-        for each in outcomes:
-            for metric, values in (*each.values.items(), *((name, (one,)) for name, one in each.figures.items())):
-                found.setdefault(metric, []).extend(value for value in values if value is not None)
-    forms = [pooled[form] for form in DAMPING_FORMS if pooled.get(form, {}).get("envelope")]
-    if len(forms) == len(DAMPING_FORMS):
-        pooled[CHOSEN_ON_TEST] = min(forms, key=lambda found: fmean(found["envelope"]))
-    return {
-        method: {metric: average(values) for metric, values in found.items() if values}
-        for method, found in pooled.items()
-    }
-
-
 def values_of(
     records: Iterable[ObjectRecord], label: str, average: Callable[[Sequence[float]], float] = fmean
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Return all objects' figures in one experiment by method, metric and object, each as `object_values`."""
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    """Return figures in one experiment by method, metric and object: means over its contacts, or other averages.
+
+    A method that failed in any part of an object's experiment has none of it. `CHOSEN_ON_TEST` counts as a method.
+    """
+    table: dict[str, dict[str, dict[str, float]]] = {}
     for record in records:
-        for method, values in object_values(record, label, average).items():
-            for metric, value in values.items():
-                found.setdefault(method, {}).setdefault(metric, {})[record.identifier] = value
-    return found
+        keys = {case.key for case in record.cases if case.label == label}
+        pooled: dict[str, dict[str, list[float]]] = {}
+        for method in dict.fromkeys(each.method for each in record.outcomes):
+            outcomes = [each for each in record.outcomes if each.method == method and each.case in keys]
+            if len(outcomes) < len(keys) or any(each.failure is not None for each in outcomes):
+                continue
+            found = pooled.setdefault(method, {})
+            for each in outcomes:
+                for metric, values in (*each.values.items(), *((name, (one,)) for name, one in each.figures.items())):
+                    found.setdefault(metric, []).extend(value for value in values if value is not None)
+        forms = [pooled[form] for form in DAMPING_FORMS if pooled.get(form, {}).get("envelope")]
+        if len(forms) == len(DAMPING_FORMS):
+            pooled[CHOSEN_ON_TEST] = min(forms, key=lambda found: fmean(found["envelope"]))
+        for method, found in pooled.items():
+            for metric, all_values in found.items():
+                if all_values:
+                    table.setdefault(method, {}).setdefault(metric, {})[record.identifier] = average(all_values)
+    return table
 
 
 def means(table: Values, statistic: Callable[[Sequence[float]], Any] = fmean) -> dict[str, dict[str, Any]]:
