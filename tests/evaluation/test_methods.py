@@ -323,6 +323,8 @@ def test_a_field_of_few_points_has_no_more_regions():
 
 def test_unknown_names_are_refused_with_the_known_ones(tmp_path):
     refused = {"spline-gain": None, "audio": None, "recorded:": None, f"recorded:{tmp_path}/none": tmp_path / "none"}
+    (tmp_path / "file").touch()
+    refused |= {f"{kind}:{tmp_path}/file": tmp_path / "file" for kind in ("recorded", "sonicgauss")}
     for name, file in refused.items():
         with raises(EvaluationError, file=file, name="method", value=name) as caught:
             method_named(name)

@@ -223,6 +223,8 @@ def test_recordings_that_cannot_be_fitted_are_refused():
     impacts, modes = plate_impacts(), plate_extraction(plate_impacts())
     with raises(FitError, name="modes", value=12):
         plate_fit(SHORT, train=impacts.take(range(7)), modes=modes)
+    with raises(FitError, name="train", value="silence"):
+        plate_fit(SHORT, train=replace(impacts, sounds=torch.zeros_like(impacts.sounds)))
     with raises(FitError, name="modes", value=pytest.approx(2302.0, abs=1.0)):
         plate_fit(SHORT, train=replace(impacts, sample_rate=4000.0))
     for name, known in (("sounds", impacts.sounds), ("contacts", impacts.contacts), ("directions", torch.ones(12, 3))):

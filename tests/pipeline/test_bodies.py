@@ -1,5 +1,6 @@
 """Bodies behind a surface as hypotheses: what they predict, and which of them is made finer."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -161,24 +162,33 @@ def test_the_variance_by_noise_is_the_scatter_of_least_squares_gains() -> None:
         assert float(gain_variance(made)) == pytest.approx(scatter, rel=0.1)
 
 
-def test_contacts_that_do_not_lie_on_the_surface_have_no_bodies_and_the_remedy_is_told() -> None:
+def moved_body(move: Callable[[torch.Tensor], torch.Tensor]) -> CandidateBody:
+    """Return the true wall's body with its surface elsewhere."""
+    body = bodies()[1]
+    return replace(body, elastic=replace(body.elastic, nodes=move(body.elastic.nodes)))
+
+
+def test_a_body_that_the_contacts_do_not_lie_on_takes_no_part_and_the_remedy_is_told() -> None:
+    body = moved_body(lambda x: 1000.0 * x)
+    report = estimator(body).solve(case())[0].report
+    assert report["bodies"] == []
     with raises(FitError, name="contacts") as caught:
-        candidate_bodies(Surface(1000.0 * dome().vertices, dome().faces), impacts=recorded(12)[0])
+        estimator(body, kinds=("elastic",)).solve(case())
+    assert report["unavailable"]["elastic"] == str(caught.value)
     assert 'unit "mm"' in str(caught.value)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 12])
 def test_bodies_take_part_despite_rough_surfaces_thick_glue_and_a_wrong_row(count: int) -> None:
-    impacts, generator = recorded(count)[0], torch.Generator().manual_seed(4)
+    generator = torch.Generator().manual_seed(4)
+    contacts = recorded(count)[0].contacts
     size = float((points().amax(0) - points().amin(0)).norm())
-    noise = torch.randn(dome().vertices.shape, generator=generator)
-    rough = Surface(dome().vertices + 0.02 * size * noise, dome().faces)
-    above = impacts.contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
+    rough = moved_body(lambda x: x + 0.02 * size * torch.randn(x.shape, generator=generator, dtype=x.dtype))
+    above = contacts + 0.03 * size * torch.tensor([0.0, 0.0, 1.0])
     above[-1] += 0.5 * size
-    for surface, contacts in ((rough, impacts.contacts), (dome(), above)):
-        config = BodyConfig(wall=0.004, shapes=6, dofs=2000)
-        assert candidate_bodies(surface, config, impacts=replace(impacts, contacts=contacts)).bodies
+    for body, each in ((rough, contacts), (bodies()[1], above)):
+        assert estimator(body).solve(case(count, contacts=each))[0].report["bodies"]
 
 
 def no_symmetries() -> None:

@@ -18,7 +18,6 @@ from multiprocessing import connection, get_context
 from multiprocessing.context import SpawnProcess
 from types import ModuleType
 from typing import Any, TypeVar
-from unittest.mock import patch
 
 from avmsf._utils.processes import end_with_parent, ending_of
 from avmsf.errors import AvmsfError, WorkerError, from_extra
@@ -52,7 +51,7 @@ class _Processes:
         ours, theirs = context.Pipe()
         # Pickled here: what a task needs is loaded once its process knows how many threads it has.
         self.processes[ours] = context.Process(target=_work, args=(theirs, pickle.dumps((act, argument))), daemon=True)
-        with patch.dict(os.environ, _ONE_THREAD), theirs:
+        with _environment(_ONE_THREAD), theirs:
             self.processes[ours].start()
         return ours
 
@@ -211,6 +210,21 @@ def _ended_early(by: str, otherwise: str) -> WorkerError:
     return WorkerError.expected(
         wanted, by, got=f"ones that end early, {MAX_STARTS} in turn ({by})", name="worker", advice=advice
     )
+
+
+@contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Let processes that are started meanwhile have these environment variables."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def _imported_ray(raising: type[AvmsfError]) -> ModuleType:

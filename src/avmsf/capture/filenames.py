@@ -1,6 +1,5 @@
 """Names by which the files of a folder are recognized; importing this loads nothing that computes."""
 
-import os
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -31,18 +30,13 @@ def number_key(name: str) -> str:
 
 
 def files_in(folder: Path, *, deep: bool = True) -> list[Path]:
-    """Return the files in a folder, sorted, and `deep` in those beneath it, each once, also behind symbolic links.
+    """Return the files in a folder, sorted, and `deep` in those beneath it; none where there is no folder.
 
-    Hidden files and folders are left out: a cache in `.avmsf` holds images and recordings of its own. None where there
-    is no folder.
+    Hidden files and folders are left out: a cache in `.avmsf` holds images and recordings of its own.
     """
-    found, seen = list[Path](), {folder.resolve()}
-    for inside, folders, names in os.walk(folder, followlinks=True):
-        new = {each: place for each in sorted(folders) if (place := Path(inside, each).resolve()) not in seen}
-        folders[:] = [each for each in new if deep and not each.startswith(".")]
-        seen.update(new.values())
-        found += [path for each in names if not each.startswith(".") and (path := Path(inside, each)).is_file()]
-    return sorted(found)
+    paths = folder.rglob("*") if deep else folder.glob("*")
+    seen = (path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+    return sorted(path for path in seen if path.is_file())
 
 
 def pictures_in(folder: Path, *, deep: bool) -> list[Path]:

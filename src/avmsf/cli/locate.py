@@ -181,9 +181,11 @@ def _is_training(field: "SoundField", path: Path) -> bool:
     """Return whether a field was fitted to a file: a recording of its capture, the folder of that name around it."""
     path, origin = path.resolve(), field.origin
     owners = [each for each in path.parents if path.relative_to(each).as_posix() in origin.trained_on]
-    with suppress(CaptureError):
-        return any((settings_of(each).name or each.name) == origin.capture for each in owners)
-    return False
+    names = {each.name for each in owners}
+    for each in owners:
+        with suppress(CaptureError):
+            names = names - {each.name} | {settings_of(each).name or each.name}
+    return origin.capture in names
 
 
 def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:

@@ -69,7 +69,7 @@ def run(options: Options) -> int:
     sounds, rate = extraction.aligned(impacts).sounds, impacts.sample_rate
     quality = measure_quality(sounds, extraction, sample_rate=rate)
     stable = stable_orders(extraction.at_common_poles(sounds, sample_rate=rate), extraction.bank, sample_rate=rate)
-    modes, supporting = mode_rows(extraction.bank, level, quality.is_mode, quality, stable)
+    modes, supporting = mode_rows(extraction.bank, level, quality.is_mode, (quality, stable))
     aligned = AlignmentReport.of(extraction, impacts)
     shifts = None if extraction.shifts is None else extraction.shifts.relative
     shifted = "" if shifts is None else f"frequencies differ between recordings by {100 * shifts:.2g} %, fitted in each"

@@ -236,24 +236,27 @@ def mode_rows(
     bank: ModalBank,
     level_db: Float[Tensor, " modes"],
     is_mode: Bool[Tensor, " modes"],
-    quality: ModeQuality | None = None,
-    stable_orders: Float64[Tensor, " modes"] | None = None,
+    quality: tuple[ModeQuality, Float64[Tensor, " modes"]] | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the modes and the supporting poles as plain values, numbered together from 1 by frequency."""
+    """Return the modes and the supporting poles as plain values, numbered together from 1 by frequency.
+
+    `quality` is that of each pole, and the part of the model orders at which it is found.
+    """
     columns = {
         "frequency_hertz": bank.frequency,
         "damping_per_second": bank.damping,
         "t60_seconds": bank.t60,
         "level_db": level_db,
     }
-    if quality is not None and stable_orders is not None:
+    if quality is not None:
+        of_poles, stable_orders = quality
         columns |= {
-            "frequency_spread_hertz": quality.frequency_spread,
-            "damping_spread_per_second": quality.damping_spread,
+            "frequency_spread_hertz": of_poles.frequency_spread,
+            "damping_spread_per_second": of_poles.damping_spread,
             "stable_orders": stable_orders,
-            "phase_coherence": quality.coherence,
-            "energy_share": quality.energy_share,
-            "explained_left_out": quality.explained_left_out,
+            "phase_coherence": of_poles.coherence,
+            "energy_share": of_poles.energy_share,
+            "explained_left_out": of_poles.explained_left_out,
         }
     cells = zip(*(column.tolist() for column in columns.values()), strict=True)
     rows = [{"number": number, **dict(zip(columns, row, strict=True))} for number, row in enumerate(cells, start=1)]

@@ -80,7 +80,7 @@ def method_named(name: str) -> Method:
     if entry.path:
         given = name.partition(":")[2]
         path = Path(given).expanduser()
-        if not given or not path.exists():
+        if not given or not (path.is_dir() if entry.is_folder else path.is_file()):
             wanted = f"{entry.path} after `{kind_of(name)}:`"
             raise EvaluationError.expected(wanted, name, file=path if given else None, name="method")
         # However it is written: results of one path are those of one method.
@@ -178,8 +178,8 @@ class Recorded:
     def render(self, contacts: Contacts, *, directions: Contacts | None = None) -> Sounds:
         """Return the files' sounds, as they are.
 
-        Raises EvaluationError for a contact without a recording, for a missing file, and for one that is no sound, has
-        several different channels or another rate or length.
+        Raises EvaluationError for a contact without a recording, for a missing file, and for one that has several
+        different channels or another rate or length; CaptureError for one that is no sound.
         """
         sounds = [self._read(self._find(contact)) for contact in contacts]
         return torch.stack(sounds) if sounds else self.task.train.sounds[:0].float()

@@ -91,6 +91,8 @@ class MethodEntry:
     """The features that a function with `fit` reads, by the field that it asks for."""
     path: str = ""
     """The folder or file that it reads, as the setting `path`, for a method whose name goes on with `:` and a path."""
+    is_folder: bool = False
+    """Whether that is a folder."""
     is_edit: bool = False
     """Whether it edits sounds, of the protocol `edit` alone; its function gets an `editing.EditTask`."""
 
@@ -185,11 +187,13 @@ METHODS: dict[str, MethodEntry] = {
         "SonicGauss with its published weights, trained on ObjectFolder Real, fine-tuned",
         "methods:sonicgauss",
         path="a folder with the published weights",
+        is_folder=True,
     ),
     "recorded": MethodEntry(
         "sounds of another system, from files",
         make="methods:RecordedMethod",
         path="a folder with a folder of wav files for every object",
+        is_folder=True,
     ),
     "unedited": _edit("the field before the edit", "editing:unedited"),
     "generation": _edit("a sound that the model generates from the prompt alone", "editing:generation"),

@@ -68,7 +68,7 @@ def write_summary(
 
 
 def write_page(results: ResultsFolder) -> list[Section]:
-    """Write `report.html`, and return its parts. Raises EvaluationError where a stored sound is missing."""
+    """Write `report.html`, and return its parts. Raises CaptureError where a stored sound is missing."""
     records = results.records()
     parts = sections(records, results.identity())
     opening, *others = parts
@@ -187,7 +187,7 @@ def write_figures(results: ResultsFolder) -> list[Path]:
     Edits are drawn as moves in the embedding of their metric, one PNG for each two materials, and as CLAP scores over
     the steps. Sounds are drawn as spectrograms, the recording next to all methods, one PNG for each object and each
     label of its cases; localized contacts as heat maps with the true contact marked, one PNG for each field and
-    recording. Raises EvaluationError where a stored file is missing.
+    recording. Raises EvaluationError where a stored map is missing, CaptureError where a sound is.
     """
     drawn, records = (_write_spectrograms, _write_maps), results.records()
     paths = [path for record in records for draw in drawn for path in draw(record, results.path)]

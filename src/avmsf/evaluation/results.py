@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,11 @@ class ResultsFolder:
             made, got = f"results of {name} {_brief(asked.get(name))}", _brief(theirs)
             if name == "source":
                 made, got = "results made by this version of avmsf", "those of another, whose code differs"
+            if name == "columns":
+                lacks, more = ({*ones} - {*others} for ones, others in permutations((wanted[name], theirs or ())))
+                named = {"without": lacks, "with": more}.items()
+                parts = [f"{word} {', '.join(in_order(names))}" for word, names in named if names]
+                made, got = "results of the same metrics", f"those {' and '.join(parts)}"
             advice = "give the same options, or choose another --output"
             raise EvaluationError.expected(made, theirs, got=got, file=self.path, name=name, advice=advice)
         write_json(path, {**wanted, "methods": {**stored, **methods}})

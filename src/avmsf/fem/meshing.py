@@ -19,12 +19,12 @@ from jaxtyping import Float64, Int
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 from trimesh import Trimesh
-from trimesh.graph import connected_component_labels
 
 from avmsf.errors import SimulationError
 from avmsf.fem.remeshing import adjacency, boundary_edges, even_points, mesh_of
 from avmsf.fem.solid import several_parts
 from avmsf.mesh.level_set import decimated
+from avmsf.mesh.points import connected_parts
 from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import Surface
 
@@ -75,7 +75,7 @@ def weld(surface: Surface) -> Trimesh:
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
     pairs = cKDTree(places).query_pairs(TOLERANCES.weld_ratio * size, output_type="ndarray")
     if len(pairs):
-        label = connected_component_labels(pairs, len(places))  # type: ignore[no-untyped-call]
+        label = connected_parts(pairs, len(places))
         places, rows = places[np.unique(label, return_index=True)[1]], label[rows]
     welded = rows.reshape(-1, 3)
     wide = np.linalg.norm(trimesh.triangles.cross(places[welded]), axis=1) > 1e-12 * size**2
@@ -358,7 +358,7 @@ def _turned(mesh: Trimesh) -> tuple[Trimesh, int]:
 
 def _parts(mesh: Trimesh) -> Int[np.ndarray, " faces"]:
     """Return the number of the part that each triangle belongs to, the widest first; they share vertices in a part."""
-    label = connected_component_labels(mesh.edges, len(mesh.vertices))[mesh.faces[:, 0]]  # type: ignore[no-untyped-call]
+    label = connected_parts(mesh.edges, len(mesh.vertices))[mesh.faces[:, 0]]
     order = np.argsort(-np.bincount(label, weights=mesh.area_faces), kind="stable")
     return np.argsort(order)[label]
 
@@ -380,6 +380,6 @@ def _lids(mesh: Trimesh) -> Float64[np.ndarray, "lids 3 3"]:
         return np.zeros((0, 3, 3))
     used, ends = np.unique(rim, return_inverse=True)
     ends, corners = ends.reshape(-1, 2), mesh.vertices[used]
-    label = connected_component_labels(ends, len(used))  # type: ignore[no-untyped-call]
+    label = connected_parts(ends, len(used))
     middles = np.stack([np.bincount(label, weights=axis) for axis in corners.T], axis=1) / np.bincount(label)[:, None]
     return np.stack([corners[ends[:, 1]], corners[ends[:, 0]], middles[label[ends[:, 0]]]], axis=1)

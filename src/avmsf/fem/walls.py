@@ -15,16 +15,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int
 from trimesh import Trimesh
-from trimesh.graph import connected_component_labels
 
 from avmsf.errors import SimulationError
 from avmsf.fem.meshing import oriented, weld
 from avmsf.fem.remeshing import adjacency, boundary_edges, even_points, mesh_of, remeshed
 from avmsf.fem.solid import Solid, prism_cells
 from avmsf.fem.tetrahedra import fill
+from avmsf.mesh.points import connected_parts, unit
 from avmsf.mesh.queries import ClosestPoints, RayCaster
 from avmsf.mesh.surface import Surface
-from avmsf.mesh.textured_mesh import unit
 
 
 @dataclass(frozen=True)
@@ -249,7 +248,7 @@ def _sides(mesh: Trimesh, facing: Bool[np.ndarray, " faces"]) -> Int[np.ndarray,
     pairs = mesh.face_adjacency
     cosine = (mesh.face_normals[pairs[:, 0]] * mesh.face_normals[pairs[:, 1]]).sum(axis=1)
     joined = pairs[(cosine > TOLERANCES.min_smooth_cosine) & facing[pairs].all(axis=1)]
-    return np.where(facing, connected_component_labels(joined, len(mesh.faces)), -1)  # type: ignore[no-untyped-call]
+    return np.where(facing, connected_parts(joined, len(mesh.faces)), -1)
 
 
 def _behind(

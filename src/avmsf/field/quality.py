@@ -47,7 +47,7 @@ class FieldQuality:
     def of(cls, record: Mapping[str, Any]) -> "FieldQuality":
         """Return it from plain values, as they are in a file. Raises RecordError."""
         added = dict.fromkeys(("next_contact", "next_distance", "nearest")) | {"standard_error": 0.0}
-        return record_of(cls, record, "quality", added=added)
+        return record_of(cls, record, "origin.report.quality", added=added)
 
     def __str__(self) -> str:
         """Return the verdict, and the advice if there is any."""

@@ -7,9 +7,9 @@ import manifold3d
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, Int
-from trimesh.graph import connected_component_labels
 
 from avmsf.errors import CaptureError, SceneError
+from avmsf.mesh.points import connected_parts
 from avmsf.mesh.surface import Surface
 
 _SPECK = 0.02
@@ -58,7 +58,7 @@ def _without_specks(
     vertices: Float64[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "faces 3"]
 ) -> tuple[Float64[np.ndarray, "kept 3"], Int[np.ndarray, "remaining 3"]]:
     ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
-    part = connected_component_labels(ends, len(vertices))[triangles[:, 0]]  # type: ignore[no-untyped-call]
+    part = connected_parts(ends, len(vertices))[triangles[:, 0]]
     corners = vertices[triangles]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     size = np.bincount(part, weights=areas)

@@ -10,6 +10,8 @@ import math
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -144,3 +146,16 @@ def _expect_rows(points: Float[Tensor, "points 3"], count: int, start: int) -> N
         raise EvaluationError.expected(f"1 to {len(points)} points", count, name="count")
     if not 0 <= start < len(points):
         raise EvaluationError.expected(f"a point from 0 to {len(points) - 1}", start, name="start")
+
+
+def connected_parts(pairs: Int[np.ndarray, "pairs 2"], count: int) -> Int[np.ndarray, " items"]:
+    """Return the number of the connected part of each of `count` items, given pairs that are connected."""
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    parts: Int[np.ndarray, " items"] = connected_components(links, directed=False)[1]
+    return parts
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors of length 1 along the last axis; what has no length stays."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0, length, 1.0)

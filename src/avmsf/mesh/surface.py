@@ -13,6 +13,7 @@ from torch import Tensor
 from avmsf._utils.arrays import ArrayLike, Seed, as_vectors, generator_of
 from avmsf._utils.caching import content_digest
 from avmsf.errors import ArrayError, CaptureError
+from avmsf.mesh.points import connected_parts
 
 SurfaceKind = Literal["ply", "obj", "glb"]
 """Formats that surfaces are written in."""
@@ -128,7 +129,7 @@ def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> t
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=False)
     rows = np.unique(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 3)
     edges = np.concatenate([rows[:, [0, 1]], rows[:, [1, 2]]])
-    parts_of = trimesh.graph.connected_component_labels(edges, node_count=rows.max() + 1)  # type: ignore[no-untyped-call]
+    parts_of = connected_parts(edges, int(rows.max()) + 1)
     label = parts_of[rows[:, 0]]
     if not label.any() or not mesh.area > 0:
         return surface, []

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.io import check_area, check_corners, check_finite_vertices, load_parts
+from avmsf.mesh.points import unit
 from avmsf.mesh.surface import Surface
 
 GRAY = 0.7
@@ -106,9 +107,8 @@ class TexturedMesh:
         for number, texture in enumerate(self.textures):
             chosen, size = self.materials == number, torch.tensor(texture.shape[1::-1])
             # Images count rows downwards, v counts up.
-            places = torch.floor(inside[chosen] * torch.tensor([1, -1]) * size).long()
-            column, row = places.remainder(size).unbind(2)
-            colors[chosen] *= texture[row, column].float() / 255.0
+            column, row = torch.floor(inside[chosen] * size).long().remainder(size).unbind(2)
+            colors[chosen] *= texture[-1 - row, column].float() / 255.0
         return colors
 
 
@@ -220,9 +220,3 @@ def _missing_images(path: Path) -> dict[str, str]:
             elif key.lower() == "map_kd" and rest.strip() and not (source.parent / rest.split()[-1]).is_file():
                 lacking[material] = rest.split()[-1]
     return lacking
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors of length 1 along the last axis; what has no length stays."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1.0)

@@ -175,12 +175,12 @@ def estimate_residual(
     fft_size = _FINENESS * 2 * (bins - 1)
     pairs = [_weakest_frames(sound, mode, fft_size) for sound, mode in zip(sounds, modes, strict=True)]
     recorded, ringing = (torch.cat(each) for each in zip(*pairs, strict=True))
+    if not len(recorded):
+        return Residual(sounds.new_zeros(bins))
     columns = torch.arange(_FINENESS * bins).view(bins, _FINENESS) - _FINENESS // 2
     # Spectra are real at 0 Hz and at half the rate, where log power has another mean.
     inside = (columns > 0) & (columns < fft_size // 2)
     columns = columns.clamp(0, fft_size // 2)
-    if not len(recorded):
-        return Residual(sounds.new_zeros(bins))
     recorded_log, ringing = torch.log(recorded[:, columns]), ringing[:, columns]
     noise = (recorded[:, columns] * inside).amax((0, 2))
     for _ in range(_ROUNDS):

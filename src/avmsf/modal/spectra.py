@@ -1,10 +1,10 @@
-"""Spectra of sounds as differentiable torch functions, one convention for losses, metrics and pictures.
+"""Spectra, envelopes and levels of sounds, one convention for losses, metrics and pictures.
 
 A spectrogram's window is the periodic Hann window of the FFT's own length. Its frames are centered on the samples 0,
 hop, 2 hop, ... with silence before the first and after the last sample, so that a sound of any length, shorter than the
 FFT too, has 1 + samples // hop frames and its onset is in the middle of the first. Nothing is scaled: a steady sine of
 amplitude A on a bin reads A fft_size / 4, and white noise of standard deviation s reads s sqrt(3 pi fft_size / 32) on
-average. Gradients are finite everywhere, at silence too.
+average. Its gradient is finite everywhere, at silence too.
 """
 
 import math
@@ -35,7 +35,8 @@ def magnitude_stft(
 def envelope(sounds: Float[Tensor, "contacts samples"]) -> Float[Tensor, "contacts samples"]:
     """Return the amplitude envelopes, in the sounds' unit: the magnitude of the analytic signal (Hilbert).
 
-    The transform takes each sound as periodic, so that one which does not end in silence wraps round at its ends.
+    The transform takes each sound as periodic, so that one which does not end in silence wraps round at its ends. It is
+    not differentiable.
     """
     return torch.from_numpy(np.abs(hilbert(sounds.detach().cpu().numpy(), axis=1))).to(sounds)
 

@@ -6,6 +6,7 @@ made, after those that it depends on, when it is first asked for, unless a `Stag
 
 import hashlib
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, suppress
@@ -19,7 +20,6 @@ from avmsf._utils.files import write_whole
 from avmsf._utils.processes import WAIT, write_lock
 from avmsf._utils.progress import ProgressListener
 from avmsf._utils.text import read_json_object
-from avmsf.capture.filenames import files_in
 from avmsf.errors import CaptureError
 
 
@@ -102,7 +102,8 @@ class StageFolder:
         if not same:
             self.checkpoint(name).unlink(missing_ok=True)
         if current and (stage.usable is None or stage.usable(path)):
-            return Kept(path, known["digest"], float(known["seconds"]), fresh=False, values=known.get("values", {}))
+            seconds = float(known.get("seconds", 0.0))
+            return Kept(path, known["digest"], seconds, fresh=False, values=known.get("values", {}))
         self._write(record, {"recipe": wanted, "digest": None, "seconds": 0.0})
         begun = time.monotonic()
         values = stage.make(path, *(kept.path for kept in inputs.values())) or {}
@@ -142,8 +143,19 @@ class Pipeline:
 
 
 def digest_of(path: Path) -> str:
-    """Return a digest of a file's content, or of the names and contents of `files_in` a folder."""
-    return digest_files(files_in(path), root=path) if path.is_dir() else digest_files([path], root=path.parent)
+    """Return a digest of a file's content, or of the names and contents of all files in a folder but hidden ones.
+
+    Symbolic links are followed, to each folder once.
+    """
+    if not path.is_dir():
+        return digest_files([path], root=path.parent)
+    found, seen = list[Path](), {path.resolve()}
+    for inside, folders, names in os.walk(path, followlinks=True):
+        new = {each: place for each in sorted(folders) if (place := Path(inside, each).resolve()) not in seen}
+        folders[:] = [each for each in new if not each.startswith(".")]
+        seen.update(new.values())
+        found += [file for each in names if not each.startswith(".") and (file := Path(inside, each)).is_file()]
+    return digest_files(found, root=path)
 
 
 def digest_files(paths: Iterable[Path], *, root: Path) -> str:

@@ -1,5 +1,7 @@
 """What counts as a mode: chance, candidates, doubles, selection and pruning."""
 
+import math
+
 import pytest
 import scipy.stats
 import torch
@@ -33,6 +35,16 @@ def selection(sounds: Tensor, *, noise: float = 1e-3) -> Selection:
     return Selection(sounds, torch.full((len(sounds), 33), noise**2, dtype=torch.float64), RATE, 6.0, 50)
 
 
+def select(sounds: Tensor, found: ModalBank, *, noise: float = 1e-3) -> ModalBank:
+    chosen = selection(sounds, noise=noise)
+    return chosen.select(bank_of([], []), found, chosen.measure(found), range_db=60.0)
+
+
+def with_others(frequency: list[float], damping: list[float]) -> ModalBank:
+    """Return the true modes and others, by frequency."""
+    return merge(TRUTH.join(bank_of(frequency, damping)), duration=0.75)
+
+
 @pytest.mark.parametrize("contacts", [1, 2, 8, 100])
 def test_chance_is_the_tail_of_chi_squared(contacts: int):
     threshold = chance_ratio(contacts, trials=10_000)
@@ -43,6 +55,40 @@ def test_doubles_are_merged_and_neighbors_kept():
     bank = merge(bank_of([700.0, 300.0, 700.0001, 703.0, 700.0], [6.0, 5.0, 6.001, 7.0, 60.0]), duration=1.0)
     assert bank.frequency.tolist() == [300.0, 700.0, 700.0, 703.0]
     assert sorted(bank.damping.tolist()) == [5.0, 6.0, 7.0, 60.0]
+
+
+# What the sounds do not have, and what only leaks from a neighbor.
+@pytest.mark.parametrize(
+    ("others", "noise"),
+    [
+        (([120.0, 500.0, 1100.0, 2000.0, 3500.0], [5.0, 8.0, 30.0, 9.0, 50.0]), 1e-3),
+        (([302.0, 1510.0], [8.0, 50.0]), 0.03),
+    ],
+)
+def test_selection_takes_the_modes_from_among_the_rest(others: tuple[list[float], list[float]], noise: float):
+    chosen = select(record(TRUTH, noise=noise), with_others(*others), noise=noise)
+    assert chosen.frequency.tolist() == TRUTH.frequency.tolist()
+    assert chosen.damping.tolist() == TRUTH.damping.tolist()
+
+
+def test_selection_among_hundreds_spans_its_chunks():
+    chosen = select(record(TRUTH, noise=1e-3), with_others(torch.linspace(100.5, 3900.5, 400).tolist(), [4.0] * 400))
+    for pitch in TRUTH.frequency.tolist():
+        assert pitch in chosen.frequency
+
+
+def test_pruning_takes_one_of_two_that_are_equal():
+    chosen = selection(record(TRUTH, noise=1e-3))
+    kept = chosen.prune(with_others([300.0, 1500.0], [5.4, 33.0]), range_db=60.0)
+    torch.testing.assert_close(kept.frequency, TRUTH.frequency)
+    assert len(chosen.prune(bank_of([300.0, 300.0], [5.0, 5.0]), range_db=60.0)) == 1
+
+
+def test_pruning_nothing_but_noise_leaves_nothing():
+    sounds = torch.randn(4, SAMPLES, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    for bank in (TRUTH, bank_of([], [])):
+        assert len(selection(sounds, noise=1.0).prune(bank, range_db=60.0)) == 0
+    assert math.isfinite(chance_ratio(1, trials=1))
 
 
 def test_pruning_leaves_no_cancelling_modes():

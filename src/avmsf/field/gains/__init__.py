@@ -1,4 +1,5 @@
-"""Gains over the surface of an object, from those of recorded impacts: see `avmsf.field` for the model.
+"""Gains over the surface of an object, from those of recorded impacts; R&W is Rasmussen and Williams, Gaussian
+Processes for Machine Learning, 2006.
 
 - `model`, `data`: what every gain model is, and what it is fitted to.
 - `kernels`, `symmetry`, `elastic`: covariance functions, in families of one assumption each (R&W 4).

@@ -141,6 +141,8 @@ def _expect_fitting(train: Impacts, modes: Extraction) -> None:
         row = int((train.forces > 0.0).int().argmin())
         force, name = float(train.forces[row]), train.names[row]
         raise FitError.expected("a force above 0", force, row=row, name=name, advice="give peak forces, or none at all")
+    if float(train.sounds.abs().max()) == 0.0:
+        raise FitError.expected("sound", "silence", name="train", advice="check the channel")
     advice = "extract the modes from the recordings that the field is fitted to"
     if len(modes.gains) != len(train):
         raise FitError.expected(f"gains of {len(train)} recordings", len(modes.gains), name="modes", advice=advice)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Complex128, Float, Int
 from torch import Tensor, nn
 
+from avmsf.capture.placement import expect_placed
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY
 from avmsf.fem.candidate_bodies import PRESENT_UNIT, CandidateBodies, CandidateBody
@@ -100,7 +101,8 @@ class MixtureEstimator(GainEstimator):
     missing: str = ""
     """Why there are no bodies, for the report."""
     symmetries: Symmetries | None = None
-    """Of the object's geometry; without any, and with bodies, whose mode shapes have them, there is no such family."""
+    """Of the object's geometry; without any, and with usable bodies, whose mode shapes have them, there is no such
+    family (docs/decisions/symmetry-of-gains.md)."""
     update: bool = True
     """Whether the stiffness and density of the most probable body are updated."""
 
@@ -148,8 +150,8 @@ class MixtureEstimator(GainEstimator):
         that make their gains most probable, where that predicts better what they are. Last, the most probable body with
         its stiffness and density updated becomes one more hypothesis.
         """
-        known = self.bodies if Elastic.kind in self.kinds else None
-        bodies: Sequence[CandidateBody] = () if known is None else known.bodies
+        bodies, missing = self._usable_bodies(data)
+        known = self.bodies if bodies else None
         given, every = data.train.directions, torch.arange(len(data.train))
         directional = bool(bodies) or (given is not None and bool(given.any()))
         groups = () if bodies or self.symmetries is None else groups_of(self.symmetries)
@@ -186,7 +188,7 @@ class MixtureEstimator(GainEstimator):
         contradicting = {data.train.names[each.row]: each.describe(data.train, with_body=credible) for each in outliers}
         report = {
             "bodies": sorted(found.entries, key=lambda each: -each["weight"]),
-            "unavailable": {Elastic.kind: self.missing} if self.missing else {},
+            "unavailable": {Elastic.kind: missing} if missing else {},
             "excluded": [name for row, name in enumerate(data.train.names) if row not in kept],
             "supports_tried": tried,
             "outliers": contradicting,
@@ -208,15 +210,28 @@ class MixtureEstimator(GainEstimator):
         return found
 
     def _expect_inputs(self, data: GainData, groups: Sequence[Group]) -> None:
-        """Raise FitError where one family alone was asked for and what it needs of the object is not known."""
-        if self.name == Elastic.kind and self.bodies is None:
-            raise FitError.expected("the object's shape", name=Elastic.kind, advice=self.missing or "give its mesh")
+        """Raise FitError where one family alone was asked for and the symmetries or features that it needs are none."""
         if self.name == Symmetric.kind and not groups:
             wanted = "symmetries of the object's shape"
             raise FitError.expected(wanted, name=Symmetric.kind, advice="take another gain model")
         if self.name == Visual.kind and data.features.encoder == GEOMETRY:
             advice = "give --features, or take another gain model"
             raise FitError.expected("visual features", GEOMETRY, got="positions only", name=Visual.kind, advice=advice)
+
+    def _usable_bodies(self, data: GainData) -> tuple[list[CandidateBody], str]:
+        """Return the bodies that the contacts lie on, and why there are none."""
+        if Elastic.kind not in self.kinds:
+            return [], ""
+        try:
+            if self.bodies is None:
+                advice = self.missing or "give its mesh"
+                raise FitError.expected("the object's shape", name=Elastic.kind, advice=advice)
+            expect_placed(data.train.contacts, self.bodies.bodies[0].elastic.points, names=data.train.names)
+        except FitError as error:
+            if self.name == Elastic.kind:
+                raise
+            return [], self.missing if self.bodies is None else str(error)
+        return list(self.bodies.bodies), ""
 
 
 def estimator_for(

@@ -5,7 +5,7 @@ In go `Impacts`; out comes an `Extraction`: a `ModalBank`, each recording's comp
 1. `alignment`: the common time zero, by one delay a recording (`phase_likelihood`) and where the mean power leaves the
    noise. `Alignment.apply` aligns recordings that were held out.
 2. `finders`: frequencies and dampings, by one of two methods. `HighResolution`: matrix pencils (ESPRIT) in subbands
-   (`esprit`), forward selection by orthogonal least squares (`selection`) and variable projection
+   (`esprit`), forward selection by orthogonal least squares (`Selection`) and variable projection
    (`least_squares.refine`). `ShortTime`: the paper's regression in each bin of a short-time spectrum (`stft`).
 3. `least_squares.fit_gains`: the complex gains of these modes in each recording, whichever method found them; at poles
    of each recording's own where frequencies shift between recordings (`frequency_shifts`).

@@ -96,9 +96,7 @@ class Selection:
         if len(found) == 0:
             return known
         samples, reach = self.sounds.shape[1], 10 ** (-range_db / 10)
-        alone = measured[0].permute(2, 1, 0)
-        # Of each alone: p' G^-1 p.
-        explained = (alone * torch.linalg.solve(own_gram(poles_of(found, self.sample_rate), samples), alone)).sum(1)
+        explained = _explained(own_gram(poles_of(found, self.sample_rate), samples), measured[0])
         energy, ratio = explained.sum(1), (explained / measured[1].T).mean(1) / 2
         # Few lie high enough for the first, coarse rounds; with all of them each would take as long as the last.
         kept = (ratio > self.significance) & (energy >= energy.amax() * reach)
@@ -144,6 +142,16 @@ class Selection:
             bank, noise = bank.take(kept), noise[:, kept]
             system, total = system.take(kept), total[kept]
         return bank.take(torch.argsort(total, descending=True)[: self.count].sort().values)
+
+
+def _explained(
+    own: Float64[Tensor, "modes 2 2"], products: Float64[Tensor, "contacts 2 modes"]
+) -> Float64[Tensor, "modes contacts"]:
+    """Return the energy of each sound that each mode alone explains: p' G^-1 p, of two by two matrices G."""
+    sine, cosine = products.permute(2, 1, 0).unbind(1)
+    crossed = (own[:, 0, 1] + own[:, 1, 0])[:, None] * sine * cosine
+    energy = own[:, 1, 1, None] * sine.square() - crossed + own[:, 0, 0, None] * cosine.square()
+    return energy / (own[:, 0, 0] * own[:, 1, 1] - own[:, 0, 1] * own[:, 1, 0])[:, None]
 
 
 def choose(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
 from avmsf.fem.solid import Solid, prism_cells
-from avmsf.mesh.textured_mesh import unit
+from avmsf.mesh.points import unit
 
 _MIN_MITRE_COSINE = 0.4
 """Least mean of the cosines between the normal at a corner and the faces around it that a mitre is made for."""
