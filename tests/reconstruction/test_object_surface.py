@@ -14,6 +14,7 @@ from avmsf.errors import SceneError
 from avmsf.mesh.level_set import enclose
 from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction import ObjectShape, object_shape, object_surface
+from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.fairing import fair_hull
 from avmsf.reconstruction.object_shape import ShapeReport
 from avmsf.reconstruction.outlines import Outline, hull_distance
