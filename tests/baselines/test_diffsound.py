@@ -182,15 +182,15 @@ def test_it_recovers_the_material_of_a_body_that_sounds_as_it_assumes():
 def test_it_recovers_the_thickness_of_a_wall_that_lies_between_those_computed():
     # A little bent, so that stretching takes part: thickness and stiffness of a flat sheet cannot be told apart.
     sheet = sheet_over(np.linspace(0, 0.2, 9), np.linspace(0, 0.14, 7), lambda x, y: 2.0 * x**2)
-    walls = body_family(sheet, count=5, dofs=1000)
+    walls = body_family(sheet, count=8, dofs=2000)
     thickness = 1.2 * walls.thickness[1]
     frequency = walls.at(thickness).modes(replace(GLASS, young=1.3 * GLASS.young, poisson=POISSON)).frequency
     damping = 8.0 + 2e-8 * (2.0 * math.pi * frequency).square()
-    sounds = synthesize(torch.ones(1, 5), frequency, damping, samples=SAMPLES, sample_rate=RATE)
+    sounds = synthesize(torch.ones(1, 8), frequency, damping, samples=SAMPLES, sample_rate=RATE)
     clips = clip_spectra(Impacts(torch.zeros(1, 3), sounds, RATE, ("1.wav",)))
     known = DampingCurve.of(ModalBank(frequency, damping))
     found = fit_material(
-        clips, known, walls, DiffSoundConfig("glass", transport_steps=1, difference_steps=1, search=20)
+        clips, known, walls, DiffSoundConfig("glass", transport_steps=1, difference_steps=1, search=40)
     )
     assert found.thickness == pytest.approx(thickness, rel=0.05)
     assert found.stiffness == pytest.approx(STIFFNESS, rel=0.02)

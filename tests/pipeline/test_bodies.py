@@ -273,7 +273,7 @@ class Cup:
 
 @pytest.mark.slow
 def test_walls_cover_the_range_thicker_ones_are_stiffer_and_a_cavity_that_no_view_saw_into_may_be_closed() -> None:
-    found = CandidateBodies(Cup(opens=False), count=6, dofs=2000)
+    found = CandidateBodies(Cup(opens=False), count=6, dofs=4000)
     filled, *walls = found.bodies
     assert filled.thickness is None
     assert [body.thickness for body in walls] == pytest.approx([0.006 * 3 ** (step / 4) for step in range(5)] * 2)

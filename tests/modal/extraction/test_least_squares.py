@@ -1,6 +1,7 @@
 """Closed forms against explicit sums; fits and refinement against sounds whose modes are known."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 
 from avmsf.modal.extraction.least_squares import NormalEquations, fit_gains, fit_sine_gains, refine
 from avmsf.modal.inner_products import gram, poles_of, project
-from avmsf.modal.modes import ModalBank, common_phase
+from avmsf.modal.modes import ModalBank, common_phase, synthesize
 
 RATE = 8000.0
 
@@ -146,3 +147,15 @@ def test_a_mode_that_others_span_is_not_apart():
     _, apart = NormalEquations.of(torch.ones(1, 6000), poles_of(bank, RATE)).lost_without()
     assert (apart[:2] < 1e-3).all()
     assert apart[2] > 0.9
+
+
+def test_modes_that_others_span_do_not_keep_the_rest_from_moving():
+    bank = bank_of([301.0, 700.0], [5.0, 5.0])
+    gains = torch.randn(4, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sounds = synthesize(gains, bank.frequency, bank.damping, samples=6000, sample_rate=RATE)
+    crowd = bank_of([*(300.0 + 1e-3 * step for step in range(8)), 700.0], [5.0] * 9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = refine(sounds, crowd, sample_rate=RATE)
+    before, after = (NormalEquations.of(sounds, poles_of(each, RATE)).explained() for each in (crowd, found))
+    assert after > (1.0 + 1e-6) * before

@@ -142,7 +142,9 @@ class NormalEquations:
         weights = torch.einsum("acpi,bcqj->apibqj", by_part, by_part)
         hessian = torch.einsum("apibqj,piqj->aibj", weights, blocks).reshape(2 * modes, 2 * modes)
         slope = torch.einsum("acpi,cpi->ai", by_part, residual).reshape(-1)
-        scale = torch.diagonal(hessian).clamp_min(torch.finfo(torch.float64).tiny)
+        # Rounding may leave nothing, or less, of a mode that the others span.
+        least = max(1e-24 * float(torch.diagonal(hessian).max()), torch.finfo(torch.float64).tiny)
+        scale = torch.diagonal(hessian).clamp_min(least)
         damped = hessian + torch.diag(trust * scale)
         root = torch.sqrt(scale)
         step = torch.linalg.solve(damped / (root[:, None] * root[None, :]), slope / root) / root
