@@ -181,11 +181,14 @@ def _is_training(field: "SoundField", path: Path) -> bool:
     """Return whether a field was fitted to a file: a recording of its capture, the folder of that name around it."""
     path, origin = path.resolve(), field.origin
     owners = [each for each in path.parents if path.relative_to(each).as_posix() in origin.trained_on]
-    names = {each.name for each in owners}
-    for each in owners:
-        with suppress(CaptureError):
-            names = names - {each.name} | {settings_of(each).name or each.name}
-    return origin.capture in names
+    return any(_capture_name(each) == origin.capture for each in owners)
+
+
+def _capture_name(folder: Path) -> str:
+    """Return what a folder's settings call it, or its own name, also where the settings cannot be read."""
+    with suppress(CaptureError):
+        return settings_of(folder).name or folder.name
+    return folder.name
 
 
 def _summary(impacts: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
