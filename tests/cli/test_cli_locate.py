@@ -199,6 +199,10 @@ def test_a_table_gives_each_recording_its_contact_and_the_summary_is_over_those_
     (tmp_path / "capture.toml").write_text('name = "other plate"')
     results, _ = located(place, capsys, paths[0], "--true-contact", *map(str, fitted.tolist()))
     assert results["impacts"][0]["training"] is False
+    # Settings that cannot be read keep no recording from being located; the folder's name is another too.
+    (tmp_path / "capture.toml").write_text("name = ")
+    results, _ = located(place, capsys, paths[0], "--true-contact", *map(str, fitted.tolist()))
+    assert results["impacts"][0]["training"] is False
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,8 @@ def test_settings_are_printed_as_a_file_that_gives_them_back(options, needed, wo
     with pytest.raises(SystemExit, match="0"):
         options.parse([*words.split(), "--print-config"])
     file = tmp_path / "settings.toml"
-    file.write_text(capsys.readouterr().out)
+    # As editors on Windows save it.
+    file.write_text(capsys.readouterr().out, encoding="utf-8-sig")
     assert options.parse([*needed, *words.split()]).all_settings != options.usual
     read = options.parse([*needed, "--config", str(file)])
     assert read.all_settings == options.parse([*needed, *words.split()]).all_settings

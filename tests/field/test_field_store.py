@@ -124,6 +124,7 @@ def put(keys: str, *value: object) -> Change:
         (put("gains.kind", "splines"), "gains.kind"),
         (put("origin.settings.highpass", -1.0), ...),
         (put("origin.report.quality", {"positions": 9, "error": 0.3, "nearest_mean": 0.7, "errors": 0.3}), ...),
+        (put("origin.report.quality", {"positions": 9, "error": 0.3, "nearest_mean": None}), ...),
         (put("origin.trained_on", [1]), "origin.trained_on"),
         (put("origin", None), "origin"),
         (put("format", "1"), "format"),
@@ -157,6 +158,8 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path):
     bank = replace(field().bank, damping=-field().bank.damping)
     with raises(FieldFileError, file=path, name="bank.damping"):
         save(replace(field(), bank=bank), path)
+    with raises(FieldFileError, file=path, name="background_force"):
+        save(replace(field(), residual=replace(field().residual, force=0.0)), path)
     with raises(FieldFileError, file=path, name="samples"):
         save(replace(field(), samples=10**9), path)
     for broken in (float("nan"), torch.ones(1)):

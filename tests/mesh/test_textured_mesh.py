@@ -165,3 +165,6 @@ def test_corners_have_the_texels_of_their_faces_own_corners_of_the_texture() -> 
     mesh = TexturedMesh.build(corners, faces, coordinates=corners[faces][..., :2], textures=[texture])
     # Rows of an image count downwards.
     assert torch.equal(mesh.corner_colors, (texture[[1, 1, 0, 0], [0, 1, 1, 0]] / 255.0)[faces])
+    # A face that is one point of the texture.
+    mesh = TexturedMesh.build(corners, faces, coordinates=torch.zeros(2, 3, 2), textures=[texture])
+    assert torch.equal(mesh.corner_colors, (texture[1, 0] / 255.0).expand(2, 3, 3))
