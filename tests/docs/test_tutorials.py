@@ -19,7 +19,6 @@ from factories.verbs import sets
 REPOSITORY = Path(__file__).resolve().parents[2]
 DOCS = REPOSITORY / "docs"
 PAGES = (*sorted((DOCS / "tutorials").glob("*.md")), REPOSITORY / "README.md", DOCS / "getting-started.md")
-"""Tutorials first: what they have run in the same folder is not repeated for README and getting started."""
 PHOTOGRAPHS, PYTHON = "**With photographs**", "## [Python]"
 """Where README turns from a capture with a mesh to one with photographs, and to Python."""
 FEW_STEPS = sets("splat.steps=60 splat.start_points=800")
@@ -77,22 +76,15 @@ def steps(text: str) -> list[tuple[str, str]]:
     return [("command", re.split(r"\s+#", command)[0]) if command else ("python", block) for command, block in found]
 
 
-@pytest.fixture(scope="module")
-def done() -> set[tuple[str, str]]:
-    """Return the folders and the steps that have run in them on an earlier page."""
-    return set()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_step_of_a_page_runs(page, done, request, tmp_path, monkeypatch):
+def test_every_step_of_a_page_runs(page, request, tmp_path, monkeypatch):
     for folder, text in parts(page).items():
         assert steps(text)
         monkeypatch.chdir(shutil.copytree(request.getfixturevalue(folder), tmp_path / folder))
         for kind, step in steps(text):
-            if step.startswith(LONG) or (folder, step) in done:
+            if step.startswith(LONG):
                 continue
-            done.add((folder, step))
             if kind == "command":
                 _, verb, *words = shlex.split(step)
                 assert main([verb, *words, *SMALL.get(f"{verb} {words[0]}", SMALL.get(verb, ()))]) == 0, step
