@@ -117,12 +117,6 @@ def test_lists_and_arrays_sound_like_tensors(kind):
     assert found.rows.tolist() == [0]
 
 
-def test_directions_count_as_unit_vectors_and_no_direction_as_none():
-    one, other = (field().render([CONTACT], [along]) for along in ([0.0, 0.6, -0.8], [0.0, 3.0, -4.0]))
-    torch.testing.assert_close(one, other)
-    assert torch.equal(field().render([CONTACT], [[0.0, 0.0, 0.0]]), field().render([CONTACT]))
-
-
 def test_scores_of_a_recording_against_itself_are_zero():
     impacts = capture().impacts
     scores = score(impacts.sounds.numpy(), impacts)

@@ -12,7 +12,6 @@ import pytest
 from avmsf._utils.parallel import MAX_STARTS, run_tasks, workers_at
 from avmsf._utils.processes import start_child
 from avmsf.errors import FitError, WorkerError
-from factories.raising import raises
 from factories.running import gone
 
 
@@ -125,8 +124,3 @@ def test_workers_end_with_their_parent_however_that_ends(tmp_path: Path) -> None
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     assert gone(numbers_in(file))
-
-
-def test_workers_that_cannot_be_had_are_named() -> None:
-    with raises(FitError, name="workers", value=0):
-        run(told, {}, count=0)

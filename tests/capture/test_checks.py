@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-import torch
 import trimesh
 
 from avmsf.capture import CaptureSettings, check, read_capture, read_recording
@@ -21,14 +20,6 @@ from factories.looked_at import surface_of
 from factories.raising import raises
 
 NAMES = ("a.wav", "b.wav", "c.wav")
-
-
-def test_channels_are_counted_from_one(tmp_path: Path) -> None:
-    both = np.stack([ring(seed=0), ring(seed=1)], axis=1)
-    folder = fill(tmp_path, replace=dict.fromkeys(NAMES, both))
-    for channel in (1, 2):
-        sounds = read_capture(folder, CaptureSettings(response_channel=channel, align=False)).impacts.sounds
-        assert torch.equal(sounds[0], torch.from_numpy(both[:, channel - 1].astype(np.float32)))
 
 
 def test_integer_samples_become_fractions_of_full_scale(tmp_path: Path) -> None:

@@ -154,13 +154,6 @@ def test_directions_become_unit_vectors(tmp_path: Path) -> None:
     assert torch.allclose(directions, torch.tensor([[0, 0, -1.0], [0.6, 0, 0.8], [1, 0, 0]]), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize(("unit", "meters"), [("m", 1), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254), ("ft", 0.3048)])
-def test_units_are_the_international_ones(unit: str, meters: float) -> None:
-    assert CaptureSettings(unit=unit).meters == meters
-    assert CaptureSettings(unit="m", surface_unit=unit).surface_meters == meters
-    assert CaptureSettings(unit=unit).surface_meters == meters
-
-
 def test_a_unit_is_open_only_where_none_is_stated_and_gives_an_object_of_usual_size():
     assert CaptureSettings().unit_ratios(8.0) == pytest.approx({"m": 1.0, "cm": 0.01, "in": 0.0254, "ft": 0.3048})
     assert CaptureSettings().unit_ratios(0.02) == {"m": 1.0}

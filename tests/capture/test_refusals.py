@@ -10,6 +10,7 @@ import pytest
 import soundfile
 import trimesh
 
+from avmsf._utils.text import MAX_TOML_BYTES
 from avmsf.capture import CaptureSettings, check, read_capture, read_recording
 from avmsf.capture.audio import MAX_SAMPLES
 from avmsf.errors import CaptureError, CaptureWarning
@@ -115,6 +116,7 @@ SETTINGS = [
     ("seconds = ", None, None),
     (f"seconds = {10**400}", "seconds", 10**400),
     ("a = " + "[" * 3000 + "]" * 3000, None, None),
+    ("#" * (MAX_TOML_BYTES + 1), None, None),
 ]
 """Texts of capture.toml, and the name and value of the error."""
 

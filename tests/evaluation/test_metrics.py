@@ -94,13 +94,6 @@ def test_levels_scale_as_they_should_and_distances_are_symmetric():
     assert torch.allclose(METRICS["l1_log"](3 * a, a), torch.tensor(math.log(3.0), dtype=torch.float64), rtol=1e-12)
 
 
-def test_relative_error_of_silence_is_one_and_of_twice_the_sound_too():
-    truth = clips()
-    for predicted in (0 * truth, 2 * truth):
-        assert float(METRICS["relative"](predicted, truth).mean()) == pytest.approx(1.0, rel=1e-12)
-    assert float(METRICS["relative"](1.1 * truth, truth).mean()) == pytest.approx(0.1, rel=1e-12)
-
-
 def test_relative_error_is_the_ratio_of_sums_at_a_quarter_hop_by_loudness():
     a, b = clips(seed=1), clips(seed=2).flip(0)
     ratios = []

@@ -97,12 +97,6 @@ def test_no_more_components_come_out_than_there_are():
     assert reduce(varied(), 2).features.shape == (400, 2)
 
 
-def test_a_size_is_the_root_mean_square_length():
-    sized = resize(varied(), 0.3).features.double()
-    assert float(sized.square().sum(1).mean().sqrt()) == pytest.approx(0.3, rel=1e-6)  # float32's rounding
-    torch.testing.assert_close(sized / sized.norm(), varied().features.double() / varied().features.double().norm())
-
-
 def test_positions_come_before_the_features():
     joined = with_positions(varied())
     geometry = FeatureField.from_points(varied().points).features

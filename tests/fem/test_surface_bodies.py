@@ -145,11 +145,6 @@ def test_a_mesh_too_large_for_the_memory_is_refused_with_the_size_that_fits(monk
     assert computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies
 
 
-def test_too_few_degrees_of_freedom_are_named():
-    with raises(SimulationError, name="dofs", value=10):
-        computed(sheet(), dofs=10)
-
-
 @pytest.fixture(scope="module")
 def coarse() -> CandidateBody:
     elastic = computed(sheet(), thicknesses=[0.004], count=4, dofs=2000).bodies[0].elastic

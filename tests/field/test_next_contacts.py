@@ -150,13 +150,6 @@ def test_where_fewer_places_are_left_than_asked_for_all_are_suggested() -> None:
     assert len(found.after) == 1
 
 
-def test_a_place_that_was_struck_is_not_suggested_again() -> None:
-    contacts = bar_contacts(6)
-    gains = elastic_field(contacts, drawn_gains(contacts, seed=3))
-    without = sound_field(gains.without(torch.arange(6) == 4))
-    assert suggest(without, 1, candidates=contacts).rows.tolist() == [4]
-
-
 def test_of_very_many_candidates_some_that_are_far_apart_are_weighed(monkeypatch: pytest.MonkeyPatch) -> None:
     contacts, candidates = bar_contacts(6), bar_contacts(120, seed=4)
     field = sound_field(elastic_field(contacts, drawn_gains(contacts, seed=3)))

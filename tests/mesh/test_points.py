@@ -11,12 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from avmsf.errors import CaptureError, EvaluationError, FitError
 from avmsf.mesh.neighborhoods import describe_neighborhoods, read_neighborhoods
-from avmsf.mesh.points import closest_points, cluster, farthest_points, lattice, nearest_points
+from avmsf.mesh.points import cluster, farthest_points, lattice, nearest_points
 from avmsf.mesh.surface import Surface, sample_surface
 from factories.looked_at import surface_of
 from factories.raising import raises
-
-CHOOSE = (farthest_points, closest_points)
 
 
 def cloud(count: int, seed: int = 0) -> torch.Tensor:
@@ -44,17 +42,6 @@ def test_no_row_is_chosen_twice_even_where_points_coincide():
     points = torch.zeros(6, 3)
     points[4] = 1.0
     assert farthest_points(points, 6, start=2).tolist() == [2, 4, 0, 1, 3, 5]
-
-
-def test_closest_points_are_a_ball_around_the_start():
-    points = cloud(50)
-    rows = closest_points(points, 10, start=7)
-    assert int(rows[0]) == 7
-    distance = (points - points[7]).norm(dim=1)
-    others = torch.ones(50, dtype=torch.bool)
-    others[rows] = False
-    assert float(distance[rows].max()) < float(distance[others].min())
-    assert bool((distance[rows].diff() >= 0).all())
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 16])
@@ -127,9 +114,9 @@ def test_triangles_without_area_are_passed_over():
 @pytest.mark.parametrize(
     ("call", "kind", "name", "value"),
     [
-        *((lambda choose=choose: choose(cloud(5), 6), EvaluationError, "count", 6) for choose in CHOOSE),
-        *((lambda choose=choose: choose(cloud(5), 2, start=5), EvaluationError, "start", 5) for choose in CHOOSE),
-        *((lambda choose=choose: choose(cloud(5), 2, start=-1), EvaluationError, "start", -1) for choose in CHOOSE),
+        (lambda: farthest_points(cloud(5), 6), EvaluationError, "count", 6),
+        (lambda: farthest_points(cloud(5), 2, start=5), EvaluationError, "start", 5),
+        (lambda: farthest_points(cloud(5), 2, start=-1), EvaluationError, "start", -1),
         (lambda: nearest_points(cloud(5), cloud(2), count=6), EvaluationError, "count", 6),
         (lambda: lattice(cloud(5), 7), EvaluationError, "count", 7),
         (lambda: cluster(cloud(3).repeat(4, 1), 4), FitError, "count", 4),

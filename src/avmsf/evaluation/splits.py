@@ -17,7 +17,7 @@ from avmsf._utils.text import counted
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.errors import EvaluationError, ExtractionError
-from avmsf.mesh.points import closest_points, farthest_points
+from avmsf.mesh.points import farthest_points, nearest_points
 from avmsf.modal.extraction.extract import Extraction, extract_modes
 
 Recordings = TypeVar("Recordings", bound=Capture | Impacts)
@@ -78,7 +78,8 @@ class Closest:
     def cases(self, impacts: Impacts) -> tuple[Case, ...]:
         """Return the one case."""
         distinct = DistinctContacts.of(impacts)
-        return (distinct.case("closest", closest_points(distinct.contacts, distinct.count_of(self.fraction))),)
+        count = distinct.count_of(self.fraction)
+        return (distinct.case("closest", nearest_points(distinct.contacts, distinct.contacts[:1], count=count)[0]),)
 
 
 @dataclass(frozen=True)

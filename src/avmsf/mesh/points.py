@@ -38,17 +38,6 @@ def farthest_points(points: Float[Tensor, "points 3"], count: int, *, start: int
     return torch.from_numpy(chosen)
 
 
-def closest_points(points: Float[Tensor, "points 3"], count: int, *, start: int = 0) -> Int[Tensor, " chosen"]:
-    """Return the `count` rows nearest to point `start`, itself first: the paper's closest-point sampling.
-
-    Raises as `farthest_points`.
-    """
-    _expect_rows(points, count, start)
-    distance = (points.double() - points[start].double()).square().sum(dim=1).sqrt()
-    distance[start] = -1.0
-    return torch.argsort(distance, stable=True)[:count]
-
-
 def nearest_points(
     points: Float[Tensor, "points 3"], queries: Float[Tensor, "queries 3"], *, count: int = 1
 ) -> Int[Tensor, "queries count"]:
