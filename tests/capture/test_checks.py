@@ -11,9 +11,10 @@ import soundfile
 import trimesh
 
 from avmsf.capture import CaptureSettings, check, read_capture, read_recording
-from avmsf.capture.audio import clipped_samples, constant_offset
+from avmsf.capture.audio import Recording, clipped_samples, constant_offset
 from avmsf.capture.checks import expect_held
 from avmsf.capture.issues import shared_problems
+from avmsf.capture.measure import prepare_single
 from avmsf.errors import CaptureError, CaptureWarning
 from factories.capture_folder import RATE, ROWS, fill, ring
 from factories.looked_at import surface_of
@@ -186,6 +187,17 @@ def test_a_constant_offset_of_the_recorder_changes_nothing(tmp_path: Path, offse
     read = read_capture(fill(tmp_path / "moved", sounds=moved)).impacts
     # The offset is estimated from the quietest 40 ms or more, whose noise is 1e-4, and samples are float32.
     np.testing.assert_allclose(read.sounds, clean.sounds, atol=2e-5)
+    noises = [check(tmp_path / name).recordings[0].noise_db for name in ("clean", "moved")]
+    assert noises[1] == pytest.approx(noises[0], abs=0.2)
+
+
+def test_a_single_sound_is_judged_without_the_rumble_that_settings_remove() -> None:
+    time = np.arange(RATE) / RATE
+    humming = 0.3 * np.sin(2 * np.pi * 50 * time) + 0.3 * ring(1.0, before=0.5)
+    hit = Recording("hit.wav", humming[None], RATE, "FLOAT")
+    with pytest.raises(CaptureError):
+        prepare_single(hit, CaptureSettings())
+    prepare_single(hit, CaptureSettings(highpass=100.0))
 
 
 def test_rows_in_the_order_of_text_and_not_of_numbers_are_remarked_on(tmp_path: Path) -> None:

@@ -73,6 +73,19 @@ def test_a_written_capture_reads_back_bit_for_bit(tmp_path: Path, sample_rate: f
             assert_same(read_capture(tmp_path / f"{number}/cup"), capture)
 
 
+def test_a_written_capture_is_aligned_held_and_measured_as_the_one_it_was_read_from(tmp_path: Path) -> None:
+    sounds = {f"{seed}.wav": ring(before=0.05 + 0.01 * seed, seed=seed) for seed in range(4)}
+    read = read_capture(fill(tmp_path / "cup", sounds=sounds, settings='unit = "ft"\nheld = [[1, 2, 3]]'))
+    read.write(tmp_path / "again" / "cup")
+    again = read_capture(tmp_path / "again" / "cup")
+    for name in ("sounds", "before", "after", "contacts"):
+        torch.testing.assert_close(
+            getattr(again.impacts, name), getattr(read.impacts, name), rtol=0, atol=0, equal_nan=True
+        )
+    assert again.settings.held_at == read.settings.held_at
+    assert [*again.settings.unit_ratios(0.2).values()] == [*read.settings.unit_ratios(0.2).values()] == [1.0]
+
+
 @pytest.mark.parametrize("names", [("strike 1", "strike 2"), ("../a.wav", "b.wav"), ("a.wav", "A.WAV"), ("a.wav", " ")])
 def test_names_that_cannot_be_files_become_numbers(tmp_path: Path, names: tuple[str, ...]) -> None:
     write_capture(invented(names=names), tmp_path / "cup")

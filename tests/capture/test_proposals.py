@@ -147,6 +147,8 @@ def test_what_cannot_be_read_is_passed_over(tmp_path: Path) -> None:
     samples, _ = soundfile.read(folder / "00.wav")
     soundfile.write(folder / "01.wav", samples, 96000)
     assert found(folder) == {}
+    (folder / "surface.obj").write_text("v 0 0 0\n")
+    assert found(folder) == {}
     (folder / "impacts.csv").unlink()
     assert found(folder) == {}
 

@@ -14,7 +14,7 @@ import torch
 
 from avmsf.errors import ExportError
 from avmsf.export.paper_demo import write_demo
-from avmsf.export.samples import Layer, hertz_layers, write_grid
+from avmsf.export.samples import LEVEL_DB, Layer, hertz_layers, write_grid
 from avmsf.gaussians.ply import read_splats
 from avmsf.modal.modes import ForcePulse
 from factories.clouds import random_cloud
@@ -30,8 +30,8 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def test_every_row_is_its_blow(tmp_path):
-    field = table(phased=True, noisy=True)
-    write_grid(field, tmp_path / "grid", contacts=5, layers=LAYERS, level_db=-3.0)
+    field = table(phased=True, noisy=True, points=5)
+    write_grid(field, tmp_path / "grid", layers=LAYERS)
     found = rows(tmp_path / "grid")
     assert len(found) == 15
     assert Counter(row["midi_note"] for row in found) == {str(note): 3 for note in range(36, 41)}
@@ -53,22 +53,22 @@ def test_every_row_is_its_blow(tmp_path):
         assert (rate, len(sound), float(row["seconds"])) == (RATE, SAMPLES, SAMPLES / RATE)
         assert float(row["peak_db"]) == pytest.approx(20 * np.log10(np.abs(sound).max()), abs=0.01)
     loudest = max(np.abs(each).max() for each in truths)
-    assert apart(sounds, 10 ** (-3 / 20) / loudest * np.array(truths)) < 1e-6
+    assert apart(sounds, 10 ** (LEVEL_DB / 20) / loudest * np.array(truths)) < 1e-6
 
 
 def test_a_layer_of_twice_the_force_has_twice_the_modes_and_the_same_background(tmp_path):
-    field = table(noisy=True, background_force=3.0)
-    write_grid(field, tmp_path / "grid", contacts=1, layers=(Layer(1.0), Layer(2.0)))
+    field = table(noisy=True, background_force=3.0, points=1)
+    write_grid(field, tmp_path / "grid", layers=(Layer(1.0), Layer(2.0)))
     soft, hard = (soundfile.read(tmp_path / "grid" / row["file"])[0] for row in rows(tmp_path / "grid"))
     scale = json.loads((tmp_path / "grid" / "manifest.json").read_text())["scale"]
     assert apart(2 * soft - hard, scale * 3.0 * field.noise.numpy()) < 1e-5
     # Unless a force is given, it is that of the recordings on average.
-    write_grid(field, tmp_path / "one", contacts=1)
+    write_grid(field, tmp_path / "one")
     assert [float(row["force"]) for row in rows(tmp_path / "one")] == [3.0]
 
 
 def test_the_instrument_plays_every_file_at_its_key(tmp_path):
-    write_grid(table(), tmp_path / "grid", contacts=4, layers=LAYERS)
+    write_grid(table(points=4), tmp_path / "grid", layers=LAYERS)
     regions = played(tmp_path / "grid")
     expected = [(r["file"], r["midi_note"], r["velocity_low"], r["velocity_high"]) for r in rows(tmp_path / "grid")]
     assert sorted((r["sample"], r["key"], r["lovel"], r["hivel"]) for r in regions) == sorted(expected)
@@ -101,8 +101,9 @@ def levels(folder: Path, note: int) -> np.ndarray:
 
 @pytest.mark.parametrize("layers", [LAYERS, (Layer(0.5), Layer(1.0), Layer(2.0)), (Layer(2.0), Layer(1.0))])
 def test_the_level_rises_with_the_velocity_without_steps_between_layers(tmp_path, layers):
-    write_grid(table(), tmp_path / "grid", contacts=2, layers=layers)
-    write_grid(table(), tmp_path / "one", contacts=2)
+    field = table().take(table().spread(2))
+    write_grid(field, tmp_path / "grid", layers=layers)
+    write_grid(field, tmp_path / "one")
     assert float(played(tmp_path / "one")[0]["amp_velcurve_64"]) == pytest.approx((64 / 127) ** 2, rel=1e-5)
     for note in (36, 37):
         level = levels(tmp_path / "grid", note)
@@ -116,7 +117,7 @@ def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path):
         ("forces", (Layer(2.0), Layer(1.0), Layer(0.5)), [2, 1, 0]),
         ("times", (Layer(1.0), Layer(1.0, 0.002), Layer(1.0, 0.0005)), [1, 2, 0]),
     ):
-        write_grid(table(), tmp_path / name, contacts=2, layers=layers)
+        write_grid(table(points=2), tmp_path / name, layers=layers)
         found = [(float(row["force"]), float(row["contact_time"])) for row in rows(tmp_path / name)[:3]]
         assert found == [(layers[number].force, layers[number].contact_time) for number in order]
 
@@ -124,20 +125,19 @@ def test_layers_go_from_soft_to_loud_whatever_their_order(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "name", "value"),
     [
-        ({"contacts": 0}, "contacts", 0),
-        ({"contacts": 93}, "contacts", 93),
         ({"layers": ()}, "layers", 0),
         ({"layers": (Layer(-1.0),)}, "force", -1.0),
         ({"layers": (Layer(1.0, contact_time=2.0),)}, "contact_time", 2.0),
         ({"seconds": 0.0}, "seconds", 0.0),
         ({"range_db": -1.0}, "range_db", -1.0),
-        ({"level_db": 6.0}, "level_db", 6.0),
     ],
 )
 def test_bad_settings_are_refused(tmp_path, settings, name, value):
     with raises(ExportError, name=name, value=value):
         write_grid(table(), tmp_path / "grid", **settings)
     assert not (tmp_path / "grid").exists()
+    with raises(ExportError, name="contacts", value=93):
+        write_grid(table(points=93), tmp_path / "grid")
     with raises(ExportError, name="sample_rate", value=8000.5):
         write_grid(replace(table(), sample_rate=8000.5), tmp_path / "grid")
 

@@ -19,10 +19,11 @@ import soundfile
 
 from avmsf.field.sound_field import SoundField
 from avmsf.field.store import save
+from avmsf.pipeline.config import Preset
 from avmsf.studio.guard import MAX_UPLOAD_BYTES, Guard, new_token
 from avmsf.studio.opening import Opened
 from avmsf.studio.server import listen, make_app, make_server
-from avmsf.studio.studio import Studio, StudioConfig
+from avmsf.studio.studio import Studio
 from factories.capture_folder import ring
 from factories.made_fields import FIELDS, sounding
 
@@ -109,10 +110,10 @@ class Served:
 
 @contextmanager
 def served(
-    opened: Opened, folder: Path, *, config: StudioConfig | None = None, largest: int = MAX_UPLOAD_BYTES
+    opened: Opened, folder: Path, *, preset: Preset = "default", largest: int = MAX_UPLOAD_BYTES
 ) -> Iterator[Served]:
     folder.mkdir(exist_ok=True)
-    studio = Studio(opened, folder, config)
+    studio = Studio(opened, folder, preset)
     token = new_token()
     with listen(0) as listener:
         port = listener.getsockname()[1]

@@ -26,7 +26,6 @@ from avmsf.errors import StudioError
 from avmsf.field.store import save
 from avmsf.studio.opening import open_target
 from avmsf.studio.server import listen, serve
-from avmsf.studio.studio import StudioConfig
 from factories.capture_folder import fill
 from factories.plate_capture import fill_plate
 from factories.raising import raises
@@ -138,8 +137,7 @@ def test_the_field_that_a_job_made_is_opened_whatever_has_replaced_it_since(tmp_
         "import json, shutil, sys; task = json.loads(input()); shutil.copy(sys.argv[1], task['output'])\n"
         "print(json.dumps({'result': {'field': 'replaced', 'task': task, 'output': task['output']}}))"
     )
-    config = StudioConfig(preset="paper")
-    with served(open_target(fill(tmp_path / "struck")), tmp_path / "files", config=config) as running:
+    with served(open_target(fill(tmp_path / "struck")), tmp_path / "files", preset="paper") as running:
         running.studio.jobs.command = (sys.executable, "-c", script, str(tmp_path / "made"))
         last = running.events(running.ask("POST", "reconstruct", {}).words["job"])[-1]
         assert last["field"] == "replaced"

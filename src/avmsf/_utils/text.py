@@ -79,12 +79,7 @@ def listed(names: Sequence[str], *, most: int = 5, separator: str = ", ") -> str
 
 def in_order(names: Iterable[str]) -> tuple[str, ...]:
     """Return names in natural order: numbers within them by value, 2 before 10, and before letters."""
-
-    def key(name: str) -> list[tuple[bool, int, str]]:
-        parts = re.findall(r"\d+|\D+", name)
-        return [(not part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
-
-    return tuple(sorted(names, key=key))
+    return tuple(sorted(names, key=lambda name: (re.sub(r"\d+", lambda digits: digits[0].zfill(255), name), name)))
 
 
 def read_text(path: Path, *, max_bytes: int = MAX_TEXT_BYTES) -> str:

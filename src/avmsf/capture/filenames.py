@@ -24,11 +24,6 @@ _OTHER_NAMES = {
 _OF_VIEWS = frozenset(("transforms.json", "sparse", "cameras.bin", "cameras.txt", *SPLATS))
 
 
-def number_key(name: str) -> str:
-    """Return what sorts names by the numbers in them: 2.wav before 10.wav."""
-    return re.sub(r"\d+", lambda digits: digits[0].zfill(255), name)
-
-
 def files_in(folder: Path, *, deep: bool = True) -> list[Path]:
     """Return the files in a folder, sorted, and `deep` in those beneath it; none where there is no folder.
 

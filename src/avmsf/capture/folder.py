@@ -10,10 +10,10 @@ from pathlib import Path, PurePosixPath
 import torch
 
 from avmsf._utils.files import new_folder
-from avmsf._utils.text import counted, csv_text, listed
+from avmsf._utils.text import counted, csv_text, in_order, listed
 from avmsf.capture.audio import Recording, read_recording, wav_bytes
 from avmsf.capture.checks import check_contacts, check_surface, find_surface
-from avmsf.capture.filenames import files_in, number_key
+from avmsf.capture.filenames import files_in
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.issues import Issues, RecordingReport, shared_problems
 from avmsf.capture.preprocess import check_levels, preprocess
@@ -123,7 +123,7 @@ def check_and_read(
         reports = [each if each.onset_seconds is None else replace(each, onset_seconds=0.0) for each in reports]
         remarks.append(UNCUT)
     names = [report.file for report in reports]
-    if names == sorted(names) != sorted(names, key=number_key):
+    if names == sorted(names) != list(in_order(names)):
         remarks.append(TEXT_ORDER)
     problems = [*map(str, issues.errors), *map(str, issues.warnings), *_copies(issues), *_unlisted(folder, set(names))]
     readable = not issues.errors and all(each.readable for each in reports)
@@ -181,10 +181,16 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
     numbers. Everything is written to a temporary folder first and then renamed into place: a folder of this name is
     complete or absent. With `onsets_within` the sounds are whole recordings that start before their impacts: reading
-    then finds the onsets, and keeps this many seconds from each on; without it they are final, and are not aligned when
-    they are read. Raises `CaptureError` where the folder exists and is not empty, or cannot be written.
+    then finds the onsets, and keeps this many seconds from each on. Sounds that may still be moved are written with
+    what their files hold around them, so that their onsets are found anew, in loud noise not always at the same sample;
+    others are not aligned when they are read. Raises `CaptureError` where the folder exists and is not empty, or cannot
+    be written.
     """
-    impacts, names = capture.impacts, _file_names(capture.impacts.names)
+    impacts, read_by, names = capture.impacts, capture.settings, _file_names(capture.impacts.names)
+    sounds, final = list(impacts.sounds), onsets_within is None and impacts.before is None
+    if impacts.before is not None and impacts.after is not None:
+        whole = torch.cat([impacts.before, impacts.sounds, impacts.after], dim=1)
+        sounds = [each[~each.isnan()] for each in whole]
     rate, speed = _whole_rate(impacts.sample_rate)
     parts = ((REQUIRED, impacts.contacts), (DIRECTION, impacts.directions), ((FORCE,), impacts.forces))
     known = {columns: each.reshape(len(impacts), -1) for columns, each in parts if each is not None}
@@ -199,13 +205,15 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
         f"seconds = {seconds!r}\n"
         f"playback_speed = {speed!r}\n"
         f'normalize = "{"none" if impacts.forces is None else "done"}"\n'
-        + ("align = false\n" if onsets_within is None else "")
+        + ("align = false\n" if final else "")
+        + ('surface_unit = "m"\n' if read_by.unit_stated else "")
+        + (f"held = {json.dumps(read_by.held_at)}\n" if read_by.held else "")
     )
     with new_folder(Path(folder), raising=CaptureError) as begun:
-        for name, sound in zip(names, impacts.sounds.numpy(), strict=True):
+        for name, sound in zip(names, sounds, strict=True):
             (begun / name).parent.mkdir(parents=True, exist_ok=True)
             # Soundfile's own error of a full disk does not say that it is full.
-            (begun / name).write_bytes(wav_bytes(sound, rate))
+            (begun / name).write_bytes(wav_bytes(sound.numpy(), rate))
         (begun / TABLE).write_text(csv_text(rows), encoding="utf-8", newline="")
         (begun / SETTINGS).write_text(settings, encoding="utf-8")
         if capture.surface is not None:

@@ -29,13 +29,13 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     channel = recording.response_channel(settings.response_channel, force_channel=settings.force_channel)
     response, seconds = recording.channel(channel), settings.kept_seconds(rate)
     level = decibels(float(np.abs(response).max()))
-    # Rumble that the settings remove is not in the sounds.
-    filtered = remove_rumble(response, settings.highpass, recording)
+    # An offset, and rumble that the settings remove, are not in the sounds.
+    filtered = remove_rumble(recording.response(channel), settings.highpass, recording)
     noise = decibels(noise_level(filtered, prepared.onset, rate) / float(np.abs(filtered).max()))
     clipped = clipped_samples(response)
     if settings.force_channel is not None:
         clipped += clipped_samples(recording.channel(settings.force_channel))
-    kept = response[prepared.onset : prepared.onset + round(seconds * rate)]
+    kept = filtered[prepared.onset : prepared.onset + round(seconds * rate)]
     second = _second_impact(kept, prepared.onset, recording, prepared, settings.force_channel)
     others = (each for row, each in enumerate(recording.channels, 1) if row not in (channel, settings.force_channel))
     problems = []
@@ -96,7 +96,8 @@ def prepare_single(recording: Recording, settings: CaptureSettings) -> tuple[Pre
     """
     prepared = prepare(recording, settings)
     # Of one channel all is used, the silence before the impact too.
-    samples = recording.response() if len(recording.channels) == 1 else prepared.sound
+    alone = len(recording.channels) == 1
+    samples = remove_rumble(recording.response(), settings.highpass, recording) if alone else prepared.sound
     check_impulsive(samples, sample_rate=recording.sample_rate, name=recording.name)
     begin = prepared.onset if settings.align else 0
     second = _second_impact(prepared.sound, begin, recording, prepared, settings.force_channel)

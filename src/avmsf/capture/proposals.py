@@ -118,12 +118,12 @@ def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tenso
 
 def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
     """Return the units in which contacts lie on the object, where the present ones cannot be meant."""
-    contacts, surface = contacts_of(rows, settings), None
+    placement, contacts = None, contacts_of(rows, settings)
     with suppress(CaptureError):
         surface = find_surface(folder, settings)
-    if surface is None or not len(contacts):
+        placement = None if surface is None else check_placement(contacts, surface_points(surface))
+    if placement is None:
         return []
-    placement = check_placement(contacts, surface_points(surface))
     if placement.fault != "unit" and NARROWEST <= placement.diagonal <= WIDEST:
         return []
     units: dict[str, Any] = fitting_units_of(placement, settings)
@@ -181,7 +181,7 @@ def _push_and_level(channel: Float64[np.ndarray, " frames"], rate: float) -> tup
     power, width = np.square(channel - pulse.rest), pulse.stop - pulse.start
     share = float(power[max(0, pulse.start - width) : pulse.stop + width].sum() / power.sum())
     noise = noise_level(channel, find_onset(channel, sample_rate=rate), rate)
-    return share, -decibels(noise / float(np.abs(channel).max()))
+    return share, -decibels(noise / float(np.sqrt(power.max())))
 
 
 def _highpass(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:

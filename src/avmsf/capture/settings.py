@@ -131,10 +131,15 @@ class CaptureSettings:
 
         The present unit comes first. Others make it an object of usual size, and there are none where one is stated.
         """
-        present, stated = self.surface_unit or self.unit, {self.unit, self.views_unit} != {"m"}
+        present = self.surface_unit or self.unit
         ratios = {unit: length / self.surface_meters for unit, length in METRES.items()}
         usual = {unit: each for unit, each in ratios.items() if OBJECT_SIZES[0] <= each * extent <= OBJECT_SIZES[1]}
-        return {present: 1.0} | ({} if stated or self.surface_unit else usual)
+        return {present: 1.0} | ({} if self.unit_stated else usual)
+
+    @property
+    def unit_stated(self) -> bool:
+        """Whether the surface's unit is stated: any unit, or another of the contacts or the cameras than m."""
+        return self.surface_unit is not None or {self.unit, self.views_unit} != {"m"}
 
     @property
     def views_meters(self) -> float:

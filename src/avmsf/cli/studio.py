@@ -56,17 +56,10 @@ def run(options: Options) -> int:
         import_module("uvicorn")
     from avmsf.studio.opening import open_target
     from avmsf.studio.server import serve
-    from avmsf.studio.studio import StudioConfig
 
     assert options.target is not None
     opened = open_target(options.target, object=options.object, capture=options.capture)
-    serve(
-        opened,
-        port=options.port,
-        browser=not options.no_browser,
-        log=_print,
-        config=StudioConfig(preset=options.preset),
-    )
+    serve(opened, port=options.port, browser=not options.no_browser, log=_print, preset=options.preset)
     say("closed")
     sys.stdout.flush()
     # The interpreter would wait for a thread that still computes, or break off in its midst with a dump of its memory.

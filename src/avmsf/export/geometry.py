@@ -16,7 +16,7 @@ from avmsf.errors import ExportError
 from avmsf.export.sampled_field import SampledField
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.ply import holds_gaussians, read_splats
-from avmsf.mesh.io import MAX_BYTES, load_mesh
+from avmsf.mesh.io import load_mesh
 from avmsf.mesh.level_set import decimated
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh, read_textured_mesh
@@ -66,16 +66,10 @@ def read_object(
 
 
 def read_gaussians(path: Path, points: Float[Tensor, "points 3"]) -> GaussianCloud | None:
-    """Return the Gaussians of a `.ply`, in meters, for a field at `points`; None for another file.
+    """Return the Gaussians of a `.ply`, in meters, for a field at `points`; None for another file, or none.
 
-    Raises `ExportError` for a file that is missing or huge, and for Gaussians in another unit.
+    Raises `ExportError` for Gaussians in another unit.
     """
-    if not path.is_file():
-        raise ExportError.expected("a mesh or a .ply of Gaussians", file=path, advice="check the name")
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        wanted = f"a mesh of at most {MAX_BYTES >> 20} MiB"
-        raise ExportError.expected(wanted, size, got=f"{size >> 20}", file=path, name="size", advice="reduce it first")
     if not holds_gaussians(path):
         return None
     cloud = read_splats(path)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avmsf.export.geometry import read_vertices
 from avmsf.export.sampled_field import SampledField, approximation_error, shared_dampings, signed_amplitudes
-from avmsf.export.writing import FORMATS, Axis, Written, check_suffix, generator, no_modes, pack, write_files
+from avmsf.export.writing import FORMATS, Axis, Written, check_suffix, generator, pack, write_files
 from avmsf.mesh.io import glb_bytes
 from avmsf.mesh.surface import Surface
 
@@ -47,12 +47,10 @@ def write_gltf(
 
     `object` is a mesh with coordinates in units of `meters`, or Gaussians, of which the file has the centers and a copy
     beside it the rest. All coordinates are in the object's frame; the node rotates its axis `up` to glTF's +y. Raises
-    `ExportError` for a name that does not end in .glb, a field without modes, and as `read_vertices`.
+    `ExportError` for a name that does not end in .glb, and as `read_vertices`.
     """
     path = Path(path)
     check_suffix(path, FORMATS["gltf"].suffixes)
-    if not len(sampled.frequency):
-        raise no_modes(path)
     damping, gains = shared_dampings(sampled), signed_amplitudes(sampled)
     vertices, gaussians = read_vertices(object, sampled, meters=meters)
     contents = {path: glb_bytes(*_document(sampled, vertices, up, gains, damping))}

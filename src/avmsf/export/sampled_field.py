@@ -77,7 +77,7 @@ class SampledField:
         More than `limit` points are reduced to evenly spread ones. `normals` are outward normals; by default those of
         the field's body, or without a body estimated from the points. `directions` are those of the impacts at given
         points, as in `SoundField.render`; one of length zero is against the normal. Raises `ExportError` for no
-        points, and for points that are not finite.
+        points, points that are not finite, and a field without a mode below half the sample rate.
         """
         places = points_on_object(sound_field.gain_field) if points is None else points
         _check_points(places, normals, limit)
@@ -92,6 +92,9 @@ class SampledField:
         if directions is not None:
             normals = torch.where(directions.any(1, keepdim=True), -directions.double(), normals.double())
         audible = torch.nonzero(sound_field.audible).flatten()
+        if not len(audible):
+            wanted, advice = "1 or more below half the sample rate", "edit less, or fit the field again"
+            raise ExportError.expected(wanted, 0, got="none", name="modes", advice=advice)
         parts = torch.split(places, _BATCH)
         ways = [None] * len(parts) if directions is None else torch.split(directions, _BATCH)
         known = [sound_field.known(part, directions=way) for part, way in zip(parts, ways, strict=True)]

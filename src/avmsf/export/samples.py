@@ -25,6 +25,8 @@ COLUMNS = (
     *("seconds", "peak_db", "contact"),
 )
 HIGHEST_NOTE = 127
+LEVEL_DB = -1.0
+"""Peak of the loudest sound, relative to full scale."""
 LOWEST_NOTE = 36
 """MIDI note of the first contact: C2, where drum maps begin."""
 
@@ -61,25 +63,23 @@ def write_grid(
     field: SampledField,
     folder: str | Path,
     *,
-    contacts: int = 16,
     layers: Sequence[Layer] | None = None,
     seconds: float | None = None,
-    level_db: float = -1.0,
     range_db: float = 40.0,
     overwrite: bool = False,
 ) -> Written:
     """Write a float32 wav for every contact and layer, the table and the instrument.
 
-    More than `contacts`, of which each has a MIDI note, are reduced by farthest point sampling; those with `range_db`
-    less energy than the loudest are left out. Each has one impact of each of the `layers`, sorted by their level, by
-    default one of an average recorded force. Sounds last `seconds`, by default as long as the training sounds. All are
-    scaled by one factor, the manifest's `scale`, so that the loudest peaks at `level_db` relative to full scale. Raises
-    `ExportError` for no layers, more contacts than MIDI has notes, and settings not positive.
+    Contacts, of which each has a MIDI note, with `range_db` less energy than the loudest are left out. Each has one
+    impact of each of the `layers`, sorted by their level, by default one of an average recorded force. Sounds last
+    `seconds`, by default as long as the training sounds. All are scaled by one factor, the manifest's `scale`, so that
+    the loudest peaks at `LEVEL_DB`. Raises `ExportError` for no layers, more contacts than MIDI has notes, and settings
+    not positive.
     """
     layers = (Layer(field.average_force),) if layers is None else layers
-    _check(contacts, layers, seconds, level_db, range_db, field.sample_rate)
+    _check(field, layers, seconds, range_db)
     rate = round(field.sample_rate)
-    rows, remarks = _chosen(field, contacts, range_db)
+    rows, remarks = _chosen(field, range_db)
     samples = field.samples if seconds is None else max(1, round(seconds * rate))
     rendered = []
     for layer in layers:
@@ -89,7 +89,7 @@ def write_grid(
     rendered.sort(key=lambda each: float(each[1].double().square().sum()))
     ordered = [layer for layer, _ in rendered]
     peak = max(float(sounds.abs().max()) for _, sounds in rendered)
-    scale = 10 ** (level_db / 20) / peak if peak > 0 else 1.0
+    scale = 10 ** (LEVEL_DB / 20) / peak if peak > 0 else 1.0
     # From 1 on: a note of velocity 0 is the end of one. No range is empty, as there are no more layers than velocities.
     edges = np.linspace(1, HIGHEST_NOTE + 1, len(ordered) + 1).round().astype(int)
     amplitudes = np.stack([sounds.double().square().mean(1).sqrt().numpy() for _, sounds in rendered])
@@ -112,7 +112,7 @@ def write_grid(
     files[INSTRUMENT] = "\n".join([*head, *chain.from_iterable(groups.values()), ""]).encode()
     manifest = {"name": field.name, "sampleRate": rate, "scale": scale, "perNewton": field.per_newton}
     manifest["pulses"] = [layer.shape for layer in ordered]
-    remarks.append(f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {level_db:g} dB")
+    remarks.append(f"all sounds are scaled by {scale:.4g}, so that the loudest reaches {LEVEL_DB:g} dB")
     remarks += _on_background(field, rendered[-1][1])
     if ordered != list(layers):
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)
@@ -130,10 +130,8 @@ def _on_background(field: SampledField, sounds: Float32[Tensor, "rows samples"])
     return [f"the recordings' background is louder than all layers: {known}; or leave the noise out"]
 
 
-def _check(
-    contacts: int, layers: Sequence[Layer], seconds: float | None, level_db: float, range_db: float, rate: float
-) -> None:
-    most = HIGHEST_NOTE + 1 - LOWEST_NOTE
+def _check(field: SampledField, layers: Sequence[Layer], seconds: float | None, range_db: float) -> None:
+    most, contacts, rate = HIGHEST_NOTE + 1 - LOWEST_NOTE, len(field), field.sample_rate
     checks = [
         ("contacts", contacts, 1 <= contacts <= most, f"1 to {most}, a MIDI note each from {LOWEST_NOTE}"),
         ("layers", len(layers), 1 <= len(layers) <= HIGHEST_NOTE, f"1 to {HIGHEST_NOTE} forces"),
@@ -141,7 +139,6 @@ def _check(
         *(("contact_time", each.contact_time, 0 <= each.contact_time < 1, "0 to 1 s") for each in layers),
         ("seconds", seconds, seconds is None or 0 < seconds < math.inf, "more than 0"),
         ("range_db", range_db, range_db >= 0, "0 dB or above"),
-        ("level_db", level_db, -math.inf < level_db <= 0, "0 dB or below"),
         ("sample_rate", rate, rate >= 1 and rate == round(rate), "whole hertz for wav files"),
     ]
     for name, value, valid, wanted in checks:
@@ -149,13 +146,12 @@ def _check(
             raise ExportError.expected(wanted, value, name=name)
 
 
-def _chosen(field: SampledField, contacts: int, range_db: float) -> tuple[Int64[Tensor, " chosen"], list[str]]:
-    """Return the rows of at most `contacts` points that are audible, and a note on those left out."""
-    rows = torch.arange(len(field)) if len(field) <= contacts else field.spread(contacts)
-    energy_db = 10 * field.energy[rows].clamp_min(1e-300).log10()
+def _chosen(field: SampledField, range_db: float) -> tuple[Int64[Tensor, " chosen"], list[str]]:
+    """Return the rows of the points that are audible, and a note on those left out."""
+    energy_db = 10 * field.energy.clamp_min(1e-300).log10()
     audible = energy_db >= energy_db.max() - range_db
     left = f"{counted(int((~audible).sum()), 'contact')} left out, {range_db:g} dB or more below the loudest"
-    return rows[audible], [] if audible.all() else [left]
+    return torch.nonzero(audible).flatten(), [] if audible.all() else [left]
 
 
 def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:

@@ -34,7 +34,7 @@ from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExportError
 from avmsf.export.geometry import ObjectKind, read_object
 from avmsf.export.sampled_field import SampledField
-from avmsf.export.writing import FORMATS, Written, generator, no_modes, pack, write_files, write_folder
+from avmsf.export.writing import FORMATS, Written, generator, pack, write_files, write_folder
 from avmsf.mesh.surface import Surface
 
 FORMAT = 1
@@ -63,14 +63,8 @@ def make_bundle(
     meters: float = 1.0,
     surface: Path | Surface | None = None,
     strikes: Impacts | None = None,
-    mute: bool = False,
 ) -> Bundle:
-    """Return a field's bundle, with options as `write_webpage`.
-
-    A field without modes is allowed if `mute`, for an object that is not recorded yet. Raises `ExportError`.
-    """
-    if len(field.frequency) == 0 and not mute:
-        raise no_modes()
+    """Return a field's bundle, with options as `write_webpage`. Raises `ExportError`."""
     kind, shown, notes = read_object(object, field.points, meters=meters)
     other, triangles, further_notes = read_object(surface, field.points)
     content, places = pack(_tensors(field))

@@ -71,7 +71,7 @@ def write(
             remarks = (f"written: {len(sampled)} of the field's {held} contacts; `contacts` sets the number",)
     if not noise:
         sampled = sampled.without_noise()
-    if kind == "wavs" or (kind == "faust" and (contacts is not None or isinstance(field, SampledField))):
+    if kind == "faust" and (contacts is not None or isinstance(field, SampledField)):
         options = {"contacts": len(sampled), **options}
     written = WRITERS[kind](sampled, output, **options)
     return replace(written, remarks=(*remarks, *written.remarks))

@@ -73,12 +73,6 @@ def check_suffix(path: Path, endings: Sequence[str]) -> None:
         raise ExportError.expected(wanted, path.suffix, got=got, file=path, name="suffix", advice=advice)
 
 
-def no_modes(path: Path | None = None) -> ExportError:
-    """Return the error for a field without a mode below half the sample rate."""
-    wanted = "1 or more below half the sample rate"
-    return ExportError.expected(wanted, 0, got="none", file=path, name="modes", advice="fit the field again")
-
-
 def pack(arrays: Mapping[str, Shaped[np.ndarray, "..."]]) -> tuple[bytes, dict[str, dict[str, Any]]]:
     """Return arrays one after another, little endian, each from a multiple of four bytes on; and where each is."""
     content, records = bytearray(), {}

@@ -180,19 +180,19 @@ class CaptureEditor:
         that every row of the table has.
         """
         with self._lock():
-            settings, table = self.settings, ImpactTable(self.folder)
+            settings, table, recording = self.settings, ImpactTable(self.folder), read_upload(content)
+            content = _as_wav(content, recording)
             for added in self.impacts():
                 # Contacts are equal but for the conversion of units.
                 if added["digest"] == _digest(content) and math.dist(added["contact"], impact.contact) < 1e-9:
                     return added
-            recording = read_upload(content)
             self._check_usable(recording, newtons=None)
             missing = {"force": FORCE} if impact.direction else {"direction": DIRECTION[0], "force": FORCE}
             for name in (name for name, column in missing.items() if column in table.names):
                 wanted = f"a {name} as in all rows"
                 raise bad_request(name, wanted, got="none", advice="add it", status=422, file=table.path)
             file = self._next_name(table)
-            write_whole(self.folder / file, _as_wav(content, recording), raising=CaptureError)
+            write_whole(self.folder / file, content, raising=CaptureError)
             try:
                 table.add(file, impact, settings)
             except BaseException:
@@ -207,10 +207,11 @@ class CaptureEditor:
         (409) if the digest of the recording is not `match`.
         """
         with self._lock():
-            if self._found(file)["digest"] == _digest(content):
-                return self._found(file)
-            table, index = self._owned(file, match)
             recording = read_upload(content)
+            content = _as_wav(content, recording)
+            if (found := self._found(file))["digest"] == _digest(content):
+                return found
+            table, index = self._owned(file, match)
             self._check_usable(recording, newtons=1.0, replaced=file)
             new = str(PurePosixPath(file).with_suffix(".wav"))
             if PurePosixPath(file).suffix.lower() == ".wav":
@@ -218,7 +219,7 @@ class CaptureEditor:
             elif os.path.lexists(self.folder / new) or new in map(file_of, table.rows):
                 new = self._next_name(table)
             self._set_aside(file)
-            write_whole(self.folder / new, _as_wav(content, recording), raising=CaptureError)
+            write_whole(self.folder / new, content, raising=CaptureError)
             if new != file:
                 table.rename(index, new)
                 (self.folder / file).unlink(missing_ok=True)

@@ -1,7 +1,6 @@
 """The files that the page fetches: those of the last few revisions."""
 
 import warnings
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,12 +50,12 @@ class Showcase:
     def __init__(self, opened: Opened, editor: CaptureEditor | None) -> None:
         self.opened, self.editor = opened, editor
         self.meters = 1.0 if opened.object is not None else opened.settings.surface_meters
-        self._shown: OrderedDict[int, Shown] = OrderedDict()
+        self._shown: dict[int, Shown] = {}
 
     @property
     def current(self) -> Shown:
         """The last revision's files."""
-        return next(reversed(self._shown.values()))
+        return list(self._shown.values())[-1]
 
     def files_of(self, number: int) -> Mapping[str, bytes]:
         """Return a revision's files, or the last one's if they are no longer kept."""
@@ -64,14 +63,14 @@ class Showcase:
 
     def show(self, revision: Revision) -> None:
         """Make a revision's files. Raises the errors of `make_bundle`, and StudioError without geometry."""
-        sampled, mute = self._sampled(revision), revision.field is None
+        sampled = self._sampled(revision)
         if self._is_other_field(revision):
             strikes, remarks = self._strikes(revision.field)
             shown, surface = find_object(self.opened), self._surface(revision.field)
-            bundle = make_bundle(sampled, object=shown, meters=self.meters, surface=surface, strikes=strikes, mute=mute)
+            bundle = make_bundle(sampled, object=shown, meters=self.meters, surface=surface, strikes=strikes)
             manifest, files, remarks = {**bundle.manifest}, bundle.files, remarks + bundle.remarks
         else:
-            before, bundle = self.current, make_bundle(sampled, mute=mute)
+            before, bundle = self.current, make_bundle(sampled)
             kept = {part: before.manifest[part] for part in ("object", "surface", "strikes")}
             manifest, files = {**bundle.manifest, **kept}, {**before.files, **bundle.files}
             remarks = before.remarks
@@ -79,10 +78,9 @@ class Showcase:
         # By revision, so that a page never reads one's manifest with another's numbers.
         file = {"file": f"revisions/{revision.number}/field.bin"}
         manifest["tensors"] = {name: {**tensor, **file} for name, tensor in manifest["tensors"].items()}
-        self._shown[revision.number] = Shown(manifest, files, sampled, revision, remarks)
-        # A page may still be reading the files of the revisions before.
-        while len(self._shown) > 4:
-            self._shown.popitem(last=False)
+        made = Shown(manifest, files, sampled, revision, remarks)
+        # A page may still be reading the files of the revisions before. A new dict: others read it meanwhile.
+        self._shown = dict([*self._shown.items(), (revision.number, made)][-4:])
 
     def _surface(self, field: SoundField | None) -> Path | Surface | None:
         """Return the surface to show in place of Gaussians or points: the field's body, or the reconstructed surface.
@@ -185,12 +183,12 @@ def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[
 def resample(sampled: SampledField, before: SoundField, after: SoundField) -> SampledField | None:
     """Return the table of the field `after` an edit from that of the field `before`.
 
-    None if that is not possible: for another fitted field, another phase, or a mode that was inaudible or muted.
+    None if that is not possible: for another fitted field, phase, a mode that was inaudible or muted, or none left.
     """
     if before.gain_field.fitted is not after.gain_field.fitted or not torch.equal(before.phase, after.phase):
         return None
     old, new = before.scale, after.scale
-    if bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):
+    if not bool(after.audible.any()) or bool((after.audible & (~before.audible | ((old == 0) & (new != 0)))).any()):
         return None
     audible = torch.nonzero(after.audible).flatten()
     columns = (torch.cumsum(before.audible.long(), 0) - 1)[audible]

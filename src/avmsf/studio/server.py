@@ -24,11 +24,12 @@ from starlette.types import ASGIApp
 
 from avmsf.errors import AvmsfError, StudioError, lacks_memory
 from avmsf.export.web import MEDIA_TYPES
+from avmsf.pipeline.config import Preset
 from avmsf.studio.capture import read_contact
 from avmsf.studio.guard import Guard, new_token, nothing_here, policy_of, read_json_object
 from avmsf.studio.opening import Opened
 from avmsf.studio.responses import FORESEEN_ERRORS, Answer, error_response, response_to
-from avmsf.studio.studio import Studio, StudioConfig
+from avmsf.studio.studio import Studio
 
 PAGE = Path(__file__).parent / "page"
 _SOUNDS = tuple(suffix for suffix, kind in MEDIA_TYPES.items() if kind.startswith("audio/"))
@@ -215,7 +216,7 @@ def serve(
     port: int | None = None,
     browser: bool = True,
     log: Callable[[str], None],
-    config: StudioConfig | None = None,
+    preset: Preset = "default",
 ) -> None:
     """Serve the page until Ctrl-C; `log` is called with its address.
 
@@ -225,7 +226,7 @@ def serve(
     with listen(port) as listener, _temporary_folder() as folder:
         number, token = listener.getsockname()[1], new_token()
         address = f"http://{_HOME}:{number}/{token}/"
-        studio = Studio(opened, Path(folder), config)
+        studio = Studio(opened, Path(folder), preset)
 
         def announce() -> None:
             log(address)

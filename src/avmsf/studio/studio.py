@@ -3,7 +3,6 @@
 import tempfile
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,24 +20,19 @@ from avmsf.studio.opening import Opened, shows_more
 from avmsf.studio.responses import NUMERIC_ERRORS, bad_request, error_response
 from avmsf.studio.session import Revision, Session
 
-
-@dataclass(frozen=True)
-class StudioConfig:
-    """Options of the page other than what is opened."""
-
-    steps: int = 150
-    """Steps towards a recording: half of the command line's, after which little changes."""
-    preset: Preset = "default"
-    """Settings of a reconstruction."""
+_STEPS = 150
+"""Steps towards a recording: half of the command line's, after which little changes."""
 
 
 class Studio:
     """What is open. Its coroutines run on one event loop; what takes long runs in threads or in a job."""
 
-    def __init__(self, opened: Opened, folder: Path, config: StudioConfig | None = None) -> None:
-        """Open everything; `folder` is for files that end with the server. Raises as the readers do."""
-        self.opened, self.folder = opened, folder
-        self.config = StudioConfig() if config is None else config
+    def __init__(self, opened: Opened, folder: Path, preset: Preset = "default") -> None:
+        """Open everything; `folder` is for files that end with the server, `preset` the settings of reconstructions.
+
+        Raises as the readers do.
+        """
+        self.opened, self.folder, self.preset = opened, folder, preset
         self.editor = None if opened.capture is None else CaptureEditor(opened.capture)
         self.showcase = Showcase(opened, self.editor)
         self.session = Session(opened.home, self.showcase.show)
@@ -82,7 +76,7 @@ class Studio:
         (folder / "like.wav").write_bytes(content)
         await self.threads.run("compute", save, field, folder / "field")
         files = {"field": "field", "recording": "like.wav", "output": "led"}
-        task: Event = {"task": "lead", "steps": self.config.steps}
+        task: Event = {"task": "lead", "steps": _STEPS}
         task |= {name: str(folder / file) for name, file in files.items()}
         return {"job": self.jobs.start("the guided edit", task, partial(self._take_led, base)).identifier}
 
@@ -124,7 +118,7 @@ class Studio:
             raise bad_request("recordings", "one or more", 0, advice="record impacts first", status=409)
         # One output is enough: the next job starts when this one's field is open.
         output = str(self.folder / "reconstructed")
-        task = {"task": "make_field", "folder": str(editor.folder), "output": output, "preset": self.config.preset}
+        task = {"task": "make_field", "folder": str(editor.folder), "output": output, "preset": self.preset}
         return {"job": self.jobs.start("the reconstruction", task, self._take_field).identifier}
 
     async def make_object(self) -> dict[str, Any]:
