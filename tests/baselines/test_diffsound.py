@@ -61,6 +61,8 @@ def test_a_family_is_exact_at_a_thickness_that_it_includes():
     place = torch.tensor(between, dtype=torch.float64).log()
     known = family.at(between).squares(ratio)
     torch.testing.assert_close(family.including(between).squares(ratio, place), known, rtol=1e-9, atol=0.0)
+    # Next to a body that it has, the curve between the two would follow their meshes' differences.
+    assert family.including(family.thickness[1] * (1.0 + 1e-6)) is family
 
 
 def test_thin_walls_bend_in_proportion_to_their_thickness():

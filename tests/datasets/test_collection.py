@@ -54,6 +54,8 @@ def test_sounds_of_every_dataset_start_where_they_are_asked_to(place: Path, path
     name = own.objects()[0]
     usual, sounds = (dataset.capture(name).impacts.sounds for dataset in (own, peak))
     assert bool((sounds[:, 0].abs() == sounds.abs().amax(1)).all())
+    # By these settings the preset `paper` knows where sounds start.
+    assert peak.capture(name).settings.time_zero == "peak"
     assert not bool((usual[:, 0].abs() == usual.abs().amax(1)).any())
     assert (
         open_dataset(place / path, time_zero="onset").capture(name).impacts.digest()

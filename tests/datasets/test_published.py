@@ -38,6 +38,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a raw tree of two objects with contacts and a mesh; nobody changes it."""
     home = write_raw(tmp_path_factory.mktemp("raw") / "of", {"10": ("0", "1"), "2": AUDIO_CONTACTS})
     write_mesh(home / "mesh_16k" / "2" / "model.obj")
+    # As some systems leave next to each file.
+    (home / "mesh_16k" / "2" / "._model.obj").write_bytes(b"no mesh")
     return home
 
 

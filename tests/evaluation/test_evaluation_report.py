@@ -15,6 +15,7 @@ from PIL import Image
 from test_runner import planned
 
 from avmsf.capture.audio import read_recording
+from avmsf.evaluation import report
 from avmsf.evaluation.published import PUBLISHED, published_ratios
 from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.report import draw_spectrogram, markdown, picture_levels, write_page, write_summary
@@ -174,6 +175,24 @@ def test_the_papers_ratio_is_of_its_own_rows() -> None:
     assert sum(map(len, PUBLISHED.values())) == 44
 
 
+def test_edits_move_from_where_their_own_object_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def edited(name: str, place: float) -> ObjectRecord:
+        reports = {"unedited": [place, place], "edit-physics": [place + 1.0, place]}
+        outcomes = [
+            Outcome("to wood", method, report={"places": {"umap": at}, "source": "ceramic", "target": "wood"})
+            for method, at in reports.items()
+        ]
+        return replace(record(name, {}), outcomes=tuple(outcomes))
+
+    drawn, results = [], ResultsFolder(tmp_path)
+    monkeypatch.setattr(ResultsFolder, "records", lambda _: (edited("1", 0.0), edited("2", 5.0)))
+    monkeypatch.setattr(report, "read_json", lambda _: {"umap": {"names": [], "embedding": [], "materials": []}})
+    monkeypatch.setattr(report, "draw_embedding", lambda *given, **_: drawn.append(given[2]))
+    monkeypatch.setattr(report, "_write_figure", lambda *_: tmp_path)
+    report.write_figures(results)
+    assert drawn == [{"edit-physics": [([0.0, 0.0], [1.0, 0.0]), ([5.0, 5.0], [6.0, 5.0])]}]
+
+
 def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) -> None:
     time = torch.arange(4000) / 8000.0
     recorded = 3.0 * torch.sin(2 * math.pi * 440 * time)
@@ -186,6 +205,10 @@ def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) 
     write_flac(tmp_path / "slow", recorded, sample_rate=400.0, gain=gain)
     slow = read_recording(tmp_path / "slow")
     assert (slow.sample_rate, slow.frames) == (8000.0, 20 * 4000)
+    # FLAC counts rates in tens above 65,535 Hz, and has none above 655,350 Hz.
+    for rate, written in ((65_536.0, 65_530.0), (800_000.0, 400_000.0)):
+        write_flac(tmp_path / "fast", recorded, sample_rate=rate, gain=gain)
+        assert read_recording(tmp_path / "fast").sample_rate == written
     write_flac(tmp_path / "silent", torch.zeros(100), sample_rate=8000.0, gain=listening_gain(torch.zeros(100)))
 
 

@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from avmsf._utils.processes import write_lock
 from avmsf.capture import read_capture, write_capture
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.datasets import CaptureCollection
 from avmsf.datasets.dataset import ObjectFacts
-from avmsf.errors import AvmsfError, EvaluationError, FitError
+from avmsf.errors import AvmsfError, EvaluationError, FitError, FolderInUseError
 from avmsf.evaluation import align_split, evaluate
 from avmsf.evaluation.methods import FieldMethod, FunctionMethod, method_named
 from avmsf.evaluation.modal_metrics import compare_modes, truth_at
@@ -230,6 +232,14 @@ def test_a_folder_of_other_things_and_damaged_results_are_refused(plates: Path, 
             results.records()
 
 
+def test_two_evaluations_exclude_each_other_in_one_folder(plates: Path, tmp_path: Path) -> None:
+    results = ResultsFolder(tmp_path / "results")
+    run_objects(planned(plates, "knn3"), ("a",), results)
+    with write_lock(results.path, "results", command="avmsf evaluate"), ThreadPoolExecutor(1) as other:
+        found = other.submit(run_objects, planned(plates, "knn3"), ("b",), results).exception()
+    assert isinstance(found, FolderInUseError)
+
+
 def test_methods_with_modes_are_compared_with_the_truth(tmp_path: Path) -> None:
     folder, asked = fill_plates(tmp_path / "plates", ("a",), truth=True), list[Task]()
     results = ResultsFolder(tmp_path / "results")
@@ -244,6 +254,8 @@ def test_methods_with_modes_are_compared_with_the_truth(tmp_path: Path) -> None:
     assert spline.figures == pytest.approx(expected, rel=1e-5)
     # Gains at one contact agree with any others.
     few = fill_plates(tmp_path / "few", ("a",), count=4, truth=True)
+    # The truth is the capture's, with or without what shows it.
+    (few / "a" / "surface.ply").unlink()
     run_objects(planned(few, "spline-gains", protocol="leave-one-out"), ("a",), ResultsFolder(tmp_path / "one"))
     (record,) = ResultsFolder(tmp_path / "one").records()
     assert len(record.outcomes) == 4

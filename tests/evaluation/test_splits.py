@@ -149,6 +149,8 @@ def test_shots_are_nested_and_scored_at_the_same_contacts() -> None:
         assert more.train[: len(fewer.train)] == fewer.train
     assert {case.test for case in cases} == {tuple(sorted(set(range(COUNT)) - set(cases[0].train)))}
     assert [case.label for case in Shots().cases(struck(5))] == ["4 shots", "2 shots", "1 shot"]
+    assert [case.label for case in Shots((2, 2)).cases(struck(5))] == ["2 shots"]
+    assert len(Shots((1,), starts=12).cases(struck(6))) == 6
 
 
 def test_shots_from_several_starts_have_test_contacts_of_their_own() -> None:

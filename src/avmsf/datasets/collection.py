@@ -57,7 +57,7 @@ class CaptureCollection:
 
     def facts(self, identifier: str) -> ObjectFacts:
         """Return what the capture is called. Raises DatasetError for an unknown one."""
-        folder = self._folder_of(identifier)
+        folder = self.folder_of(identifier)
         try:
             return ObjectFacts(identifier, settings_of(folder).name or identifier)
         except CaptureError:
@@ -66,7 +66,7 @@ class CaptureCollection:
 
     def capture(self, identifier: str) -> Capture:
         """Read one capture by `read_capture`. Raises DatasetError for an unknown or unreadable one."""
-        folder = self._folder_of(identifier)
+        folder = self.folder_of(identifier)
         try:
             return read_capture(folder, settings_of(folder).starting(self._time_zero))
         except CaptureError as error:
@@ -75,7 +75,7 @@ class CaptureCollection:
     def visual_source(self, identifier: str) -> VisualSource | None:
         """Return the capture's folder where there is anything in it to see. Raises DatasetError for an unknown one and
         for settings that cannot be read."""
-        folder = self._folder_of(identifier)
+        folder = self.folder_of(identifier)
         try:
             settings = settings_of(folder)
             return VisualSource(folder, settings) if shows_object(folder, settings) else None
@@ -97,7 +97,8 @@ class CaptureCollection:
         found = {path.name: path for path in _visible(self.folder) if (path / TABLE).is_file()}
         return {name: found[name] for name in in_order(found)}
 
-    def _folder_of(self, identifier: str) -> Path:
+    def folder_of(self, identifier: str) -> Path:
+        """Return the folder of a capture. Raises DatasetError for an unknown one."""
         expect_known(identifier, self._folders, str(self.folder))
         return self._folders[identifier]
 

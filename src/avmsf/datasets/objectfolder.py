@@ -14,7 +14,7 @@ import soundfile
 from avmsf._utils.text import in_order, parse_json, read_text
 from avmsf.capture.audio import Recording, read_recording
 from avmsf.capture.checks import find_surface
-from avmsf.capture.filenames import SHAPE_SUFFIXES
+from avmsf.capture.filenames import SHAPE_SUFFIXES, files_in
 from avmsf.capture.folder import Capture
 from avmsf.capture.settings import CaptureSettings
 from avmsf.capture.table import Impact
@@ -220,7 +220,7 @@ def find_mesh(folder: Path, identifier: str) -> VisualSource | None:
     """
     for place in mesh_folders(folder):
         flat = [place / f"{identifier}{suffix}" for suffix in SHAPE_SUFFIXES]
-        deep = sorted(path for path in (place / identifier).rglob("*") if path.suffix.lower() in SHAPE_SUFFIXES)
+        deep = [path for path in files_in(place / identifier) if path.suffix.lower() in SHAPE_SUFFIXES]
         for path in (*flat, *deep):
             if path.is_file():
                 return VisualSource(path.parent, CaptureSettings(surface=path.name))

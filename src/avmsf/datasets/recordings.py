@@ -52,7 +52,7 @@ def build_capture(
     if remarks:
         message = f"{origin}: {listed(remarks, separator='; ')}"
         warnings.warn(CaptureWarning(message, name=origin, value=tuple(remarks)), stacklevel=3)
-    return Capture(name, impacts, surface)
+    return Capture(name, impacts, surface, settings)
 
 
 def refuse_few(count: int, *, origin: str, reasons: Sequence[str]) -> None:

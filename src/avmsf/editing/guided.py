@@ -1,7 +1,7 @@
 """Guided editing: a field's modes are optimized towards a guide's target sounds, with one edit for all contacts."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +29,7 @@ dampings; and of gain factors, without the common level."""
 
 @dataclass(frozen=True)
 class Parameterization:
-    """Rates are those of Adam, in logarithms a step, falling to a twentieth; 0 fixes a quantity at its initial value.
+    """What of an edit moves, and how fast.
 
     The penalty on a quantity of single modes is half the mean square over modes of its value over its standard
     deviation (.05 of shift, .3 of damping_shift, 1 of scale), times `stiffness`, in the unit of the loss, which is a
@@ -38,16 +38,8 @@ class Parameterization:
 
     name: str
     """Name in the edit's report."""
-    pitch_rate: float
-    """Of the common factor on frequencies."""
-    damping_rate: float
-    """Of the common factor on dampings."""
-    shift_rate: float
-    """Of each frequency."""
-    damping_shift_rate: float
-    """Of each damping."""
-    scale_rate: float
-    """Of each gain factor."""
+    rates: Mapping[str, float]
+    """Adam's, by quantities of `ModalEdit`, in logarithms a step, falling to a twentieth; others stay as they are."""
     stiffness: float
     """Weight of the penalty on single modes."""
     searches: bool = True
@@ -56,14 +48,15 @@ class Parameterization:
     """Whether gains of a mode from f1 to f2 Hz are multiplied by f1 / f2 when the edit ends (paper, section 3.6)."""
 
 
-HIERARCHICAL = Parameterization("hierarchical", 0.02, 0.02, 0.003, 0.01, 0.02, 0.05)
+_OWN_RATES = {"shift": 0.003, "damping_shift": 0.01, "scale": 0.02}
+HIERARCHICAL = Parameterization("hierarchical", {"pitch": 0.02, "damping": 0.02, **_OWN_RATES}, 0.05)
 """The paper's factor on all frequencies, and ours: one on all dampings, penalties on single modes, a search first."""
-PUBLISHED = Parameterization("published", 0.02, 0.0, 0.003, 0.01, 0.02, 0.0, searches=False, gains_follow=True)
+PUBLISHED = Parameterization("published", {"pitch": 0.02, **_OWN_RATES}, 0.0, searches=False, gains_follow=True)
 """The paper's: f = exp(log alpha + log f0 + delta), dampings and gains of single modes, no penalty.
 
 The rates, which the paper does not state, are those of `HIERARCHICAL`.
 """
-INDEPENDENT = Parameterization("independent", 0.0, 0.0, 0.02, 0.02, 0.02, 0.0, searches=False)
+INDEPENDENT = Parameterization("independent", dict.fromkeys(_DEVIATIONS, 0.02), 0.0, searches=False)
 """The paper's baseline, after Audio-SDS: independent frequencies, dampings and gains, no common factors.
 
 The rates are this package's, those of the common factors above; Audio-SDS states .05 for its parameters.
@@ -222,15 +215,14 @@ class _Optimization:
         return identity if self.score is None else identity | {"network": self.score.digest}
 
     def _optimizer(self) -> torch.optim.Adam:
-        """Return an optimizer of the values; those whose rate is 0 stay where they begin."""
+        """Return an optimizer of the values; those without a rate stay where they begin."""
         own = torch.zeros(len(self.field.bank), dtype=torch.bool).index_fill(0, self.edited, True)
         groups = []
-        for name, value in self.values.items():
-            rate = getattr(self.parameters, f"{name}_rate")
-            if rate > 0:
-                groups.append({"params": [value.requires_grad_()], "lr": rate, "rate": rate})
-                if value.ndim:
-                    value.register_hook(lambda gradient: torch.where(own, gradient, 0.0))
+        for name, rate in self.parameters.rates.items():
+            value = self.values[name].requires_grad_()
+            groups.append({"params": [value], "lr": rate, "rate": rate})
+            if value.ndim:
+                value.register_hook(lambda gradient: torch.where(own, gradient, 0.0))
         # Targets change from step to step: a long memory of the gradient's square would brake what chance once pushed.
         return torch.optim.Adam(groups, betas=(0.9, 0.99))
 

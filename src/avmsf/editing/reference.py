@@ -103,7 +103,7 @@ class Reference:
         onset. Warns of a second impact, of clipping, and of a rate below the field's.
         """
         given = [Path(paths)] if isinstance(paths, str | Path) else [Path(path) for path in paths]
-        inside = [sorted(path.glob("*.[wW][aA][vV]")) if path.is_dir() else [path] for path in given]
+        inside = [sorted(path.glob("[!.]*.[wW][aA][vV]")) if path.is_dir() else [path] for path in given]
         found = [path for each in inside for path in each]
         if not found:
             folder, advice = given[0] if given else None, "give a sound file, or a folder with some"

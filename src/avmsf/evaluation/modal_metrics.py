@@ -16,9 +16,7 @@ Both are chosen so that `gain_error` is least.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -27,8 +25,8 @@ from jaxtyping import Complex128, Float, Float64, Int
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 from torch import Tensor
 
+from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.datasets.dataset import Dataset
 from avmsf.errors import EvaluationError
 from avmsf.evaluation.task import Amplitudes, Contacts
 from avmsf.modal.extraction.least_squares import NormalEquations
@@ -41,15 +39,10 @@ MAX_DELAY_SECONDS = 0.005
 off by up to three samples on measured objects, which is 3 ms at 1000 Hz, the lowest rate that is simulated."""
 
 
-def truth_of(dataset: Dataset, identifier: str) -> Truth | None:
+def truth_of(capture: Capture) -> Truth | None:
     """Return what is known of an object's modes; None for recorded objects. Raises as `read_truth`."""
-    path = _path(dataset, identifier)
-    return None if path is None else read_truth(path)
-
-
-def simulated(dataset: Dataset, names: Sequence[str]) -> frozenset[str]:
-    """Return which of the named objects the dataset has and were simulated."""
-    return frozenset(each for each in dataset.objects() if each in names and _path(dataset, each) is not None)
+    folder = capture.folder
+    return None if folder is None or not (folder / TRUTH).is_file() else read_truth(folder)
 
 
 def truth_at(truth: Truth, names: tuple[str, ...]) -> Truth:
@@ -110,11 +103,6 @@ def common_delay(truth: Truth, impacts: Impacts) -> float:
         options={"xatol": 1e-6 * step},
     )
     return float(found.x)
-
-
-def _path(dataset: Dataset, identifier: str) -> Path | None:
-    source = dataset.visual_source(identifier)
-    return source.folder / TRUTH if source is not None and (source.folder / TRUTH).is_file() else None
 
 
 _SAME_FREQUENCY_RATIO = 0.002

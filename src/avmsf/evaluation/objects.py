@@ -19,7 +19,6 @@ from avmsf.datasets.dataset import Dataset
 from avmsf.datasets.numbering import ABLATION, NON_SYMMETRIC
 from avmsf.errors import AvmsfError, EvaluationError, SceneError
 from avmsf.evaluation.editing import TRANSITIONS, materials_of
-from avmsf.evaluation.modal_metrics import simulated
 from avmsf.evaluation.mode_embedding import check_materials
 from avmsf.evaluation.registry import Protocol, VisualInput
 from avmsf.features.feature_field import FeatureField, load_features, read_report
@@ -35,6 +34,7 @@ from avmsf.pipeline.shape import mesh_symmetries, reported_symmetries
 from avmsf.pipeline.stages import StageFolder
 from avmsf.reconstruction import ObjectShape
 from avmsf.simulate import recipe
+from avmsf.simulate.ground_truth import TRUTH
 from avmsf.symmetry.symmetries import Symmetries
 
 
@@ -200,9 +200,11 @@ def members(dataset: Dataset) -> dict[str, frozenset[str]]:
     """
     found = {}
     for group, (_, numbers, names) in SUBSETS.items():
-        found[group] = frozenset(each for each in dataset.objects() if each.partition("_")[0] in numbers)
         if isinstance(dataset, CaptureCollection):
-            found[group] = simulated(dataset, names)
+            known = (each for each in dataset.objects() if each in names)
+            found[group] = frozenset(each for each in known if (dataset.folder_of(each) / TRUTH).is_file())
+        else:
+            found[group] = frozenset(each for each in dataset.objects() if each.partition("_")[0] in numbers)
     return {group: each for group, each in found.items() if each}
 
 

@@ -195,22 +195,26 @@ def write_figures(results: ResultsFolder) -> list[Path]:
 
 
 def _write_edits(records: Sequence[ObjectRecord], folder: Path) -> Iterator[Path]:
-    outcomes = [each for record in records for each in record.outcomes if "places" in each.report]
-    before = {each.case: each.report["places"] for each in outcomes if each.method == "unedited"}
-    edited = [each for each in outcomes if each.case in before and each.method != "unedited"]
-    pairs = dict.fromkeys((each.report["source"], each.report["target"]) for each in edited)
-    spaces = read_json(folder / SPACES) if pairs else {}
-    for (metric, space), (source, target) in product(spaces.items(), pairs):
+    moved: dict[tuple[str, str], list[tuple[str, Any, Any]]] = {}
+    curves: dict[str, list[Curve]] = {}
+    for record in records:
+        outcomes = [each for each in record.outcomes if "places" in each.report]
+        # Of this object alone: others of its material have cases of the same keys.
+        before = {each.case: each.report["places"] for each in outcomes if each.method == "unedited"}
+        for each in outcomes:
+            if each.method != "unedited" and each.case in before:
+                move = each.method, before[each.case], each.report["places"]
+                moved.setdefault((each.report["source"], each.report["target"]), []).append(move)
+            if each.report.get("clap"):
+                curves.setdefault(each.method, []).append([(step, score) for step, score in each.report["clap"]])
+    spaces = read_json(folder / SPACES) if moved else {}
+    for (metric, space), ((source, target), edits) in product(spaces.items(), moved.items()):
         moves: dict[str, list[Move]] = {}
-        for each in (each for each in edited if (each.report["source"], each.report["target"]) == (source, target)):
-            moves.setdefault(each.method, []).append((before[each.case][metric], each.report["places"][metric]))
+        for method, old, new in edits:
+            moves.setdefault(method, []).append((old[metric], new[metric]))
         title = f"{source} to {target}, {METRICS[metric].heading} of {len(space['names'])} objects"
         figure = draw_embedding(np.array(space["embedding"]), space["materials"], moves, target=target, title=title)
         yield _write_figure(figure, folder, f"{metric} {source} to {target}")
-    curves: dict[str, list[Curve]] = {}
-    for each in outcomes:
-        if each.report.get("clap"):
-            curves.setdefault(each.method, []).append([(step, score) for step, score in each.report["clap"]])
     if curves:
         figure = draw_clap_curves(curves, title="CLAP score of the previews and the prompt")
         yield _write_figure(figure, folder, "clap")

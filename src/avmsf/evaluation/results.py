@@ -5,6 +5,7 @@ Some of the sounds are stored too, to be listened to and drawn.
 
 import io
 import json
+import math
 import re
 import traceback
 from collections.abc import Mapping, Sequence
@@ -35,8 +36,8 @@ RECORDED = "recorded"
 """What the recordings are called next to the methods."""
 _PEAK = 0.25
 """What recordings peak at, of full scale: louder sounds of a method have room above."""
-_MIN_RATE_HZ = 8000.0
-"""Below it browsers do not play."""
+_RATES_HZ = 8000.0, 655_350.0
+"""Below the first browsers do not play; FLAC has none above the second."""
 _FULL_SCALE = 1 - 2**-15
 
 
@@ -198,13 +199,17 @@ def listening_gain(recorded: Float[Tensor, " samples"]) -> float:
 def write_flac(path: Path, sound: Float[Tensor, " samples"], *, sample_rate: float, gain: float) -> None:
     """Write a sound times `gain` as a FLAC file of 16 bits; what would clip is turned down to full scale.
 
-    Sounds at rates that browsers do not play are resampled by a whole factor. Raises EvaluationError.
+    Sounds at rates that browsers do not play or FLAC does not have are resampled by a whole factor. Raises
+    EvaluationError.
     """
-    factor = max(1, int(np.ceil(_MIN_RATE_HZ / sample_rate)))
-    samples = resample_poly(sound.double().numpy() * gain, factor, 1)
+    up, down = (max(1, math.ceil(each)) for each in (_RATES_HZ[0] / sample_rate, sample_rate / _RATES_HZ[1]))
+    samples = resample_poly(sound.double().numpy() * gain, up, down)
+    rate = round(sample_rate * up / down)
+    # Above 65,535 Hz FLAC counts in tens.
+    rate -= rate % 10 if rate > 65_535 else 0
     samples = samples * min(1.0, _FULL_SCALE / max(float(np.abs(samples).max(initial=0.0)), _FULL_SCALE))
     memory = io.BytesIO()
-    soundfile.write(memory, samples, round(sample_rate * factor), subtype="PCM_16", format="FLAC")
+    soundfile.write(memory, samples, rate, subtype="PCM_16", format="FLAC")
     write_whole(path, memory.getvalue(), raising=EvaluationError)
 
 

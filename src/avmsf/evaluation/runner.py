@@ -16,6 +16,7 @@ from torch import Tensor
 from avmsf._utils.caching import Given, Result, content_digest, once
 from avmsf._utils.device import one_thread
 from avmsf._utils.parallel import run_tasks, workers_at
+from avmsf._utils.processes import write_lock
 from avmsf.capture import Capture
 from avmsf.errors import AvmsfError, EvaluationError, WorkerError
 from avmsf.evaluation.editing import EditTask, Generated, score_edit
@@ -66,7 +67,7 @@ class ObjectData:
         """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are
         not of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the
         signs of the gains, and which the truth of all does not have."""
-        truth = None if evaluation.time_zero == "peak" else truth_of(dataset, identifier)
+        truth = None if evaluation.time_zero == "peak" else truth_of(capture)
         known = () if truth is None else (truth.frequency, truth.damping, truth.gains)
         self.digest = content_digest(self.impacts.digest(), *known)
         """Of all that values depend on of the object's recordings and truth."""
@@ -342,13 +343,14 @@ def run_objects(
 
     with workers_at(workers, address, raising=EvaluationError) as parallel:
         evaluation.begin(results)
-        if workers > 1 or address is not None:
-            act = partial(_run_elsewhere, (evaluation, results, METRICS))
-            run_tasks(act, {each: each for each in identifiers}, parallel, done, log)
-            return
-        for identifier in identifiers:
-            run_object(evaluation, identifier, results, log)
-            done(identifier, None)
+        with write_lock(results.path, "results", command="avmsf evaluate", advice=", or choose another --output"):
+            if workers > 1 or address is not None:
+                act = partial(_run_elsewhere, (evaluation, results, METRICS))
+                run_tasks(act, {each: each for each in identifiers}, parallel, done, log)
+                return
+            for identifier in identifiers:
+                run_object(evaluation, identifier, results, log)
+                done(identifier, None)
 
 
 def _run_elsewhere(shared: tuple[Evaluation, ResultsFolder, dict[str, MetricEntry]], identifier: str) -> None:

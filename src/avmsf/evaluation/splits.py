@@ -148,9 +148,10 @@ class Shots:
         """Return a case for each number and start; the test contacts are those left by the largest number."""
         distinct = DistinctContacts.of(impacts)
         total = len(distinct.rows)
-        counts = [count for count in self.counts if count < total] or [distinct.check_count(min(self.counts))]
+        given, starts = dict.fromkeys(self.counts), min(self.starts, total)
+        counts = [count for count in given if count < total] or [distinct.check_count(min(given))]
         cases = []
-        for first in dict.fromkeys(round(number * total / self.starts) for number in range(self.starts)):
+        for first in (round(number * total / starts) for number in range(starts)):
             order = farthest_points(distinct.contacts, max(counts), start=first).tolist()
             test = distinct.case("", order).test
             fold = f"from {impacts.names[distinct.rows[first][0]]}" if self.starts > 1 else ""

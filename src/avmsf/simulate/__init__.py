@@ -6,7 +6,7 @@ modes, amplitudes of every recording, true contacts. The same recipe gives the s
 
 Core types: `ObjectRecipe`, `Imperfections`, `Hammer`, `Shape`, `SoundingBody`, `Simulation`, `Truth`.
 
-- `shapes` makes closed surfaces, tetrahedra, colors and known symmetries by rule: surfaces of revolution, sheets, rods
+- `shapes` makes closed surfaces, tetrahedra and colors by rule: surfaces of revolution, sheets, rods
   swept along a curve and lumps, of prisms that are cut into tetrahedra.
 - `bodies` makes the elastic body of a recipe, which stands on soft springs.
 - `imperfections` lets walls, stiffness and density vary smoothly over it, damping couple modes, and recordings start

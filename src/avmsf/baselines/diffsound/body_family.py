@@ -29,6 +29,8 @@ _WALL_RATIOS = (0.6, 0.85, 1.2, 1.7)
 inside of a vessel worse than its outside."""
 _SHAPE_THICKNESSES = 6
 """Thicknesses that are computed at first of a shape whose wall is not known."""
+_SAME_THICKNESS = 1e-3
+"""Relative difference up to which two thicknesses count as one."""
 _REFINEMENT = 0.7
 """Factor on the length of prisms that are too coarse for a mesh."""
 
@@ -83,7 +85,12 @@ class BodyFamily:
         return isotropic_modes(self.make(thickness), count=self.bodies[0].count)
 
     def including(self, thickness: float) -> "BodyFamily":
-        """Return the family with the body of another thickness, meters, too, which makes it exact there."""
+        """Return the family with the body of another thickness, meters, too, which makes it exact there.
+
+        The same where it has one next to it: the slope between the two would be that of their meshes' differences.
+        """
+        if any(math.isclose(known, thickness, rel_tol=_SAME_THICKNESS) for known in self.thickness):
+            return self
         bodies = dict(zip(self.thickness, self.bodies, strict=True)) | {thickness: self.at(thickness)}
         ordered = tuple(sorted(bodies))
         return replace(self, thickness=ordered, bodies=tuple(bodies[each] for each in ordered))

@@ -3,13 +3,12 @@
 import itertools
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int
-from torch import Tensor
 
 from avmsf.fem.solid import Solid, prism_cells
 from avmsf.mesh.points import unit
@@ -131,9 +130,6 @@ def halves(
     return first, np.where(rising[:, None], np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
 
 
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-
-
 @dataclass(frozen=True, eq=False)
 class Rings:
     """Points on rings from the inside out, the pole first if there is one, and triangles between them.
@@ -198,32 +194,12 @@ class Rings:
 
 
 @dataclass(frozen=True, eq=False)
-class Symmetry:
-    """Rotations about an axis and mirror planes, through the origin, of a shape; compositions are not listed."""
-
-    axis: Float64[Tensor, " 3"] | None = None
-    """Direction of the axis, a unit vector; None where no turn is a symmetry."""
-    order: int | None = None
-    """Turns by 1/order are symmetries; None with an axis means every angle (of the shape that the triangles
-    approximate), and every plane that contains the axis."""
-    mirrors: Float64[Tensor, "planes 3"] = field(default_factory=lambda: torch.zeros(0, 3).double())
-    """Unit normals of mirror planes, apart from those that contain an axis of every angle."""
-
-
-ROUND = Symmetry(UP, None)
-"""Of what turns about the z axis by every angle."""
-MIRRORED = Symmetry(mirrors=torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
-"""Of what has a handle: the plane through it and the axis."""
-
-
-@dataclass(frozen=True, eq=False)
 class Draft:
     """A shape without its colors."""
 
     body: SolidBuilder
     wall: float
     """Nominal thickness, meters."""
-    symmetry: Symmetry
 
 
 Maker = Callable[[np.random.Generator, float | None], Draft]

@@ -15,7 +15,7 @@ from avmsf.fem.remeshing import halved
 from avmsf.fem.solid import Solid
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import TexturedMesh
-from avmsf.simulate.shapes.body import Draft, Maker, Symmetry, stream
+from avmsf.simulate.shapes.body import Draft, Maker, stream
 from avmsf.simulate.shapes.freeform import blob
 from avmsf.simulate.shapes.revolution import bell, bottle, bowl, dish, fluted, goblet, lid, plate, pot, tube
 from avmsf.simulate.shapes.sheet import boomerang, bracket, channel, platter, scallop, spoon, tray
@@ -36,16 +36,12 @@ _MAX_DRAFTS = 4
 class Shape:
     """One individual of a kind: upright along z, its axis, if any, the z axis."""
 
-    name: str
-    """Kind and seed, such as "mug-3"."""
     surface: Surface
     """Closed triangles, counter-clockwise from outside, meters: the solid's surface, with its triangles subdivided."""
     colors: Float[Tensor, "points 3"]
     """Red, green, blue at each vertex of the surface as displayed (sRGB), 0 to 1."""
     thickness: float
     """Nominal thickness of the walls, meters; of a lump without walls its smallest extent."""
-    symmetry: Symmetry
-    """Of the shape; colors need not follow it."""
     solid: Solid
     """Tetrahedra, in the surface to rounding."""
 
@@ -77,11 +73,9 @@ def make_shape(kind: str, *, seed: int = 0, size: float | None = None, wall: flo
     # The name is part of the seed: with another one, all objects have other colors.
     colors = glaze(points, stream(seed, f"{kind} colours"))
     return Shape(
-        name=f"{kind}-{seed}",
         surface=Surface(torch.from_numpy(points).float(), torch.from_numpy(faces)),
         colors=torch.from_numpy(colors).float(),
         thickness=draft.wall * scale,
-        symmetry=draft.symmetry,
         solid=solid,
     )
 

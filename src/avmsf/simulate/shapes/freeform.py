@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from avmsf.fem.solid import Solid
-from avmsf.simulate.shapes.body import Draft, Patch, SolidBuilder, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import Draft, Patch, SolidBuilder, drawn_wall
 
 _CORE, _SHELLS = (10, 5, 3), 3
 """Boxes along each side of a blob's core, and layers around it."""
@@ -46,7 +46,7 @@ def blob(random: np.random.Generator, wall: float | None) -> Draft:
     body.fill(placed[cells])
     layers = np.stack([shaped(ball) * scale for ball in balls])
     Patch(body, placed[rows], layers[0], triangles.reshape(-1, 3), np.arange(len(rows))).grow(layers)
-    return Draft(body, flat, Symmetry())
+    return Draft(body, flat)
 
 
 def _boxes(numbers: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 from scipy.interpolate import BSpline
 
-from avmsf.simulate.shapes.body import ROUND, UP, Draft, Patch, Rings, SolidBuilder, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import Draft, Patch, Rings, SolidBuilder, drawn_wall
 
 DEFAULT_POINTS = 900
 """Points in the middle of a wall: about 12 nodes of second order each, so some 32,000 degrees of freedom."""
@@ -170,7 +169,7 @@ def bowl(random: np.random.Generator, wall: float | None) -> Draft:
     corners = [(0.0, 0.0, 1.25), (bottom, 0.0, 1.25), (belly, 0.15, 1.0), (0.97, 0.7, 1.0), (1.0, 1.0, 0.9)]
     turned = Turned.lay(Profile.scaled(radius, depth * radius, wall, corners))
     turned.add_foot(0.42 * radius, random.uniform(0.004, 0.008))
-    return Draft(turned.body, wall, ROUND)
+    return Draft(turned.body, wall)
 
 
 def plate(random: np.random.Generator, wall: float | None) -> Draft:
@@ -181,7 +180,7 @@ def plate(random: np.random.Generator, wall: float | None) -> Draft:
     corners = [(0.0, 0.0, 1.0), (flat, 0.0, 1.0), (flat + 0.12, 0.65, 1.0), (flat + 0.2, 0.85, 1.0), (1.0, 1.0, 0.9)]
     turned = Turned.lay(Profile.scaled(radius, rise, wall, corners))
     turned.add_foot(0.8 * flat * radius, random.uniform(0.003, 0.005))
-    return Draft(turned.body, wall, ROUND)
+    return Draft(turned.body, wall)
 
 
 def goblet(random: np.random.Generator, wall: float | None) -> Draft:
@@ -218,7 +217,7 @@ def goblet(random: np.random.Generator, wall: float | None) -> Draft:
     slim = 1.0 - (1.0 - thinnest) * np.sin(math.pi * part) ** 0.6
     layers = ((1.0 - part) * start + part * end) * np.concatenate([slim, slim, np.ones_like(slim)], axis=2)
     above.grow(layers, end=below)
-    return Draft(cup.body, wall, ROUND)
+    return Draft(cup.body, wall)
 
 
 def bell(random: np.random.Generator, wall: float | None) -> Draft:
@@ -231,7 +230,7 @@ def bell(random: np.random.Generator, wall: float | None) -> Draft:
     corners = [(0.0, 1.0, 1.2), (shoulder, 1.0, 1.2), (waist, 0.75, 1.0), (waist * 1.15, 0.3, 1.0), (1.0, 0.0, 1.5)]
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800)
     _crown(turned, grip_radius, height + grip, swell=0.35, taper=0.45)
-    return Draft(turned.body, wall, ROUND)
+    return Draft(turned.body, wall)
 
 
 def bottle(random: np.random.Generator, wall: float | None) -> Draft:
@@ -241,7 +240,7 @@ def bottle(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.0025, 0.0035, wall)
     corners = [(0.0, 0.0, 1.4), (0.95, 0.0, 1.3), (1.0, 0.1, 1.0), (1.0, shoulder, 1.0)]
     corners += [(neck, shoulder + 0.12, 1.0), (neck, 1.0, 1.1)]
-    return Draft(Turned.lay(Profile.scaled(radius, tall * radius, wall, corners)).body, wall, ROUND)
+    return Draft(Turned.lay(Profile.scaled(radius, tall * radius, wall, corners)).body, wall)
 
 
 def lid(random: np.random.Generator, wall: float | None) -> Draft:
@@ -253,7 +252,7 @@ def lid(random: np.random.Generator, wall: float | None) -> Draft:
     corners = [(0.0, 1.0, 1.1), (0.45, 1.0, 1.0), (0.85, 0.45, 1.0), (0.93, 0.05, 1.1), (1.0, 0.0, 1.1)]
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners))
     _crown(turned, knob_radius, height + knob, swell=0.7, taper=0.6)
-    return Draft(turned.body, wall, ROUND)
+    return Draft(turned.body, wall)
 
 
 def tube(random: np.random.Generator, wall: float | None) -> Draft:
@@ -262,7 +261,7 @@ def tube(random: np.random.Generator, wall: float | None) -> Draft:
     wall = drawn_wall(random, 0.002, 0.003, wall)
     # Outwards is upwards here, so that the lower side of the wall is the tube's outside.
     profile = Profile([(radius, height * length, wall) for height in (-0.5, 0.0, 0.5)])
-    return Draft(Turned.lay(profile).body, wall, Symmetry(UP, None, UP[None].clone()))
+    return Draft(Turned.lay(profile).body, wall)
 
 
 def pot(random: np.random.Generator, wall: float | None) -> Draft:
@@ -273,7 +272,7 @@ def pot(random: np.random.Generator, wall: float | None) -> Draft:
     half, sides = 0.5 * (1 + flare), 6
     corners = [(0.0, 0.0, 1.2), (0.93, 0.0, 1.2), (1.0, 0.1, 1.0), (half, 0.6, 1.0), (flare, 1.0, 1.0)]
     profile = Profile.scaled(radius, tall * radius, wall, corners)
-    return Draft(Turned.lay(profile, fold=sides, warp=_polygon(sides, edged)).body, wall, _turning(sides))
+    return Draft(Turned.lay(profile, fold=sides, warp=_polygon(sides, edged)).body, wall)
 
 
 def fluted(random: np.random.Generator, wall: float | None) -> Draft:
@@ -289,7 +288,7 @@ def fluted(random: np.random.Generator, wall: float | None) -> Draft:
 
     corners = [(0.0, 0.0, 1.2), (0.5, 0.0, 1.2), (0.85, 0.3, 1.0), (1.0, 1.0, 1.0)]
     profile = Profile.scaled(radius, depth * radius, wall, corners)
-    return Draft(Turned.lay(profile, fold=lobes, warp=warp).body, wall, _turning(lobes))
+    return Draft(Turned.lay(profile, fold=lobes, warp=warp).body, wall)
 
 
 def dish(random: np.random.Generator, wall: float | None) -> Draft:
@@ -309,7 +308,7 @@ def dish(random: np.random.Generator, wall: float | None) -> Draft:
 
     corners = [(0.0, 0.0, 1.2), (0.55, 0.0, 1.2), (0.8, 0.25, 1.0), (1.0, 1.0, 0.9)]
     profile = Profile.scaled(radius, depth * radius, wall, corners)
-    return Draft(Turned.lay(profile, warp=warp).body, wall, Symmetry())
+    return Draft(Turned.lay(profile, warp=warp).body, wall)
 
 
 def _crown(turned: Turned, radius: float, top: float, *, swell: float, taper: float) -> None:
@@ -335,9 +334,3 @@ def _polygon(sides: int, edged: float) -> Warp:
         return values[:, 0] * (1.0 + weight * (factor - 1.0)), values[:, 1]
 
     return warp
-
-
-def _turning(order: int) -> Symmetry:
-    angles = torch.arange(order, dtype=torch.float64) * (math.pi / order) + 0.5 * math.pi
-    normals = torch.stack([torch.cos(angles), torch.sin(angles), torch.zeros_like(angles)], dim=1)
-    return Symmetry(UP, order, normals)

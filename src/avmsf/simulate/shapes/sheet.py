@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from jaxtyping import Float64, Int
 
-from avmsf.simulate.shapes.body import MIRRORED, UP, Draft, Rings, SolidBuilder, Symmetry, drawn_wall, halves
+from avmsf.simulate.shapes.body import Draft, Rings, SolidBuilder, drawn_wall, halves
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +47,6 @@ class Grid:
 
 
 _POINTS = 900
-_HALF_TURN = Symmetry(UP, 2, torch.eye(3).double()[:2])
-"""Of what is as long to both sides, and as wide, but not as high."""
 _HOLE_HALF_SIDE = 2
 """Half the side of the block of squares that a hole takes the place of."""
 
@@ -61,8 +58,7 @@ def platter(random: np.random.Generator, wall: float | None) -> Draft:
     grid = _even_grid(length, width * length)
     places = grid.parts * (0.5 * length, 0.5 * width * length)
     middle = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
-    # Half turns about x, y and z.
-    return _draft(middle, wall, grid.triangles, grid.order, Symmetry(UP, 2, torch.eye(3, dtype=torch.float64)))
+    return _draft(middle, wall, grid.triangles, grid.order)
 
 
 def boomerang(random: np.random.Generator, wall: float | None) -> Draft:
@@ -74,7 +70,7 @@ def boomerang(random: np.random.Generator, wall: float | None) -> Draft:
     one, other = grid.parts.T
     out, angle = radius + width * other * (1.0 - taper * one**2), 0.5 * arc * one
     middle = np.stack([out * np.cos(angle), out * np.sin(angle), np.zeros(len(one))], axis=1)
-    return _draft(middle, wall, grid.triangles, grid.order, Symmetry(mirrors=torch.eye(3).double()[1:]))
+    return _draft(middle, wall, grid.triangles, grid.order)
 
 
 def channel(random: np.random.Generator, wall: float | None) -> Draft:
@@ -87,7 +83,7 @@ def channel(random: np.random.Generator, wall: float | None) -> Draft:
     one, other = grid.parts.T
     aside, up = _bent(0.5 * across * np.abs(other), 0.5 * width, 0.5 * math.pi, bend)
     middle = np.stack([0.5 * length * one, np.sign(other) * aside, up], axis=1)
-    return _draft(middle, wall, grid.triangles, grid.order, _HALF_TURN)
+    return _draft(middle, wall, grid.triangles, grid.order)
 
 
 def scallop(random: np.random.Generator, wall: float | None) -> Draft:
@@ -101,7 +97,7 @@ def scallop(random: np.random.Generator, wall: float | None) -> Draft:
     part, angle = 0.2 + 0.4 * (1.0 + other), spread * one
     up = depth * (1.0 - part**2) * np.cos(0.5 * angle) + rib * part * np.cos(2.0 * ribs * angle)
     middle = radius * np.stack([part * np.cos(angle), part * np.sin(angle), up], axis=1)
-    return _draft(middle, wall, grid.triangles, grid.order, MIRRORED)
+    return _draft(middle, wall, grid.triangles, grid.order)
 
 
 def tray(random: np.random.Generator, wall: float | None) -> Draft:
@@ -120,7 +116,7 @@ def tray(random: np.random.Generator, wall: float | None) -> Draft:
         ],
         axis=1,
     )
-    return _draft(middle, wall, grid.triangles, grid.order, _HALF_TURN)
+    return _draft(middle, wall, grid.triangles, grid.order)
 
 
 def bracket(random: np.random.Generator, wall: float | None) -> Draft:
@@ -140,7 +136,7 @@ def bracket(random: np.random.Generator, wall: float | None) -> Draft:
         kept &= _punch(grid, flat, row, column)
     x, z = _bent(flat[:, 0], lengths[0], angle, bend)
     middle = np.stack([x, flat[:, 1], z], axis=1)
-    return _draft(middle, wall, grid.triangles[kept], grid.order, Symmetry())
+    return _draft(middle, wall, grid.triangles[kept], grid.order)
 
 
 def spoon(random: np.random.Generator, wall: float | None) -> Draft:
@@ -185,7 +181,7 @@ def spoon(random: np.random.Generator, wall: float | None) -> Draft:
     triangles, order = _attach(rings, rim, rows)
     swelling = np.repeat(1.0 + 0.9 * np.sin(math.pi * part_along[:, 0]) ** 0.5, len(across))
     swelling = np.concatenate([np.ones(len(disc)), swelling])
-    return _draft(np.concatenate([disc, strip]), wall, triangles, order, MIRRORED, swelling=swelling)
+    return _draft(np.concatenate([disc, strip]), wall, triangles, order, swelling=swelling)
 
 
 def _even_grid(length: float, width: float) -> Grid:
@@ -195,18 +191,12 @@ def _even_grid(length: float, width: float) -> Grid:
 
 
 def _draft(
-    middle: np.ndarray,
-    wall: float,
-    triangles: np.ndarray,
-    order: np.ndarray,
-    symmetry: Symmetry,
-    *,
-    swelling: np.ndarray | float = 1.0,
+    middle: np.ndarray, wall: float, triangles: np.ndarray, order: np.ndarray, *, swelling: np.ndarray | float = 1.0
 ) -> Draft:
     """Return the shape of one sheet, `swelling` times as thick as the wall at each point."""
     body = SolidBuilder()
     body.lay(middle, wall * swelling, triangles, order)
-    return Draft(body, wall, symmetry)
+    return Draft(body, wall)
 
 
 def _punch(grid: Grid, flat: np.ndarray, row: int, column: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from avmsf.simulate.shapes.body import MIRRORED, Draft, Patch, Symmetry, drawn_wall
+from avmsf.simulate.shapes.body import Draft, Patch, drawn_wall
 from avmsf.simulate.shapes.revolution import Profile, Turned, spline
 
 _MELT_RATIO = 0.16
@@ -79,7 +79,7 @@ def mug(random: np.random.Generator, wall: float | None) -> Draft:
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWDING)
     reach, low = random.uniform(0.75, 0.95) * radius, random.uniform(0.2, 0.3)
     _add_handle(turned, low * height, random.uniform(0.74, 0.82) * height, reach, random)
-    return Draft(turned.body, wall, MIRRORED)
+    return Draft(turned.body, wall)
 
 
 def jug(random: np.random.Generator, wall: float | None) -> Draft:
@@ -101,7 +101,7 @@ def jug(random: np.random.Generator, wall: float | None) -> Draft:
     turned = Turned.lay(Profile.scaled(radius, height, wall, corners), points=800, crowd=_CROWDING, warp=warp)
     reach = random.uniform(0.9, 1.1) * radius
     _add_handle(turned, random.uniform(0.38, 0.45) * height, 0.82 * height, reach, random)
-    return Draft(turned.body, wall, Symmetry())
+    return Draft(turned.body, wall)
 
 
 def skillet(random: np.random.Generator, wall: float | None) -> Draft:
@@ -130,7 +130,7 @@ def skillet(random: np.random.Generator, wall: float | None) -> Draft:
     widths = random.uniform(0.018, 0.023) * (0.75 + 0.25 * part) * rounding
     heights = np.full(_HANDLE_LAYERS, random.uniform(0.009, 0.012)) * (0.4 + 0.6 * rounding)
     patch.grow(swept(curve, widths, heights, patch.places))
-    return Draft(turned.body, wall, MIRRORED)
+    return Draft(turned.body, wall)
 
 
 def _add_handle(turned: Turned, low: float, high: float, reach: float, random: np.random.Generator) -> None:
