@@ -200,6 +200,7 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
                 ([CONTACT, [0.0, math.nan, 0.0]], 1),
             )
         ),
+        (lambda: field().gains(CONTACT), ArrayError, {"name": "contacts"}),
         (lambda: field().render([CONTACT], directions=[[0, 0, 1.0]] * 2), ArrayError, {"name": "directions"}),
         (lambda: field().render([CONTACT], forces=[1.0, 2.0]), ArrayError, {"name": "forces"}),
         (lambda: field().render([CONTACT], forces=-5), ArrayError, {"name": "forces", "row": 0, "value": -5.0}),

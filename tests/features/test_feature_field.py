@@ -217,9 +217,9 @@ def test_a_mirror_image_counts_as_much_as_the_point_itself():
 def test_pooled_features_are_the_same_all_over_an_orbit_and_stay_so():
     given, both = field(tube()), symmetries(SIXFOLD, UPRIGHT)
     once = refine(given, both)
-    turned = once.at(SIXFOLD.turn(tube(), math.pi / 3).float())
+    turned = once.features[once.nearest(SIXFOLD.turn(tube(), math.pi / 3).float())]
     assert torch.allclose(once.features, turned, atol=1e-6)
-    assert torch.allclose(once.features, once.at(UPRIGHT.reflect(tube()).float()), atol=1e-6)
+    assert torch.allclose(once.features, once.features[once.nearest(UPRIGHT.reflect(tube()).float())], atol=1e-6)
     assert torch.allclose(refine(once, both).features, once.features, atol=1e-6)
     assert orbit_spread(once, both) < 1e-6
     # Averages keep the mean over the whole object.

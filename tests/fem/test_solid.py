@@ -1,6 +1,8 @@
 """Tetrahedra: their volume, their outside, and bodies made of meshes that are closed, open or broken."""
 
 import math
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -72,6 +74,17 @@ def test_closest_points_are_those_of_trimesh():
         np.testing.assert_allclose(found.weights.sum(axis=1), 1.0, rtol=1e-12)
         at = np.einsum("pc,pcd->pd", found.weights, triangles[found.rows])
         np.testing.assert_allclose(at, expected, atol=1e-12)
+
+
+def test_threads_that_share_a_search_get_what_they_asked_for():
+    search, interval = ClosestPoints(trimesh.creation.box().triangles), sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(1e-6)
+        with ThreadPoolExecutor(2) as pool:
+            found = list(pool.map(lambda count: len(search(np.zeros((count, 3))).rows), 20_000 * (3, 5)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert found == 20_000 * [3, 5]
 
 
 def test_a_coarser_skin_keeps_its_volume_and_stays_closed():

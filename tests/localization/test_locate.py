@@ -251,7 +251,10 @@ NOISE = torch.randn(7200, generator=torch.Generator().manual_seed(0))
             lambda: Locator.of(true_field(), points=torch.zeros(3, 3), directions=torch.zeros(2, 3)),
             {"name": "directions"},
         ),
-        (lambda: locate(true_field(100), SOUND, locator=locator_of()), {"name": "locator", "value": "another field"}),
+        *(
+            (lambda find=find: find(true_field(100), SOUND, locator=locator_of()), {"name": "locator"})
+            for find in (locate, locate_impacts)
+        ),
     ],
 )
 def test_what_cannot_be_located_is_refused(make, attributes):

@@ -2,7 +2,6 @@
 
 import io
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from avmsf.studio.session import Revision
 from avmsf.studio.studio import Studio
 from factories.capture_folder import fill
 from factories.raising import raises
-from factories.ringing_field import SameGains
 from served import plate_field, served
 
 SIDES = (0.24, 0.16, 0.02)
@@ -101,12 +99,8 @@ def test_gaussians_are_opened_as_gaussians(tmp_path: Path) -> None:
     assert manifest["points"] == len(points)
 
 
-def test_a_field_without_geometry_needs_an_object(tmp_path: Path) -> None:
-    class Nowhere(SameGains):
-        points = torch.zeros(0, 3)
-
-    field = plate_field()
-    bare = Revision(1, 1, field=replace(field, gain_field=Nowhere(torch.zeros(len(field.bank)))))
+def test_without_field_and_geometry_an_object_is_needed(tmp_path: Path) -> None:
+    bare = Revision(1, 1)
     with raises(StudioError, name="object"):
         Showcase(Opened("plate", tmp_path), None).show(bare)
     mesh = tmp_path / "lid.ply"

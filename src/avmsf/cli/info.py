@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 _DRAWN_POINTS = 4000
 _DRAWN_CONTACTS = 4
-_BATCH = 1024
-"""Points whose gains are taken at once: the encoding of their offsets to many clusters is large."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,6 @@ def _describe_field(options: Options) -> None:
 
 def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:
     """Write the figures of a field to a folder, with some of the recordings `recorded` next to its sounds."""
-    import torch
-
     from avmsf.cli.report import levels
     from avmsf.mesh.points import farthest_points
     from avmsf.pipeline.fit import modes_words
@@ -114,7 +110,7 @@ def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" 
     points = field.gain_field.points
     points = points[:: max(1, len(points) // _DRAWN_POINTS)]
     # Not `field.gains`, which warns of points off the surface.
-    gains = torch.cat([field.known(part).mean.real for part in torch.split(points, _BATCH)])[:, kept]
+    gains = field.known(points).mean.real[:, kept]
     title = f"gains of the modes of most energy of {name}"
     pictures = {
         "modes": draw_modes(field.bank, levels(field.amplitudes), is_mode=kept, title=f"{modes} of {name}"),

@@ -23,8 +23,6 @@ from avmsf.mesh.points import farthest_points, nearest_points
 from avmsf.modal.modes import ForcePulse, common_phase, synthesize
 from avmsf.modal.spectra import magnitude_stft
 
-_BATCH = 1024
-"""Points sampled at once; bounds the memory."""
 _RENDER_BATCH = 32
 """Contacts rendered at once; bounds the memory."""
 _DRAWN = 4
@@ -95,19 +93,14 @@ class SampledField:
         if not len(audible):
             wanted, advice = "1 or more below half the sample rate", "edit less, or fit the field again"
             raise ExportError.expected(wanted, 0, got="none", name="modes", advice=advice)
-        parts = torch.split(places, _BATCH)
-        ways = [None] * len(parts) if directions is None else torch.split(directions, _BATCH)
-        known = [sound_field.known(part, directions=way) for part, way in zip(parts, ways, strict=True)]
+        known = sound_field.known(places, directions=directions)
         turn = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase)
-        gains = torch.cat([(part.mean * turn)[:, audible].to(torch.complex64) for part in known])
-        damping = sound_field.bank.damping[audible]
-        factors = [part.damping[:, audible] for part in known if part.damping is not None]
         return cls(
             places.detach(),
             torch.nn.functional.normalize(normals.float(), dim=1),
             sound_field.bank.frequency[audible],
-            damping * torch.cat(factors) if factors else damping,
-            gains,
+            known.dampings(sound_field.bank.damping)[..., audible],
+            (known.mean * turn)[:, audible].to(torch.complex64),
             sound_field.noise().float(),
             sound_field.sample_rate,
             sound_field.origin.per_newton,

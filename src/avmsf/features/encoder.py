@@ -98,19 +98,11 @@ class PatchEncoder(ABC):
         color = functional.pad(color, beyond, mode="replicate")
         with torch.no_grad():
             found = self.tokens(color.to(next(self.model.parameters()))).float()
-        down, across = (_interpolation(side, self.patch).to(found) for side in (height, width))
-        return (down @ found @ across.T).to(image.device)
-
-
-def _interpolation(length: int, patch: int) -> Float[Tensor, "cells patches"]:
-    """Return what interpolates linearly from patches' centers to those of as many equal cells of `length` pixels.
-
-    The identity where the patches end with the image.
-    """
-    count = -(-length // patch)
-    places = (torch.arange(count, dtype=torch.float64) + 0.5) * length / count / patch - 0.5
-    places = places.clamp(0.0, count - 1.0)
-    return (1 - (places[:, None] - torch.arange(count)).abs()).clamp(min=0.0)
+        down, across = height / (rows * self.patch), width / (columns * self.patch)
+        inside = found.new_tensor([[[across, 0.0, across - 1.0], [0.0, down, down - 1.0]]])
+        cells = functional.affine_grid(inside, [1, *found.shape], align_corners=False)
+        found = functional.grid_sample(found[None], cells, padding_mode="border", align_corners=False)[0]
+        return found.to(image.device)
 
 
 def continue_outside(

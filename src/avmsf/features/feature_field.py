@@ -78,10 +78,6 @@ class FeatureField:
         """Return the row of the point nearest to each contact (paper: i*, section 3.5)."""
         return nearest_points(self.points, contacts)[:, 0]
 
-    def at(self, contacts: Float[Tensor, "contacts 3"]) -> Float[Tensor, "contacts dim"]:
-        """Return the features of the points nearest to the contacts."""
-        return self.features[self.nearest(contacts)]
-
     def clusters(self, count: int) -> tuple[Float[Tensor, "clusters 3"], Float[Tensor, "clusters dim"]]:
         """Return the mean positions and features of `count` regions, by k-means on the positions (paper, eq. 7)."""
         centers, labels = cluster(self.points, count)

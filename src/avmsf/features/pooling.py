@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -18,9 +18,6 @@ DEFAULT_ANGLES = 36
 """Angles of an orbit about a continuous axis: every 10 degrees."""
 DEFAULT_REACH_SPACINGS = 3.0
 """Distance in point spacings up to which the nearest point is a counterpart."""
-
-SymmetricPoints = tuple[Int[Tensor, "members points"], Bool[Tensor, "members points"]]
-"""Of every member of an orbit and every point: which row its counterpart is, and whether there is one."""
 
 
 def refine(
@@ -46,11 +43,11 @@ def refine(
         name, value = ("iterations", iterations) if iterations < 1 else ("angles", angles)
         raise SceneError.expected("at least 1", value, name=name)
     orbits = _orbits(features.points, symmetries, angles=angles, reach=reach)
-    pools = [_pool(rows, found) for rows, found in orbits]
+    means = [counts / counts.sum(axis=1)[:, None] for counts in orbits]
     values = features.features.detach().cpu().numpy()
     for _ in range(iterations):
-        for pool in pools:
-            values = pool @ values
+        for mean in means:
+            values = mean @ values
     return FeatureField(features.points, torch.from_numpy(values).to(features.features), features.encoder)
 
 
@@ -63,53 +60,40 @@ def orbit_spread(features: FeatureField, symmetries: Symmetries, *, angles: int 
     """
     if not symmetries:
         raise SceneError.expected("at least one", 0, name="symmetries")
-    values = features.features.detach().cpu().double()
-    total = float(values.var(dim=0, correction=0).sum())
-    within, counted = 0.0, 0
-    for rows, found in _orbits(features.points, symmetries, angles=angles):
-        members = found.sum(dim=0)
+    values = features.features.detach().cpu().double().numpy()
+    total, within, counted = float(values.var(axis=0).sum()), 0.0, 0
+    for counts in _orbits(features.points, symmetries, angles=angles):
+        members = counts.sum(axis=1)
         shared = members > 1
-        mean = torch.from_numpy(_pool(rows, found).astype(np.float64) @ values.numpy())
-        squares = sum(
-            ((values[row] - mean).square().sum(dim=1) * there for row, there in zip(rows, found, strict=True)),
-            start=torch.zeros_like(mean[:, 0]),
-        )
+        squares = (counts @ values**2 - (counts @ values) ** 2 / members[:, None]).sum(axis=1)
         within += float((squares[shared] / (members[shared] - 1)).sum())
         counted += int(shared.sum())
-    return (within / counted / total) ** 0.5 if counted and total > 0.0 else 0.0
-
-
-def _pool(rows: Int[Tensor, "members points"], found: Bool[Tensor, "members points"]) -> csr_array:
-    """Return the matrix that takes features to their means over the members that were found, the point among them."""
-    count = rows.shape[1]
-    shares = (found / found.sum(dim=0)).numpy()
-    own = np.broadcast_to(np.arange(count), rows.shape)
-    there = found.numpy()
-    return csr_array((shares[there].astype(np.float32), (own[there], rows.numpy()[there])), shape=(count, count))
+    # Rounding may leave less than nothing.
+    return math.sqrt(max(within, 0.0) / counted / total) if counted and total > 0.0 else 0.0
 
 
 def _orbits(
     points: Float[Tensor, "points 3"], symmetries: Symmetries, *, angles: int, reach: float = DEFAULT_REACH_SPACINGS
-) -> list[SymmetricPoints]:
-    """Return the counterparts under every rotation, and then under every mirror plane."""
+) -> list[csr_array]:
+    """Return how often each point [rows] has each other [columns] as a counterpart, and itself once.
+
+    Under every rotation, and then under every mirror plane.
+    """
     if not symmetries:
         return []
     places = points.detach().double().cpu()
-    tree = cKDTree(places.numpy())
-    spacing = torch.from_numpy(read_neighborhoods(places.numpy()).spacing)
-    limit = reach * spacing if reach else torch.full_like(spacing, math.inf)
+    tree, own = cKDTree(places.numpy()), np.arange(len(places))
+    spacing = read_neighborhoods(places.numpy()).spacing
+    limit = reach * spacing if reach else np.full_like(spacing, math.inf)
     moved = [[each.turn(places, angle) for angle in each.angles(angles)[1:]] for each in symmetries.rotations]
     moved += [[mirror.reflect(places)] for mirror in symmetries.mirrors]
-    return [_symmetric_points(each, tree, limit) for each in moved]
-
-
-def _symmetric_points(
-    moved: list[Float[Tensor, "points 3"]], tree: cKDTree, reach: Float[Tensor, " points"]
-) -> SymmetricPoints:
-    itself = torch.arange(len(reach))
-    rows, found = [itself], [torch.ones_like(itself, dtype=torch.bool)]
-    for places in moved:
-        distance, row = (torch.from_numpy(part) for part in tree.query(places.numpy()))
-        rows.append(row.long())
-        found.append(distance <= reach[row])
-    return torch.stack(rows), torch.stack(found)
+    found = []
+    for images in moved:
+        pairs = [(own, own)]
+        for image in images:
+            distance, row = tree.query(image.numpy())
+            there = distance <= limit[row]
+            pairs.append((own[there], row[there]))
+        rows, columns = np.concatenate(pairs, axis=1)
+        found.append(csr_array((np.ones(len(rows)), (rows, columns)), shape=(len(own), len(own))))
+    return found

@@ -201,7 +201,7 @@ class SoundField:
         Both as energy over all modes: 0 is certainty; points that may be louder than the mean can have more than 1.
         Points off the object give no warning. Raises as `fitted_mixture`.
         """
-        points = self._near(points, "positions")
+        points, _ = self._impacts(points, warn=False)
         _, surface = self.fitted_mixture, self.gain_field.points
         step = max(1, len(surface) // _MAX_MAPPED_POINTS)
         energy = self.energy(self.gain_field.predict(surface[::step]).parts).mean()
@@ -223,8 +223,7 @@ class SoundField:
         They are those along each mode's phase; `complex_gains` has what is ahead of it too.
         `directions`, unit vectors, are those of the impacts; without them they go straight into the surface.
         """
-        points, vectors = self._impacts(contacts, directions)
-        return self.known(points, directions=vectors).mean.real
+        return self.gain_field.point_estimate(*self._impacts(contacts, directions, "contacts")).mean.real
 
     def complex_gains(
         self, contacts: ArrayLike, *, directions: ArrayLike | None = None
@@ -233,18 +232,14 @@ class SoundField:
 
         -i times `Extraction.gains`; contacts, directions and unit as in `gains`, dampings d those of the contacts.
         """
-        points, vectors = self._impacts(contacts, directions)
-        return self._amplitudes(self.known(points, directions=vectors))
+        return self._amplitudes(self.gain_field.point_estimate(*self._impacts(contacts, directions, "contacts")))
 
     def known(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Gains:
         """Return all that a sound needs at the contacts: both parts of the gains, and the factors on the dampings.
 
         Contacts, directions and unit as in `gains`. Raises PositionError for a contact far from the object.
         """
-        points = self._near(contacts, "contacts")
-        vectors = None if directions is None else as_directions(directions, "directions", count=len(points))
-        with torch.no_grad():
-            return self.gain_field.point_estimate(points, vectors)
+        return self.gain_field.point_estimate(*self._impacts(contacts, directions, "contacts", warn=False))
 
     def render(
         self,
@@ -287,7 +282,7 @@ class SoundField:
         parts = [torch.zeros(0, length)]
         for rows in torch.split(torch.arange(len(contacts)), _BATCH):
             vector = None if vectors is None else vectors[rows]
-            modes = self.modal_sounds(self.known(contacts[rows], directions=vector), length)
+            modes = self.modal_sounds(self.gain_field.point_estimate(contacts[rows], vector), length)
             sounds = modes if pulse is None else pulse.soften(modes, sample_rate=self.sample_rate)
             parts.append(sounds + self._recorded(contacts[rows], vector, length) if recorded else sounds)
         sounds = torch.cat(parts)
@@ -299,22 +294,17 @@ class SoundField:
             background = missing_background(given / average, NEIGHBORS) * background
         return sounds + background if forces is None else given * sounds + average * background
 
-    def _near(self, positions: ArrayLike, name: str) -> Float[Tensor, "positions 3"]:
-        """Return positions as a tensor. Raises PositionError for one far from the object."""
-        points = as_vectors(positions, name)
-        expect_near(points, self.gain_field.points, name=name)
-        return points
-
     def _impacts(
-        self, positions: ArrayLike, directions: ArrayLike | None
+        self, positions: ArrayLike, directions: ArrayLike | None = None, name: str = "positions", *, warn: bool = True
     ) -> tuple[Float[Tensor, "contacts 3"], Float[Tensor, "contacts 3"] | None]:
-        """Return positions and directions as tensors. Warns of positions off the object."""
-        contacts = self._near(positions, "positions")
-        off = off_surface(contacts, self.gain_field)
+        """Return positions and directions as tensors. Raises PositionError; warns of positions off the object."""
+        contacts = as_vectors(positions, name)
+        expect_near(contacts, self.gain_field.points, name=name)
+        off = off_surface(contacts, self.gain_field) if warn else []
         if off:
             row, distance = max(off, key=lambda each: each[1])
             wanted, got = "positions on the object", f"{len(off)} off it, this one by {1e3 * distance:.3g} mm"
-            found = PositionWarning.expected(wanted, distance, got=got, name="positions", row=row)
+            found = PositionWarning.expected(wanted, distance, got=got, name=name, row=row)
             warnings.warn(found, stacklevel=3)
         vectors = None if directions is None else as_directions(directions, "directions", count=len(contacts))
         return contacts, vectors

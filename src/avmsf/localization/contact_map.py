@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.arrays import ArrayLike, as_floats, as_vectors, short_repr
 from avmsf._utils.text import counted
 from avmsf.errors import LocationError
+from avmsf.mesh.points import connected_parts
 
 LEVEL = 0.9
 """Probability of a credible region by default."""
@@ -171,10 +170,9 @@ class ContactPosterior:
         rows = torch.nonzero(self.region(level)).flatten()
         positions = self.points[rows].double().numpy()
         pairs = cKDTree(positions).query_pairs(self.linking_length, output_type="ndarray")
-        links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(rows), len(rows)))
-        count, labels = connected_components(links, directed=False)
+        labels = connected_parts(pairs, len(rows))
         found = []
-        for label in range(count):
+        for label in np.unique(labels):
             own = rows[torch.from_numpy(labels == label)]
             row = int(own[torch.argmax(self.probability[own])])
             members = torch.zeros(len(self.points), dtype=torch.bool)

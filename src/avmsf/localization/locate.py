@@ -68,15 +68,21 @@ def locate(
     Raises:
         LocationError: As `preprocess_recording` and `Locator.locate`, and for a locator of another field.
     """
-    if locator is not None and locator.field is not field:
-        got, advice = "one of another field", "leave it out"
-        raise LocationError.expected("one of this field", "another field", got=got, name="locator", advice=advice)
     with ProgressDisplay(shown=progress) as display:
         display.doing("locating the impact; the first of a field takes seconds to minutes")
-        impact = preprocess_recording(recording, field, sample_rate=sample_rate, settings=settings)
-        finder = _locator_of(field) if locator is None else locator
-        found = finder.locate(impact.sound, highest=impact.highest, force=force)
-    return assess_match(replace(found, notes=(*impact.notes, *found.notes)))
+        sound, highest, notes = preprocess_recording(recording, field, sample_rate=sample_rate, settings=settings)
+        found = _locator_for(field, locator).locate(sound, highest=highest, force=force)
+    return assess_match(replace(found, notes=(*notes, *found.notes)))
+
+
+def _locator_for(field: SoundField, given: Locator | None) -> Locator:
+    """Return a given locator, or the one that is kept of a field. Raises LocationError for one of another field."""
+    if given is None:
+        return _locator_of(field)
+    if given.field is not field:
+        got, advice = "one of another field", "leave it out"
+        raise LocationError.expected("one of this field", "another field", got=got, name="locator", advice=advice)
+    return given
 
 
 def assess_match(found: ContactPosterior) -> ContactPosterior:
@@ -137,8 +143,8 @@ def locate_impacts(
     every impact, as for `locate`; `locator` is one made of the field before. The decaying sound of earlier impacts is
     fitted by the object's modes just before an impact, extrapolated and subtracted. Impacts on other objects are left
     out, which a note says, and impacts closer than 30 ms count as one. Raises LocationError as `preprocess_recording`,
-    where no impact can be located, and for settings with `normalize = "deconvolve"` where the recording has a force
-    channel.
+    where no impact can be located, for a locator of another field, and for settings with `normalize = "deconvolve"`
+    where the recording has a force channel.
     """
     whole, chosen, notes = open_recording(recording, field, sample_rate=sample_rate, settings=settings)
     if chosen.normalize == "deconvolve":
@@ -150,7 +156,7 @@ def locate_impacts(
         sound = remove_rumble(response, chosen.highpass, whole)
     onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
-    finder = _locator_of(field) if locator is None else locator
+    finder = _locator_for(field, locator)
     ratio = len(resampled) / len(sound)
     starts = [round(onset * ratio) for onset in onsets]
     found = []

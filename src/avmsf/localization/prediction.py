@@ -16,8 +16,6 @@ from avmsf.field.sound_field import SoundField
 from avmsf.localization.likelihood import Likelihood, PredictedGains
 from avmsf.mesh.points import farthest_points
 
-_BATCH = 2048
-"""Points whose gains are asked for at once."""
 _NEIGHBORS = 8
 """Nearest points from which the variance of gains around a point is estimated."""
 _PATCH = 1.0 / 9.0
@@ -50,28 +48,18 @@ def predict(
     points: Float[Tensor, "points 3"],
     directions: Float[Tensor, "points 3"] | None = None,
     *,
-    factor: float | None = None,
+    factor: float,
 ) -> tuple[Complex64[Tensor, "points modes"], Float32[Tensor, "points modes"], Float32[Tensor, "points modes"] | None]:
     """Return gains, their posterior variance, and the factors on dampings.
 
     Gains are amplitudes of sines, and of cosines as imaginary part. The deviations are multiplied by `factor`; the
-    variance is zero without it and without a posterior.
+    variance is zero without a posterior.
     """
-    rotated = torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
-    gains, variances, dampings = [], [], []
-    for rows in torch.split(torch.arange(len(points)), _BATCH):
-        place = points[rows], None if directions is None else directions[rows]
-        with torch.no_grad():
-            gain_model = sound_field.gain_field
-            known = gain_model.predict(*place) if factor is None else gain_model.posterior(*place)
-        if factor is None or known.std is None:
-            variances.append(torch.zeros(known.mean.shape))
-        else:
-            variances.append((factor * known.std).square().sum(2).float())
-        gains.append(known.mean.to(torch.complex64) * rotated)
-        if known.damping is not None:
-            dampings.append(known.damping.float())
-    return torch.cat(gains), torch.cat(variances), torch.cat(dampings) if dampings else None
+    with torch.no_grad():
+        known = sound_field.gain_field.posterior(points, directions)
+    std, turn = known.std, torch.polar(torch.ones_like(sound_field.phase), sound_field.phase).to(torch.complex64)
+    variance = torch.zeros(known.mean.shape) if std is None else (factor * std).square().sum(2).float()
+    return known.mean.to(torch.complex64) * turn, variance, known.damping
 
 
 def local_variance(
@@ -146,8 +134,6 @@ _POINTS = 300
 _FACTORS = torch.logspace(-2.0, 0.6, 27, dtype=torch.float64)
 _LOG_PRIOR_STD = 1.0
 """Standard deviation of the factor's logarithm without any contact: e times as much or as little."""
-_SAME = 1e-6
-"""Distance over the object's size within which two contacts are in one place."""
 _NOISE = 1e-10
 """Variance of the measured gains' own errors over the strongest one's square: they are taken as they are."""
 
@@ -164,25 +150,24 @@ def calibrate_tempering(field: SoundField) -> float:
     if not can_self_calibrate(field):
         return 1.0
     gains = field.fitted_mixture
-    fitted = replace(field, gain_field=gains)
+    together = gains.places
     contacts = farthest_points(gains.contacts, min(_MAX_HOLDOUT, len(gains.contacts)))
     points = gains.points.double()
-    merged = _SAME * (points.amax(0) - points.amin(0)).norm()
     near = torch.from_numpy(cKDTree(points.numpy()).query(gains.contacts[contacts].numpy())[1])
     spread = farthest_points(points, min(_POINTS, len(points)))
     rows = torch.unique(torch.cat([spread, near]))
     truths = torch.searchsorted(rows, near)
-    places, factor = gains.points[rows], calibration_factor(fitted)
-    about = local_variance(gains.points, predict(fitted, gains.points)[0])[rows]
+    places, factor = gains.points[rows], calibration_factor(field)
+    about = local_variance(gains.points, gains.predict(gains.points).mean)[rows]
     prior = point_areas(places).clamp_min(1e-300).log() if len(places) > 2 else torch.zeros(len(places)).double()
-    smoothing = smoothing_matrix(places, contacts=distinct_contacts(fitted))
+    smoothing = smoothing_matrix(places, contacts=distinct_contacts(field))
     # A locator leaves the others out, too.
     kept = torch.nonzero(field.audible & (field.scale != 0.0)).flatten()
     rotated = torch.polar(torch.ones_like(field.phase), field.phase)[kept]
     weights = 1.0 / (4.0 * field.bank.damping[kept].double())
     score = -0.5 * (_FACTORS.log() / _LOG_PRIOR_STD).square()
     for contact, truth in zip(contacts.tolist(), truths.tolist(), strict=True):
-        left = gains.without((gains.contacts - gains.contacts[contact]).norm(dim=1) <= merged)
+        left = gains.without(together == together[contact])
         if left.place_count < 2:
             continue
         measured = gains.values[contact][kept] * rotated

@@ -2,12 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import scipy
 import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
@@ -21,27 +19,12 @@ from avmsf.capture.preprocess import latest_start
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import ArrayError, CaptureError, LocationError
 from avmsf.field.sound_field import SoundField
+from avmsf.modal.spectra import resampled
 
 Sound = str | Path | Recording | ArrayLike
 """The path of a sound file, a recording, or samples alone: [samples]."""
 _USABLE_BANDWIDTH = 0.9
 """Part of half a sample rate up to which a recording of another rate still holds all of a sound."""
-_MAX_RATIO_TERMS = 2000
-"""Largest terms of the ratio between two rates."""
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedImpact:
-    """One impact, prepared."""
-
-    sound: Float32[Tensor, " samples"]
-    """From its onset on, at the field's rate, up to the next impact or the recording's end."""
-    onset: int
-    """Sample of the recording at which the impact begins, at the recording's own rate."""
-    highest: float | None
-    """Frequency in Hz up to which the recording holds the sound; None where that is half the field's rate."""
-    notes: tuple[str, ...]
-    """Messages for the user."""
 
 
 def preprocess_recording(
@@ -50,8 +33,11 @@ def preprocess_recording(
     *,
     sample_rate: float | int | None = None,
     settings: CaptureSettings | None = None,
-) -> PreparedImpact:
+) -> tuple[Float32[Tensor, " samples"], float | None, list[str]]:
     """Prepare a recorded impact for a field like the recordings that it was fitted to.
+
+    Returns its samples at the field's rate, from its onset on up to the next impact or the recording's end, up to which
+    frequency in Hz they hold the sound (None for half that rate), and messages for the user.
 
     By the settings of that capture, which the field stores, or by `settings`. The impact is searched for in all of the
     recording, unless the capture was not cut and this recording starts with its impact, too. Bare samples are at
@@ -75,7 +61,7 @@ def preprocess_recording(
             "located; --several (in Python locate_impacts) locates all"
         )
     at_rate, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
-    return PreparedImpact(at_rate, prepared.onset, highest, (*notes, *remark))
+    return at_rate, highest, [*notes, *remark]
 
 
 @contextmanager
@@ -163,8 +149,7 @@ def at_field_rate(
         lowest = f"sound at {float(frequency.min()):.4g} Hz, the lowest of the object's {len(frequency)} modes"
         got, advice = f"{own:g} Hz samples with sound up to {highest:.4g} Hz", f"record at {rate:g} Hz"
         raise LocationError.expected(lowest, own, got=got, file=recording.name, name="sample_rate", advice=advice)
-    ratio = Fraction(rate / own).limit_denominator(_MAX_RATIO_TERMS)
-    resampled = scipy.signal.resample_poly(sound, ratio.numerator, ratio.denominator, padtype="line")
+    at_rate = resampled(torch.from_numpy(sound)[None], sample_rate=own, wanted=rate)[0]
     note = f"{recording.name} was resampled from {own:g} Hz to the field's {rate:g} Hz"
     if held < int(field.audible.sum()):
         energy = field.amplitudes.square() / field.bank.damping
@@ -173,4 +158,4 @@ def at_field_rate(
             f"; located by {held} of the object's {counted(len(frequency), 'mode')}, with {share:.0f} % of the energy "
             f"of its sounds: those above {highest:.4g} Hz are left out"
         )
-    return torch.from_numpy(resampled.astype(np.float32)), highest, [note]
+    return at_rate.float(), highest, [note]

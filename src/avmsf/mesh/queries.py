@@ -40,11 +40,14 @@ class ClosestPoints:
 
     def __call__(self, places: Float64[np.ndarray, "places 3"]) -> Closest:
         """Return the closest points; those of the places of the last call are kept."""
-        if not np.array_equal(places, self._last[0]):
+        # Read once: another thread may replace it meanwhile.
+        known, found = self._last
+        if not np.array_equal(places, known):
             parts = [self._search(some) for some in np.array_split(places, 1 + len(places) // _BATCH)]
             rows, weights, distances = (np.concatenate(each) for each in zip(*parts, strict=True))
-            self._last = places.copy(), Closest(rows, weights, distances)
-        return self._last[1]
+            found = Closest(rows, weights, distances)
+            self._last = places.copy(), found
+        return found
 
     def _search(self, places: Float64[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         near = [group[tree.query(places)[1]] for group, tree in zip(self._groups, self._trees, strict=True)]

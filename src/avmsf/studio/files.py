@@ -106,10 +106,7 @@ class Showcase:
             assert before.revision.field is not None
             found = resample(before.sampled, before.revision.field, field)
             return sample(field, before.sampled.points, before.sampled.normals) if found is None else found
-        own = points_on_object(field.gain_field)
-        if not len(own):
-            return sample(field, *self._clickable())
-        sampled = SampledField.of(field, _thinned(own, MAX_POINTS))
+        sampled = SampledField.of(field, _thinned(points_on_object(field.gain_field), MAX_POINTS))
         return replace(sampled, points=(sampled.points.double() / field.gain_field.length).float())
 
     def _is_other_field(self, revision: Revision) -> bool:
@@ -117,7 +114,7 @@ class Showcase:
         return not self._shown or self.current.revision.opening != revision.opening
 
     def _clickable(self) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points 3"]]:
-        """Return points of the object, and normals, for a field without points. Raises StudioError without geometry."""
+        """Return points of the object, and normals, where there is no field. Raises StudioError without geometry."""
         path = find_object(self.opened)
         if path is not None and not holds_gaussians(path):
             return _on_mesh(Surface.read(path, meters=self.meters))

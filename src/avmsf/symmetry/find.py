@@ -71,7 +71,7 @@ def find_symmetries(points: Float[Tensor, "points 3"], *, seed: Seed = None) -> 
         for normal, row in group.planes():
             foot = torch.from_numpy(middle + diagonal * (center @ normal) * normal)
             mirrors.append(MirrorSymmetry(_signed(normal), foot, _root(group.squares[row])))
-    turns.sort(key=lambda each: (not each.continuous, -(each.order or 0), each.error))
+    turns.sort(key=lambda each: (each.order is not None, -(each.order or 0), each.error))
     mirrors.sort(key=lambda each: each.error)
     return Symmetries(tuple(turns), tuple(mirrors), test.spacing * diagonal, test.tolerance, _root(min(rejected)))
 

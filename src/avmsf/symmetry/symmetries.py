@@ -27,11 +27,6 @@ class RotationalSymmetry:
     error: float
     """How far turned points lie from the surface, root mean square, in point spacings; see `find_symmetries`."""
 
-    @property
-    def continuous(self) -> bool:
-        """Whether every angle is a symmetry."""
-        return self.order is None
-
     def turn(self, points: Float[Tensor, "points 3"], angle: float) -> Float[Tensor, "points 3"]:
         """Return the points turned about the axis by `angle`, radians."""
         axis, offset = self.axis.double(), points.double() - self.point.double()

@@ -24,6 +24,8 @@ SHARED, PER_CONTACT = "shared", "per-contact"
 """Dampings that are the same everywhere, and those that vary with the contact."""
 _MIN_PLACES = 6
 """Positions below which none are held out to validate on."""
+_BATCH = 2048
+"""Contacts at once: the encoding of their offsets to many clusters is large."""
 _MAX_LAYERS = 64
 """Hidden layers, or bands of frequency, of a network in a file: thirty times those of the paper's. Each takes time
 to build before it can be compared with the file's tensors."""
@@ -85,7 +87,9 @@ class AttentionGains(TrainableGains, GainModel):
 
     def predict(self, points: Points, directions: Directions = None) -> Gains:
         """Return the gains at the contacts, for any direction, and the factors where dampings vary."""
-        return self.read(self.feature_field.nearest(points))
+        known = [self.read(rows) for rows in torch.split(self.feature_field.nearest(points), _BATCH)]
+        factors = [each.damping for each in known if each.damping is not None]
+        return Gains(torch.cat([each.mean for each in known]), damping=torch.cat(factors) if factors else None)
 
     def read(self, rows: Int[Tensor, " contacts"]) -> Gains:
         """Return what `predict` does for the points of the given rows; differentiable in the network's parameters."""

@@ -157,12 +157,10 @@ def expect_near(
 ) -> None:
     """Raise PositionError for a position farther outside the box of an object's points than the object is large.
 
-    Such a position counts another unit, or is in another frame. Of an object without points nothing is refused. `label`
-    says where a row's position was given, by default by their `name`.
+    Such a position counts another unit, or is in another frame. `label` says where a row's position was given, by
+    default by their `name`.
     """
     places, known = positions.double(), points.detach().cpu().double()
-    if not len(known):
-        return
     low, high = known.amin(0), known.amax(0)
     size = float((high - low).norm())
     outside = torch.clamp(torch.maximum(low - places, places - high), min=0).norm(dim=1)
@@ -202,8 +200,6 @@ def points_on_object(gains: GainModel) -> Float32[Tensor, "points 3"]:
 
     All of them where that would be none.
     """
-    if not len(gains.points):
-        return gains.points
     off = [row for row, _ in off_surface(gains.points, gains)]
     on = torch.ones(len(gains.points), dtype=torch.bool)
     on[off] = False
