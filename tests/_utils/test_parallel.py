@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from avmsf._utils.parallel import MAX_STARTS, run_tasks, workers_at
-from avmsf._utils.processes import start_child
+from avmsf._utils.processes import child_process
 from avmsf.errors import FitError, WorkerError
 from factories.running import gone
 
@@ -33,10 +33,10 @@ def dies_at_first(place: tuple[Path, int]) -> int:
 
 def stays(file: Path) -> None:
     """Start a process, write the number of both, and end never."""
-    child = start_child([sys.executable, "-c", "import time; time.sleep(600)"])
-    file.with_suffix(".part").write_text(f"{os.getpid()} {child.pid}")
-    file.with_suffix(".part").rename(file)
-    time.sleep(600)
+    with child_process([sys.executable, "-c", "import time; time.sleep(600)"]) as child:
+        file.with_suffix(".part").write_text(f"{os.getpid()} {child.pid}")
+        file.with_suffix(".part").rename(file)
+        time.sleep(600)
 
 
 def numbers_in(file: Path) -> list[int]:

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 import soundfile
 import torch
+import trimesh
 
 import avmsf
-from avmsf.capture import read_capture
+from avmsf.capture import read_capture, write_capture
 from avmsf.cli import VERBS, main
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.paths import OutputError
 from avmsf.errors import FitError
+from avmsf.features.feature_field import FeatureField, save_features
 from avmsf.field.store import load, save
 from avmsf.modal.modes import ForcePulse
 from factories.made_fields import directional, sounding
@@ -203,6 +205,17 @@ def test_render_sets_levels_by_one_factor_for_all(field: Path, tmp_path: Path, l
         assert max(np.abs(each).max() for each in written) == 32767
 
 
+def test_info_of_features_and_meshes_that_others_made(tmp_path: Path, capsys: Streams) -> None:
+    features = FeatureField.from_points(torch.rand(40, 3, generator=torch.Generator().manual_seed(0)))
+    save_features(features, tmp_path / "features.safetensors", report={"encoder": "one of our own"})
+    assert main(["info", str(tmp_path / "features.safetensors")]) == 0
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.invert()
+    box.export(tmp_path / "box.ply")
+    assert main(["info", str(tmp_path / "box.ply")]) == 0
+    assert "volume 1e+03 cm3" in capsys.readouterr().out
+
+
 def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys: Streams) -> None:
     output = tmp_path / "pictures"
     told, shown = results_of(capsys, "info", field, "--capture", capture, "--plots", output)
@@ -219,6 +232,10 @@ def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert len(told["compared_with"]["recordings"]) == 3
     assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "001.wav")
     assert (told["pipeline"]["extraction"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
+    # A later session may number its recordings as this one did.
+    write_capture(replace(read_capture(capture), name="another day"), tmp_path / "later")
+    told, _ = results_of(capsys, "info", field, "--capture", tmp_path / "later")
+    assert told["compared_with"]["which"] == "none a training recording"
     for name in ("modes", "gains", "spectrograms"):
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     # It has no body.

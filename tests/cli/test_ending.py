@@ -283,6 +283,13 @@ def test_of_many_a_file_that_the_command_did_not_make_is_not_replaced(captures, 
         record.touch()
 
 
+def test_pictures_that_are_asked_for_later_are_drawn(captures, tmp_path, capsys):
+    words = ["fit", *map(str, captures[:2]), "--until", "surface", "-o", str(tmp_path / "many")]
+    for plots, state in (((), "done"), ((), "as before"), (("--plots", str(tmp_path / "plots")), "done")):
+        assert {*states(capsys, *words, *plots).values()} == {state}
+    assert [*(tmp_path / "plots").rglob("*.png")]
+
+
 def test_what_cannot_be_of_many_is_refused(captures: tuple[Path, ...], tmp_path: Path) -> None:
     twice = tmp_path / captures[0].name
     shutil.copytree(captures[0], twice)

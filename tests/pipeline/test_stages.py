@@ -237,6 +237,8 @@ def test_settings_out_of_range_and_another_start_of_sounds_than_the_presets_are_
     for config, name in ((ViewsConfig, "count"), (LiftConfig, "reach")):
         with raises(SceneError, name=name, value=-1):
             config(**{name: -1})
+    with raises(SceneError, name="seed", value=2**63):
+        LiftConfig(seed=2**63)
     with raises(AvmsfError, name="fit"):
         FitOptions.parse(["mug", "--preset", "quick"])
     with raises(FitError, name="time_zero", value="onset"):

@@ -123,7 +123,7 @@ def test_who_comes_later_gets_what_was_missed() -> None:
 
 LIFELINE = """
 import threading
-from avmsf._utils.processes import end_with_parent, start_child
+from avmsf._utils.processes import child_process, end_with_parent
 threading.Thread(target=end_with_parent, daemon=True).start()
 """
 WAITS = "import time; time.sleep(60)"
@@ -131,13 +131,13 @@ WAITS = "import time; time.sleep(60)"
 
 def pair(begin: str, child: str = WAITS) -> tuple[str, ...]:
     """Return a worker that starts a process, says which both are, and waits."""
-    start = f"child = start_child([sys.executable, '-c', {child!r}])\nsay(processes=[os.getpid(), child.pid])\n"
-    return script(f"{begin}{start}{WAITS}")
+    start = f"with child_process([sys.executable, '-c', {child!r}]) as child:\n"
+    return script(f"{begin}{start}    say(processes=[os.getpid(), child.pid])\n    {WAITS}")
 
 
 @in_proc
 @pytest.mark.parametrize(
-    "worker", [pair(LIFELINE), pair("from avmsf._utils.processes import start_child\n", LIFELINE + WAITS)]
+    "worker", [pair(LIFELINE), pair("from avmsf._utils.processes import child_process\n", LIFELINE + WAITS)]
 )
 def test_cancelling_ends_all_processes_also_of_a_worker_that_does_not_end_itself(worker: tuple[str, ...]) -> None:
     async def cancel() -> list[Any]:

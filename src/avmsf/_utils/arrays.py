@@ -19,17 +19,18 @@ _LONGEST = 80
 """Characters of a single value."""
 
 
-def as_vectors(values: ArrayLike, name: str, *, count: int | None = None) -> Float[Tensor, "rows 3"]:
-    """Return three numbers a row as a tensor on the CPU: a float tensor's own type, else float64.
+def as_vectors(
+    values: ArrayLike, name: str, *, count: int | None = None, size: int | None = 3
+) -> Float[Tensor, "rows size"]:
+    """Return `size` numbers a row, any for None, as a tensor on the CPU: a float tensor's own type, else float64.
 
     Raises ArrayError for another shape, for another number of rows than `count`, and for values that are not finite.
     """
     found = as_floats(values, name)
-    rows = "rows" if count is None else str(count)
-    if found.ndim != 2 or found.shape[1] != 3 or (count is not None and len(found) != count):
-        single = f"put a single one into a list, {name}=[[x, y, z]]" if found.shape == (3,) else ""
-        shape = list(found.shape)
-        raise ArrayError.expected(f"an array [{rows}, 3]", shape, name=name, advice=single)
+    if found.ndim != 2 or size not in (None, found.shape[1]) or count not in (None, len(found)):
+        rows, columns = "rows" if count is None else count, "columns" if size is None else size
+        single = f"put a single one into a list, {name}=[[x, y, z]]" if found.shape == (size,) else ""
+        raise ArrayError.expected(f"an array [{rows}, {columns}]", list(found.shape), name=name, advice=single)
     return _finite(found, name)
 
 
@@ -77,18 +78,15 @@ def as_samples(values: ArrayLike, name: str) -> Float[Tensor, " samples"]:
     return _finite(found, name)
 
 
-def as_rows(values: ArrayLike, name: str, *, count: int) -> Float[Tensor, "rows columns"]:
-    """Return `count` rows of numbers. Raises as `as_vectors`."""
-    found = as_floats(values, name)
-    if found.ndim != 2 or len(found) != count:
-        raise ArrayError.expected(f"an array of {count} rows", list(found.shape), name=name)
-    return _finite(found, name)
-
-
 def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*shape"]:
     """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
     try:
-        found = torch.as_tensor(values if isinstance(values, Tensor) else np.asarray(values))
+        if isinstance(values, Tensor):
+            found = values
+        else:
+            array = np.asarray(values)
+            # A copy in native order: torch refuses reversed rows and foreign bytes, and shares others with the caller.
+            found = torch.from_numpy(array.astype(array.dtype.newbyteorder("=")))
     except (ValueError, TypeError, RuntimeError) as error:
         got = "lists of different lengths or other values" if isinstance(values, Sequence) else repr(values)[:60]
         raise ArrayError.expected(

@@ -89,18 +89,16 @@ def _expect_excused(error: OSError, path: Path) -> None:
     raise AvmsfError.expected("a lock", error.strerror or str(error), file=path, advice=advice) from error
 
 
-def start_child(command: Sequence[str], **settings: Any) -> "subprocess.Popen[bytes]":
-    """Start a process that `end_child` or `end_with_parent` ends; `settings` are those of Popen. Raises OSError."""
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, **settings)
-    _RUNNING.add(process)
-    return process
-
-
-def end_child(process: "subprocess.Popen[bytes]") -> None:
-    """Kill a process, where it runs."""
-    with process:
-        process.kill()
-    _RUNNING.discard(process)
+@contextmanager
+def child_process(command: Sequence[str], **settings: Any) -> Iterator["subprocess.Popen[bytes]"]:
+    """Run a process that ends with the context or by `end_with_parent`; `settings` are Popen's. Raises OSError."""
+    with subprocess.Popen(command, stdin=subprocess.PIPE, **settings) as process:
+        _RUNNING.add(process)
+        try:
+            yield process
+        finally:
+            process.kill()
+            _RUNNING.discard(process)
 
 
 def _end_of_input() -> None:

@@ -1,5 +1,6 @@
 """The progress of work that takes long: what it reports, and how that is shown on the standard error."""
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -122,7 +123,8 @@ class ProgressDisplay:
     @property
     def _moves(self) -> bool:
         """Whether the standard error shows a line that moves."""
-        return sys.stderr.isatty() or "ipykernel" in sys.modules
+        plain = os.environ.get("TERM", "").lower() in ("dumb", "unknown")
+        return (sys.stderr.isatty() and not plain) or "ipykernel" in sys.modules
 
     @property
     def _idle(self) -> bool:

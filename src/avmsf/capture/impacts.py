@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_forces, as_rate, as_rows, as_vectors
+from avmsf._utils.arrays import ArrayLike, as_forces, as_rate, as_vectors
 from avmsf._utils.caching import content_digest
 from avmsf.errors import ArrayError
 
@@ -75,7 +75,7 @@ class Impacts:
             raise ArrayError.expected(f"{count}, one for each contact", len(named), name="names")
         return cls(
             places,
-            as_rows(sounds, "sounds", count=count).float(),
+            as_vectors(sounds, "sounds", count=count, size=None).float(),
             as_rate(sample_rate),
             named,
             None if directions is None else as_vectors(directions, "directions", count=count).float(),

@@ -112,8 +112,8 @@ class Options(Many):
     def read(self) -> Iterator[Path]:
         """Return the files and folders on whose content the output depends."""
         yield from super().read()
-        if self.capture is not None and (self.capture / CACHE / SURFACE).is_file():
-            yield self.capture / CACHE / SURFACE
+        if self.capture is not None:
+            yield from (each for each in _surfaces(self.inputs[0], self.capture) if each.is_file())
 
     def cells(self, values: Mapping[str, Any]) -> dict[str, str]:
         """Return what the table of many shows of an export."""
@@ -265,14 +265,19 @@ def _note_size(field: "SoundField", path: Path) -> None:
         note(f"the field was edited to {length:g} times its size; {path} is not scaled and has to have it")
 
 
+def _surfaces(field: Path, capture: Path) -> list[Path]:
+    """Return where a surface for a field may lie, the field's own first."""
+    caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
+    return [field.with_name(f"{field.stem}-{SURFACE}"), *caches]
+
+
 def _reconstructed(options: Options) -> Path | None:
     """Return the surface, in meters, that `fit` left in a cache or `demo` next to the field; print if none."""
     field, capture = options.inputs[0], options.capture
     if capture is None:
         note("only the field's points are shown; --object or --capture adds the surface")
         return None
-    caches = [capture / CACHE / SURFACE, *([field.parent / SURFACE] if field.parent.name == CACHE else [])]
-    made = next((each for each in [field.with_name(f"{field.stem}-{SURFACE}"), *caches] if each.is_file()), None)
+    made = next((each for each in _surfaces(field, capture) if each.is_file()), None)
     if made is None:
         advice = f"make one by avmsf fit {capture} --until surface, or give --object"
         note(f"{capture} has no surface: only the field's points are shown; {advice}")

@@ -216,7 +216,7 @@ def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> 
         fitted, path = _written(made.field, options.output)
     aligned = AlignmentReport.of(made.modes, train)
     lines = [] if aligned is None else aligned.sentences() if display.verbose else aligned.warnings()
-    lines += features_lines(made.report) if made.report and display.verbose else []
+    lines += features_lines(made.report) if display.verbose else []
     scores: dict[str, Scores] = {}
     if test is not None:
         scores = compare(fitted, train, test, made.modes)
@@ -308,9 +308,8 @@ def _make_stage(options: Options, settings: CaptureSettings, stages: "StageFolde
 
     folder, words = options.capture, "-o field.safetensors"
     check_one_unit(folder, settings)
-    scene = SceneStages(
-        folder, stages, options.all_settings.scene, settings=settings, listener=display.listener, device=options.device
-    )
+    config, listener = options.all_settings, display.listener
+    scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener, device=config.device)
     scene.expect_any()
     contacts = None
     if options.plots is not None and (folder / TABLE).is_file():

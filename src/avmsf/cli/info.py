@@ -78,8 +78,9 @@ def _describe_field(options: Options) -> None:
     compared = None
     if options.capture is not None:
         doing("comparing the field with the capture's recordings")
-        impacts = read_capture(options.capture).impacts
-        others = [row for row, name in enumerate(impacts.names) if name not in field.origin.trained_on]
+        read = read_capture(options.capture)
+        impacts, trained = read.impacts, field.origin.trained_on if read.name == field.origin.capture else ()
+        others = [row for row, name in enumerate(impacts.names) if name not in trained]
         what = "all of them training recordings"
         if others:
             what = "not training recordings" if len(others) < len(impacts) else "none a training recording"
@@ -186,7 +187,7 @@ def _features(path: Path) -> "_Described":
         rows = {"features": component_colors(features.features[:, positions:])}
         return draw_cloud(features.points, rows, title=title, symmetries=symmetries)
 
-    return "\n".join([title, *(features_lines(report) if "encoder" in report else [])]), values, draw
+    return "\n".join([title, *features_lines(report)]), values, draw
 
 
 def _surface(path: Path, contacts: "Float[Tensor, 'contacts 3'] | None") -> "_Described":
@@ -198,7 +199,7 @@ def _surface(path: Path, contacts: "Float[Tensor, 'contacts 3'] | None") -> "_De
     surface = Surface.read(path)
     mesh = trimesh.Trimesh(surface.vertices.double().numpy(), surface.faces.numpy(), process=True)
     extent = " x ".join(f"{1000 * side:.3g}" for side in surface.vertices.amax(0) - surface.vertices.amin(0))
-    closed = f"closed, volume {1e6 * mesh.volume:.3g} cm3" if mesh.is_watertight else "not closed"
+    closed = f"closed, volume {1e6 * abs(mesh.volume):.3g} cm3" if mesh.is_watertight else "not closed"
     text = f"{counted(len(surface.faces), 'triangle')}, {extent} mm, area {1e4 * mesh.area:.3g} cm2, {closed}"
     values = {"kind": "surface", "triangles": len(surface.faces)}
     title = f"{path.name}: surface"

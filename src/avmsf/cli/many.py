@@ -141,7 +141,9 @@ def _make(verb: str, options: Many) -> dict[str, Any]:
     from avmsf.pipeline.stages import Stage, StageFolder, digest_of
 
     options.check_paths()
-    ignored = {"overwrite", *(each.name for each in fields(Many))} | {name for name, *_ in options.marked_paths()}
+    # What is read counts by its content, and where stages are kept decides nothing.
+    ignored = {"overwrite", "cache", *(each.name for each in fields(Many))}
+    ignored |= {name for name, mark, _ in options.marked_paths() if isinstance(mark, Existing)}
     given = {each.name: getattr(options, each.name) for each in fields(options) if each.name not in ignored}
 
     def recipe() -> dict[str, Any]:

@@ -76,6 +76,8 @@ class Options(Common):
         if not 0 <= self.contact_time <= MAX_CONTACT_SECONDS:
             wanted = f"seconds from 0 to {MAX_CONTACT_SECONDS:g}"
             raise OutputError.expected(wanted, self.contact_time, name="--contact-time")
+        if not abs(self.level_db) <= 200:
+            raise OutputError.expected("decibels from -200 to 200", self.level_db, name="--level-db")
 
 
 def run(options: Options) -> int:

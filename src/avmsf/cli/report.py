@@ -202,7 +202,9 @@ def score_table(title: str, scores: Mapping[str, Scores]) -> str:
 
 
 def features_lines(report: Mapping[str, Any]) -> list[str]:
-    """Return lines on the features, their consistency over the views, and their symmetries."""
+    """Return lines on the features, their consistency over the views, and their symmetries; none of other reports."""
+    if not {"encoder", "points", "unseen", "agreement"} <= report.keys():
+        return []
     lines = [
         f"features: {report['encoder']}, on {report['points']} points, {report['unseen']} of them in no view; "
         f"consistency of the views {100 * report['agreement']:.0f} % of the features' variance"

@@ -24,7 +24,7 @@ from trimesh import Trimesh
 
 from avmsf._utils.caching import discard, keep_if_possible, source_digest
 from avmsf._utils.files import write_whole
-from avmsf._utils.processes import end_child, start_child
+from avmsf._utils.processes import child_process
 from avmsf.errors import SimulationError
 from avmsf.fem import tetrahedra_worker
 from avmsf.fem.meshing import principal_extents, weld
@@ -89,7 +89,7 @@ def _stored(mesh: Trimesh, detail: float, timeout: float) -> tuple[np.ndarray, n
     path = folder / f"{digest[:24]}.npz"
     try:
         return _arrays(path.read_bytes())
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         content = _tetrahedralize(given, faces, detail, timeout)
     keep_if_possible(lambda: write_whole(path, content), path)
     with suppress(OSError):
@@ -117,13 +117,10 @@ def _tetrahedralize(points: np.ndarray, faces: np.ndarray, detail: float, timeou
         # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
         command = [sys.executable, "-P", str(WORKER), str(job), str(result)]
         variables = os.environ | {"OMP_NUM_THREADS": "1"}
-        with open(log, "wb") as output:
-            # fTetWild leaves a file of its own where it runs.
-            child = start_child(command, stdout=output, stderr=output, env=variables, cwd=name)
-        try:
+        # fTetWild leaves a file of its own where it runs.
+        settings = {"env": variables, "cwd": name}
+        with open(log, "wb") as output, child_process(command, stdout=output, stderr=output, **settings) as child:
             child.wait()
-        finally:
-            end_child(child)
         if child.returncode == -signal.SIGPROF:
             raise SimulationError.expected(
                 f"tetrahedra of {len(faces)} triangles within {timeout:g} s of the processor", timeout, got="none",

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from avmsf._utils.files import temporary_path, unwritable
-from avmsf._utils.processes import end_child, ending_of, start_child
+from avmsf._utils.processes import child_process, ending_of
 from avmsf._utils.text import counted, listed
 from avmsf.capture.filenames import PICTURE_SUFFIXES, pictures_in
 from avmsf.errors import CaptureError, CaptureWarning
@@ -135,20 +135,16 @@ def _run_worker(begun: Path, *, timeout: float) -> dict[str, list[str]]:
     log, result = begun / "worker.log", begun / "result.json"
     # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
     command = [sys.executable, "-P", str(WORKER), str(begun / "job.json")]
-    with open(log, "wb") as output:
-        try:
-            worker = start_child(command, stdout=output, stderr=output)
-        except OSError as error:
-            wanted = "a process for structure from motion"
-            raise CaptureError.expected(wanted, error.strerror, name="starting") from error
-        try:
+    try:
+        with open(log, "wb") as output, child_process(command, stdout=output, stderr=output) as worker:
             worker.wait(timeout)
-        except subprocess.TimeoutExpired as error:
-            wanted, stage = f"structure from motion within {timeout:g} s", _stage_and_lines(log)[0]
-            advice = "increase timeout, or give fewer or smaller photographs"
-            raise CaptureError.expected(wanted, timeout, got="no result", name=stage, advice=advice) from error
-        finally:
-            end_child(worker)
+    except OSError as error:
+        wanted = "a process for structure from motion"
+        raise CaptureError.expected(wanted, error.strerror, name="starting") from error
+    except subprocess.TimeoutExpired as error:
+        wanted, stage = f"structure from motion within {timeout:g} s", _stage_and_lines(log)[0]
+        advice = "increase timeout, or give fewer or smaller photographs"
+        raise CaptureError.expected(wanted, timeout, got="no result", name=stage, advice=advice) from error
     if worker.returncode != 0 or not result.is_file():
         (stage, lines), ending = _stage_and_lines(log), ending_of(worker.returncode)
         advice = "where memory ran out, give smaller photographs; " if ending == "SIGKILL" else ""

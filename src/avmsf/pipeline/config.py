@@ -88,9 +88,12 @@ class LiftConfig:
     """Seed of the random choices: points of a mesh, and those of them that the search for symmetries uses."""
 
     def __post_init__(self) -> None:
-        for name, least in {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100}.items():
+        lowest = {"longest": 1, "components": 0, "iterations": 1, "angles": 2, "points": 100, "seed": 0}
+        for name, least in lowest.items():
             if getattr(self, name) < least:
                 raise SceneError.expected(f"{least} or more", getattr(self, name), name=name)
+        if self.seed >= 2**63:
+            raise SceneError.expected("less than 2^63", self.seed, name="seed")
         if not 0 <= self.reach < math.inf:
             raise SceneError.expected("a number of point spacings, or 0 for any distance", self.reach, name="reach")
         if self.standardize and self.components:

@@ -106,7 +106,9 @@ class SceneStages(Pipeline):
         if splats is not None:
             return [*views, self._given_cloud(splats, (VIEWS,)), lifting]
         if source.kind == "mesh" and config.lift.onto == "mesh":
-            lifting = replace(lifting, inputs=(VIEWS,))
+            # Points are drawn of the mesh itself, of which views do not show all.
+            files = {"files": source.digest}
+            lifting = replace(lifting, inputs=(VIEWS,), recipe=lambda: {**self._features_recipe(), **files})
         # Structure from motion's points may be the start.
         start = {"files": source.digest} if source.kind == "cameras" else {}
         inputs = tuple(stage.name for stage in views)
