@@ -49,7 +49,7 @@ def fit_dino(quick: bool) -> tuple[dict[str, float], dict[int, dict[str, float]]
     _, held = _hold_out(find_foreground(views))
     # A few steps on small images compile all that is compiled at first use, and loads it later.
     warmup = replace(QUICK, steps=10, densify_every=5)
-    _, compiling = timed(lambda: splat([_small(view) for view in train], warmup, rasterizer=choose_rasterizer("cpu")))
+    _, compiling = timed(lambda: splat([_small(view) for view in train], warmup, device="cpu"))
     curve: dict[int, dict[str, float]] = {}
     paused = 0.0
 
@@ -62,7 +62,7 @@ def fit_dino(quick: bool) -> tuple[dict[str, float], dict[int, dict[str, float]]
             paused += taken
 
     begun = time.perf_counter()
-    cloud = splat(train, config, rasterizer=choose_rasterizer("cpu"), progress=evaluate)
+    cloud = splat(train, config, device="cpu", progress=evaluate)
     seconds = time.perf_counter() - begun - paused
     values = _scores(cloud, held)
     symmetries = find_symmetries(cloud.centers, seed=0).summary()

@@ -42,7 +42,7 @@ def depth_of(mesh: trimesh.Trimesh, *, behind: float = 0.0) -> DepthMap:
 
     def depth(camera: Camera) -> torch.Tensor:
         found = tracer.depth(camera)
-        return torch.where(torch.isfinite(found), found + behind, 0.0)
+        return torch.where(found > 0, found + behind, 0.0)
 
     return depth
 

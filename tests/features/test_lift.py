@@ -11,8 +11,7 @@ from avmsf.errors import SceneError
 from avmsf.features.lift import by_presence, by_visibility, lift, lift_points, supported
 from avmsf.gaussians.cloud import GaussianCloud
 from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer, Rendering
-from avmsf.gaussians.visibility import depth_of_cloud, depth_of_surface, depth_reach, depth_test
-from avmsf.mesh.surface import Surface
+from avmsf.gaussians.visibility import depth_of_cloud, depth_reach, depth_test
 from avmsf.photographs.cameras import Camera, View
 from factories.raising import raises
 
@@ -284,7 +283,6 @@ def _lift(points=None, count: int = 1, maps=None):
         (lambda: _lift(maps=[torch.zeros(2, 0, 4)]), "painted", [2, 0, 4]),
         (lambda: _lift(count=2, maps=[torch.zeros(2, 3, 4), torch.zeros(3, 3, 4)]), "a view", 3),
         (lambda: supported(replace((lifted := _lift()), past=lifted.seen)), "points", 0),
-        (lambda: depth_of_surface(Surface(torch.zeros(5, 3), torch.zeros(0, 3, dtype=torch.long))), "surface", 0),
     ],
 )
 def test_what_cannot_be_lifted_is_refused(work, name, value):

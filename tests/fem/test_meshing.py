@@ -17,7 +17,7 @@ from avmsf.fem.candidate_bodies import CandidateBodies
 from avmsf.fem.meshing import TOLERANCES, CheckedSurface, checked, denoised, roughness, simplified, thinned, weld
 from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed
 from avmsf.fem.tetrahedra import fill
-from avmsf.mesh.level_set import enclose
+from avmsf.mesh.level_set import Grid, enclose
 from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import Surface
 from factories.looked_at import surface_of
@@ -191,7 +191,7 @@ def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is
     values /= values.std()
     radius = np.linalg.norm(np.meshgrid(*[np.linspace(-1, 1, 40)] * 3), axis=0)
     sponge = np.minimum(values + 0.5, 4 * (0.85 - radius)).astype(np.float32)
-    mesh = weld(enclose(sponge, 0.0, lowest=np.zeros(3), spacing=0.01))
+    mesh = weld(enclose(sponge, Grid(np.zeros(3), 0.01, sponge.shape)))
     assert len(simplified(mesh, 1000).faces) > 10_000
     found = simplified(mesh, 1000, most=4000)
     assert len(found.faces) <= 1000

@@ -1,8 +1,14 @@
 """Tetrahedra: their volume, their outside, and bodies made of meshes that are closed, open or broken."""
 
+import importlib.util
 import math
+import os
+import signal
+import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -212,8 +218,25 @@ def test_a_mesh_has_the_same_tetrahedra_each_time_and_a_damaged_copy_is_made_aga
     assert torch.equal(first.points, second.points)
     assert torch.equal(first.cells, second.cells)
     (stored,) = (tmp_path / "tetrahedra").iterdir()
-    stored.write_bytes(stored.read_bytes()[:100])
-    assert fill(sphere(subdivisions=2), detail=0.2).volume == pytest.approx(first.volume, rel=0.05)
+    for length in (100, 0):
+        stored.write_bytes(stored.read_bytes()[:length])
+        assert fill(sphere(subdivisions=2), detail=0.2).volume == pytest.approx(first.volume, rel=0.05)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fdinfo").exists(), reason="sees by /proc when the worker has begun")
+def test_a_filling_ends_when_its_parent_does(tmp_path):
+    mesh, library = sphere(subdivisions=4), Path(importlib.util.find_spec("pytetwild").origin).parent
+    points, faces = mesh.vertices.double().numpy(), mesh.faces.numpy().astype(np.uint32)
+    settings = {"edge": 0.005, "envelope": 1e-4, "library": str(library), "seconds": 60.0}
+    np.savez(tmp_path / "job.npz", points=points, faces=faces, **settings)
+    command = [sys.executable, "-P", str(tetrahedra.WORKER), "job.npz", "result.npz"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=tmp_path) as worker:
+        flags = Path(f"/proc/{worker.pid}/fdinfo/0")
+        while not int(flags.read_text().split()[3], 8) & os.O_ASYNC:
+            time.sleep(0.05)
+        # What a dying parent leaves behind: its end of the pipe, closed.
+        worker.stdin.close()
+        assert worker.wait(30) == -signal.SIGIO
 
 
 def test_a_crash_of_pytetwild_is_reported(monkeypatch, tmp_path):

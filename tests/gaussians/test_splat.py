@@ -15,7 +15,7 @@ from avmsf.gaussians.config import SplatConfig
 from avmsf.gaussians.fit import SplatProgress, splat
 from avmsf.gaussians.rasterizer.rasterizers import NumbaRasterizer
 from avmsf.gaussians.ssim import convolved_ssim, psnr, ssim
-from avmsf.gaussians.start_points import StartPoints, photographed_colors, starting_cloud
+from avmsf.gaussians.start_points import StartPoints, photographed_colors, starting_cloud, visual_hull
 from avmsf.gaussians.targets import choose_background, comparable_views, pyramid
 from avmsf.photographs.cameras import View
 from factories.ball_views import MIDDLE, RADIUS, ball_color, ball_normals, ball_view, ball_views
@@ -76,6 +76,16 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
     for others, settings in ((views, replace(config, seed=5)), (views[1:], config)):
         with raises(SceneError, file=place, value=["view, initial point or setting"]):
             splat(others, settings, checkpoint=place)
+
+
+def test_a_checkpoint_is_of_the_views_whatever_their_cameras_were_asked(tmp_path: Path) -> None:
+    start = visual_hull(ball_views(12), points=200)
+    views = [replace(view, camera=replace(view.camera)) for view in ball_views(12)]
+    config = replace(QUICK, steps=2)
+    first = splat(views, config, start=start, checkpoint=tmp_path / "splat.ckpt")
+    assert all(view.camera.position.isfinite().all() for view in views)
+    again = splat(views, config, start=start, checkpoint=tmp_path / "splat.ckpt")
+    assert torch.equal(again.centers, first.centers)
 
 
 def test_photographs_without_masks_start_from_points() -> None:
@@ -181,6 +191,7 @@ SAME, LOST = StartPoints(torch.zeros(9, 3), torch.zeros(9, 3)), torch.full((9, 3
         (lambda: SplatConfig(steps=0), "steps", 0),
         (lambda: SplatConfig(center_rate=0.0), "center_rate", 0.0),
         (lambda: SplatConfig(start_opacity=1.0), "start_opacity", 1.0),
+        (lambda: SplatConfig(background=(0.5,)), "background", (0.5,)),
         (lambda: SplatConfig(densify_until=1.5), "densify_until", 1.5),
         (lambda: SplatConfig(gaussians=5), "gaussians", 5),
         (lambda: SplatConfig(background=(0.0, 0.0, 255.0)), "background", (0.0, 0.0, 255.0)),

@@ -13,8 +13,8 @@ import torch
 import trimesh
 from PIL import Image
 
-from avmsf.errors import CaptureError, CaptureWarning
-from avmsf.mesh.level_set import decimated, enclose
+from avmsf.errors import SceneError
+from avmsf.mesh.level_set import Grid, decimated, enclose
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import GRAY, TexturedMesh, read_textured_mesh
 from factories.looked_at import mesh_of, surface_of
@@ -102,7 +102,7 @@ def ball(faces: int | None = None) -> Surface:
     """Return the surface of a ball that fades from one to zero across its skin."""
     depth = RADIUS - np.linalg.norm(places() - MIDDLE, axis=-1)
     values = np.clip(0.5 + 0.5 * depth / (2 * SPACING), 0, 1).astype(np.float32)
-    return enclose(values, 0.5, lowest=LOWEST, spacing=SPACING, faces=faces)
+    return enclose(values - 0.5, Grid(LOWEST, SPACING, values.shape), faces)
 
 
 def off(surface: Surface) -> np.ndarray:
@@ -132,7 +132,7 @@ def test_specks_beside_the_body_are_left_out() -> None:
     values = np.zeros((40, 20, 20), dtype=np.float32)
     values[5:15, 5:15, 5:15] = 1.0
     values[30, 10, 10] = 1.0
-    surface = enclose(values, 0.5, lowest=np.array([1.0, 2.0, 3.0]), spacing=0.1)
+    surface = enclose(values - 0.5, Grid(np.array([1.0, 2.0, 3.0]), 0.1, values.shape))
     # Half a cell around the solid ones.
     assert surface.vertices.amin(0).tolist() == pytest.approx([1.45, 2.45, 3.45])
     assert surface.vertices.amax(0).tolist() == pytest.approx([2.45, 3.45, 4.45])
@@ -141,8 +141,8 @@ def test_specks_beside_the_body_are_left_out() -> None:
 def test_what_encloses_nothing_or_reaches_the_edge_is_refused() -> None:
     empty, full = np.zeros((8, 8, 8), dtype=np.float32), np.ones((8, 8, 8), dtype=np.float32)
     for values in (empty, full):
-        with raises(CaptureError, name="values", value=[values.min(), values.max()]):
-            enclose(values, 0.5, lowest=np.zeros(3), spacing=0.1)
+        with raises(SceneError, name="values", value=[values.min() - 0.5, values.max() - 0.5]):
+            enclose(values - 0.5, Grid(np.zeros(3), 0.1, values.shape))
 
 
 def test_meshes_that_threads_thin_at_a_time_are_those_of_one_thread():

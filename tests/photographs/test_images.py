@@ -145,6 +145,11 @@ def test_missing_and_corrupt_images_are_left_out_and_those_without_cameras_named
         read_image(tmp_path / "a.jpg")
 
 
+def test_no_views_are_not_read(tmp_path: Path) -> None:
+    with raises(CaptureError, name="max_views", value=0):
+        read_views(tmp_path, max_views=0)
+
+
 def test_longest_averages_areas_and_takes_the_camera_along(tmp_path: Path) -> None:
     image = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     folder = folder_of(tmp_path, image)

@@ -66,7 +66,7 @@ def test_depth_of_a_sphere() -> None:
     rays = camera.rays()
     along = rays[..., 2] * DISTANCE
     under = along.square() - DISTANCE**2 + RADIUS**2
-    hit = torch.isfinite(depth)
+    hit = depth > 0
     assert bool((hit == (under > 0)).float().mean() > 0.998)
     clear = hit & (under > 0.1 * RADIUS**2)
     reach = along - under.clamp(min=0).sqrt()
@@ -146,7 +146,7 @@ def test_a_mesh_far_from_the_origin_is_seen_as_sharply() -> None:
     pose[:3, 3] -= pose[:3, :3] @ away
     (here,) = render_views(near, [camera])
     there = MeshTracer(moved).depth(Camera(pose, camera.focal, camera.principal, 48, 48))
-    assert bool((torch.isfinite(there) == (here.mask > 127)).float().mean() > 0.99)
+    assert bool(((there > 0) == (here.mask > 127)).float().mean() > 0.99)
 
 
 def test_orbits_are_the_72_views() -> None:

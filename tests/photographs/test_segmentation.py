@@ -13,9 +13,10 @@ import trimesh
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from avmsf.errors import CaptureError, CaptureWarning
+from avmsf.mesh.level_set import Grid
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.visual_hull import Grid, carve, project_votes
+from avmsf.photographs.visual_hull import carve, project_votes
 from factories.raising import raises, warns
 from factories.views_folder import ring
 
@@ -227,6 +228,11 @@ def box_in(view: View) -> np.ndarray:
     filled = np.zeros((view.camera.height, view.camera.width), dtype=np.uint8)
     cv2.fillConvexPoly(filled, outline, 1)
     return filled > 0
+
+
+def test_views_from_one_place_are_warned_of(views: list[View]) -> None:
+    with warns(CaptureWarning, name="masks"):
+        find_foreground([replace(view, camera=views[0].camera) for view in views])
 
 
 def test_what_is_bright_in_all_views_fills_the_bounding_box(dino: tuple[View, ...]) -> None:

@@ -11,8 +11,7 @@ import trimesh
 
 from avmsf._utils.caching import source_digest
 from avmsf.errors import SceneError
-from avmsf.mesh.level_set import enclose
-from avmsf.photographs.visual_hull import Grid
+from avmsf.mesh.level_set import Grid, enclose
 from avmsf.reconstruction import ObjectShape, object_shape, object_surface
 from avmsf.reconstruction.distance import distance_from
 from avmsf.reconstruction.fairing import fair_hull
@@ -360,7 +359,7 @@ def _hull(mesh: trimesh.Trimesh, *, taut: bool) -> trimesh.Trimesh:
     grid = Grid.around(mesh.bounds[0] - 0.03, mesh.bounds[1] + 0.03, cells=96, finest=1.0, margin=2)
     hull = hull_distance(outlines, grid, rank=0)
     values = fair_hull(hull, outlines, grid, float(np.linalg.norm(mesh.extents)))[0] if taut else hull
-    return mesh_of(enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing))
+    return mesh_of(enclose(values, grid))
 
 
 @pytest.mark.slow

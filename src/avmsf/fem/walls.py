@@ -258,5 +258,5 @@ def _behind(
 
     The distance is infinite where there is none, and the cosine 1.
     """
-    rows, reach = RayCaster(mesh.triangles)(places, -normals, lead=TOLERANCES.ray_lead)
+    rows, reach, _ = RayCaster(mesh.triangles)(places, -normals, lead=TOLERANCES.ray_lead)
     return reach, np.where(rows >= 0, (normals * mesh.face_normals[rows]).sum(axis=1), 1.0), rows

@@ -101,5 +101,5 @@ class SplatConfig:
         if isinstance(self.background, str):
             if self.background not in ("found", "random"):
                 raise SceneError.expected("found, random or three numbers", self.background, name="background")
-        elif not all(0 <= value <= 1 for value in self.background):
+        elif len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
             raise SceneError.expected("red, green and blue from 0 to 1", self.background, name="background")

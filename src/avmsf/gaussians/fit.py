@@ -57,23 +57,23 @@ def splat(
     *,
     start: StartPoints | None = None,
     device: torch.device | str | None = None,
-    rasterizer: Rasterizer | None = None,
     progress: Callable[[SplatProgress], None] | None = None,
     checkpoint: str | Path | None = None,
 ) -> GaussianCloud:
     """Fit Gaussians to views and return those that lie on the object.
 
-    They start at the points of `start`, or on the visual hull of the views' masks. Without a `device` or `rasterizer`
-    they are fitted on a CUDA device if there is one and gsplat is installed, else on the CPU; they are returned on the
-    CPU. There the same views, config and start give the same Gaussians on the same machine.
+    They start at the points of `start`, or on the visual hull of the views' masks. Without a `device` they are fitted
+    on a CUDA device if there is one and gsplat is installed, else on the CPU; they are returned on the CPU. There the
+    same views, config and start give the same Gaussians on the same machine.
 
     With `checkpoint`, the state is saved there while it runs, on interruption and at the end, and a call with the
     same arguments continues from it to the same result; delete the file once the Gaussians are written. Raises
     `SceneError` for views or settings that nothing can be made of, and for a checkpoint that is not of these.
     """
     config = SplatConfig() if config is None else config
-    device = _device(device, rasterizer)
-    rasterizer = choose_rasterizer(device) if rasterizer is None else rasterizer
+    usable = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    device = torch.device(device or ("cuda" if usable else "cpu"))
+    rasterizer = choose_rasterizer(device)
     began = time.monotonic()
     background = choose_background(views, config)
     photographs = comparable_views(views, background)
@@ -112,15 +112,8 @@ def splat(
 
 def _fingerprint(views: Sequence[View], cloud: GaussianCloud, config: SplatConfig) -> str:
     """Return a digest of a fit's views, start and settings."""
-    seen = [(view.name, *vars(view.camera).values(), view.image, view.mask) for view in views]
+    seen = [(view.name, view.camera.projection, view.image, view.mask) for view in views]
     return content_digest(_CHECKPOINT_VERSION, asdict(config), *chain.from_iterable(seen), *vars(cloud).values())
-
-
-def _device(device: torch.device | str | None, rasterizer: Rasterizer | None) -> torch.device:
-    if device is not None:
-        return torch.device(device)
-    usable = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
-    return torch.device("cuda" if usable and rasterizer is None else "cpu")
 
 
 class _Run:

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import ZEROTH, GaussianCloud
+from avmsf.mesh.level_set import Grid, touches_edge
 from avmsf.photographs.cameras import View
-from avmsf.photographs.visual_hull import Grid, count_votes, masked_views, no_common_point, object_extent, touches_edge
+from avmsf.photographs.visual_hull import count_votes, masked_views, no_common_point, object_extent
 
 
 @dataclass(frozen=True, eq=False)

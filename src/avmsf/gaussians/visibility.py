@@ -12,12 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from avmsf.errors import SceneError
 from avmsf.gaussians.cloud import GaussianCloud, rotation_matrices
 from avmsf.gaussians.rasterizer.rasterizers import Rasterizer
-from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.mesh_views import MeshTracer
 
 _MIN_COVERAGE = 0.5
 """Share of a pixel that the object must cover for the pixel to show its depth."""
@@ -87,21 +84,6 @@ def depth_of_cloud(cloud: GaussianCloud, rasterizer: Rasterizer) -> DepthMap:
             return torch.where(rendering.alpha >= _MIN_COVERAGE, rendering.depth, 0.0)
 
     return render
-
-
-def depth_of_surface(surface: Surface) -> DepthMap:
-    """Return a depth map by rays through each pixel's center to a surface. Raises SceneError without triangles."""
-    if len(surface.faces) == 0:
-        wanted, got = "triangles, which can hide points from a camera", f"{len(surface.vertices)} points alone"
-        advice = "compute the features of Gaussians instead, or give a mesh"
-        raise SceneError.expected(wanted, 0, got=got, name="surface", advice=advice)
-    tracer = MeshTracer(surface)
-
-    def cast(camera: Camera) -> Float[Tensor, "height width"]:
-        depth = tracer.depth(camera)
-        return torch.where(torch.isfinite(depth), depth, 0.0)
-
-    return cast
 
 
 def depth_reach(cloud: GaussianCloud, camera: Camera) -> Float[Tensor, " points"]:

@@ -104,21 +104,14 @@ class RayCaster:
 
     def __call__(
         self, origins: Float64[np.ndarray, "rays 3"], directions: Float64[np.ndarray, "rays 3"], *, lead: float
-    ) -> tuple[Int[np.ndarray, " rays"], Float64[np.ndarray, " rays"]]:
-        """Return the triangle that each ray meets first, -1 for none, and its distance, infinite for none, meters.
+    ) -> tuple[Int[np.ndarray, " rays"], Float64[np.ndarray, " rays"], Float64[np.ndarray, "rays 3"]]:
+        """Return the triangle that each ray meets first, its distance, meters, and barycentric coordinates in it.
 
-        `directions` are unit vectors. Rays start `lead` times the triangles' size from their origins, so that those
-        that leave a triangle do not meet it.
+        -1 and infinite for none. `directions` are unit vectors. Rays start `lead` times the triangles' size from their
+        origins, so that those that leave a triangle do not meet it.
         """
-        rows, _, distances = self.hits(origins, directions, lead=lead)
-        return rows, distances
-
-    def hits(
-        self, origins: Float64[np.ndarray, "rays 3"], directions: Float64[np.ndarray, "rays 3"], *, lead: float
-    ) -> tuple[Int[np.ndarray, " rays"], Float64[np.ndarray, "rays 3"], Float64[np.ndarray, " rays"]]:
-        """Return the triangles and distances as a call does, and between them the points' barycentric coordinates."""
         starts = (origins - self._middle) / self._size + lead * directions
         hits = self._scene.run(starts.astype(np.float32), directions.astype(np.float32), output=1)
         rows, u, v = hits["primID"].astype(np.int64), hits["u"].astype(np.float64), hits["v"].astype(np.float64)
         distances = np.where(rows >= 0, (hits["tfar"].astype(np.float64) + lead) * self._size, np.inf)
-        return rows, np.stack([1 - u - v, u, v], axis=1), distances
+        return rows, distances, np.stack([1 - u - v, u, v], axis=1)

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from avmsf.errors import CaptureError, CaptureWarning
 from avmsf.mesh.io import check_area, check_corners, check_finite_vertices, load_parts
-from avmsf.mesh.points import unit
 from avmsf.mesh.surface import Surface
 
 GRAY = 0.7
@@ -152,18 +151,10 @@ def corner_normals(vertices: Float[np.ndarray, "points 3"], faces: Int[np.ndarra
 
     Where a face leans more than `CREASE` from that mean, its corner keeps the face's own normal.
     """
-    corners = vertices.astype(np.float64)[faces]
-    sides = unit(np.roll(corners, -1, axis=1) - corners)
-    # At each corner, the side that leaves it and the one that arrives, turned round.
-    angles = np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(axis=-1), -1, 1))
-    flat = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    total = np.zeros((len(vertices), 3))
-    for axis in range(3):
-        weights = angles * flat[:, axis, None]
-        total[:, axis] = np.bincount(faces.ravel(), weights=weights.ravel(), minlength=len(vertices))
-    smooth = unit(total)[faces]
-    sharp = (smooth * flat[:, None]).sum(axis=-1) < math.cos(math.radians(CREASE))
-    return np.where(sharp[..., None], flat[:, None], smooth)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    flat, smooth = mesh.face_normals[:, None], mesh.vertex_normals[faces]
+    sharp = (smooth * flat).sum(axis=-1, keepdims=True) < math.cos(math.radians(CREASE))
+    return np.where(sharp, flat, smooth)
 
 
 _COLORLESS = CaptureWarning("has neither texture nor colors; it is rendered gray", name="colors")

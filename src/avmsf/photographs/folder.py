@@ -57,6 +57,8 @@ def read_views(
     """
     if longest is not None and longest < 1:
         raise CaptureError.expected("at least 1 pixel", longest, name="longest")
+    if max_views is not None and max_views < 1:
+        raise CaptureError.expected("at least 1 view", max_views, name="max_views")
     if not (math.isfinite(meters) and meters > 0):
         raise CaptureError.expected("the length of the cameras' unit in meters", meters, name="meters")
     cameras = read_camera_file(Path(folder))

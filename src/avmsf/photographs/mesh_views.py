@@ -62,9 +62,9 @@ class MeshTracer:
     def depth(self, camera: Camera) -> Float[Tensor, "height width"]:
         """Return the depth of the face behind the center of each pixel, meters along the optical axis.
 
-        Float64; infinite where there is no face.
+        Float64; 0 where there is no face.
         """
-        depth = np.full((camera.height, camera.width), np.inf)
+        depth = np.zeros((camera.height, camera.width))
         for hits in self.cast(camera):
             depth[hits.rows, hits.columns] = hits.depth
         return torch.from_numpy(depth)
@@ -84,7 +84,7 @@ class MeshTracer:
             band = replace(camera, principal=(x - left, y - start), width=width, height=rows)
             directions = band.rays().reshape(-1, 3).numpy()
             origins = np.broadcast_to(camera.position.numpy(), directions.shape)
-            faces, weights, _ = self.caster.hits(origins, directions, lead=0.0)
+            faces, _, weights = self.caster(origins, directions, lead=0.0)
             hit = np.flatnonzero(faces >= 0)
             faces, weights = faces[hit], weights[hit]
             depth = (depths[self.faces[faces]] * weights).sum(axis=1)

@@ -9,70 +9,17 @@ from typing import no_type_check
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64, Real, Shaped, UInt16
+from jaxtyping import Bool, Float64, Int64, Shaped, UInt16
 
 from avmsf._utils.compiled import compiled, lane_count, run_lanes
 from avmsf.errors import CaptureWarning, SceneError
+from avmsf.mesh.level_set import Grid
 from avmsf.photographs.cameras import MIN_VIEWS, Camera, View
 
 MIN_VIEW_RATIO = 1 / 3
 """Part of the views that must have a cell in their image for it to be object."""
 _CELLS_AT_ONCE = 1 << 16
 """Cells that all views vote on before the next ones: their values stay in the processor's cache."""
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Cells of equal edges; values belong to the middles of cells."""
-
-    lowest: Float64[np.ndarray, " 3"]
-    """Middle of the first cell, object frame, meters."""
-    spacing: float
-    """Edge of a cell, meters."""
-    shape: tuple[int, int, int]
-    """Cells along x, y and z."""
-
-    @classmethod
-    def around(
-        cls, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], *, cells: int, finest: float, margin: int
-    ) -> "Grid":
-        """Return a grid of `cells` along the longest side of a box, and `margin` cells more on each side.
-
-        A box that fills less than half of its cube has finer cells, at most `finest` times as fine, as many as half
-        the cube would have: slender objects are thin.
-        """
-        extent = high - low
-        filled = float(np.prod(extent / extent.max()))
-        spacing = float(extent.max()) / cells * min(max((2.0 * filled) ** (1 / 3), 1 / finest), 1.0)
-        counts = np.ceil(extent / spacing).astype(int) + 2 * margin + 1
-        middle = (low + high) / 2
-        return cls(middle - spacing * (counts - 1) / 2, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
-
-    @classmethod
-    def filling(cls, low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"], *, cells: int) -> "Grid":
-        """Return a grid of about so many cells in all, which fill a box."""
-        edge = float(np.prod(high - low) / cells) ** (1 / 3)
-        x, y, z = np.maximum(1, np.ceil((high - low) / edge)).astype(int).tolist()
-        return cls(low + edge / 2, edge, (x, y, z))
-
-    def centers(self, rows: Real[np.ndarray, "*cells 3"]) -> Float64[np.ndarray, "*cells 3"]:
-        """Return the middles of cells given by their indices, meters."""
-        return self.lowest + self.spacing * rows
-
-    def box(self, inside: Bool[np.ndarray, "x y z"]) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
-        """Return the middles of the lowest and highest of the cells that are inside, of which there must be one."""
-        rows = np.argwhere(inside)
-        return self.centers(rows.min(axis=0)), self.centers(rows.max(axis=0))
-
-    def coarser(self, factor: int) -> "Grid":
-        """Return a grid that covers this one with cells `factor` times as wide; both have the same first middle."""
-        counts = [-(-(count - 1) // factor) + 1 for count in self.shape]
-        return Grid(self.lowest, self.spacing * factor, (counts[0], counts[1], counts[2]))
-
-
-def touches_edge(solid: Bool[np.ndarray, "x y z"]) -> bool:
-    """Whether anything is solid in the outermost cells of a grid."""
-    return any(solid.take(end, axis=axis).any() for axis in range(3) for end in (0, -1))
 
 
 def project_votes(
@@ -161,7 +108,10 @@ def carve(masks: Sequence[Bool[np.ndarray, "_ _"]], cameras: Sequence[Camera]) -
     """Return the votes of masks around their hull; None where they and their cameras agree on no point at all."""
     if sum(mask.any() for mask in masks) < 2:
         return None
-    middle, reach = object_extent(masks, cameras)
+    try:
+        middle, reach = object_extent(masks, cameras)
+    except SceneError:
+        return None
     coarse = count_votes(masks, cameras, Grid.filling(middle - reach, middle + reach, cells=50**3))
     inside = coarse.occupied(missing=len(masks) // 6)
     if not inside.any():
@@ -234,7 +184,8 @@ def object_extent(
     """Return about where the object's middle is, [3] in the object frame, and how far it reaches from there, meters.
 
     The middle is the point nearest to the lines of sight through the masks' middles; those that miss it by far have
-    little weight (iteratively reweighted least squares). Masks without an object say nothing.
+    little weight (iteratively reweighted least squares). Masks without an object say nothing. Raises SceneError where
+    all others' cameras are in one place.
     """
     positions, directions, sizes = [], [], []
     for mask, camera in zip(masks, cameras, strict=True):
@@ -248,6 +199,9 @@ def object_extent(
         positions.append(camera.position.numpy())
         sizes.append(max(np.ptp(columns) / camera.focal[0], np.ptp(rows) / camera.focal[1]))
     starts, rays = np.stack(positions), np.stack(directions)
+    if float(np.ptp(starts, axis=0).max()) <= 1e-6 * float(np.abs(starts).max()) + 1e-12:
+        # Lines of sight from one place meet in the cameras alone.
+        raise no_common_point(len(starts))
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     weight = np.ones(len(rays))
     for _ in range(10):

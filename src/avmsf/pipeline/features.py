@@ -16,9 +16,9 @@ from avmsf.features.feature_field import FeatureField, expect_varied, reduce, re
 from avmsf.features.lift import Lifted, by_presence, by_visibility, lift, lift_points, supported
 from avmsf.features.pooling import orbit_spread, refine
 from avmsf.gaussians.cloud import GaussianCloud
-from avmsf.gaussians.visibility import depth_of_surface
 from avmsf.mesh.surface import Surface, sample_surface
 from avmsf.photographs.cameras import View
+from avmsf.photographs.mesh_views import MeshTracer
 from avmsf.pipeline.config import AUTO, DESCRIPTORS, DINO, LiftConfig
 from avmsf.symmetry.find import find_symmetries
 
@@ -63,7 +63,7 @@ def lift_features(
         points,
         views,
         encoder,
-        depth_map=depth_of_surface(shape),
+        depth_map=MeshTracer(shape).depth,
         weighting=weighting,
         inpainted=inpainted,
         progress=progress,

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy import ndimage
 
+from avmsf.mesh.level_set import Grid, enclose
 from avmsf.photographs.cameras import Camera
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.photographs.visual_hull import Grid, project_votes
-from avmsf.reconstruction.object_shape import closed_surface
+from avmsf.photographs.visual_hull import project_votes
 
 _BINS = 32
 """Of distances before the depth that views see."""
@@ -58,11 +58,11 @@ def _bias(
 
     Most of a surface touches its hull; the depth of cavities lies behind it by lengths of all kinds.
     """
-    tracer = MeshTracer(closed_surface(hull, grid, _BIAS_FACES))
+    tracer = MeshTracer(enclose(hull, grid, _BIAS_FACES))
     behind, step = [], max(1, len(depths) // _BIAS_VIEWS)
     for depth, camera in zip(depths[::step], cameras[::step], strict=True):
         front = tracer.depth(camera).numpy()
-        behind.append((depth - front)[np.isfinite(front) & (depth > 0)])
+        behind.append((depth - front)[(front > 0) & (depth > 0)])
     found = np.sort(np.concatenate(behind))
     found = found[np.abs(found) < _MAX_BIAS_RATIO * diagonal]
     if len(found) < _MIN_BIAS_PIXELS:

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
+import trimesh
 from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
-from avmsf.photographs.visual_hull import Grid
-from avmsf.reconstruction.object_shape import closed_surface
+from avmsf.mesh.level_set import Grid, enclose
 from avmsf.reconstruction.outlines import Outline
 
 _BLUR_RATIO = 0.015
@@ -40,7 +40,7 @@ def fair_hull(
     hull: Float32[np.ndarray, "x y z"], outlines: Sequence[Outline], grid: Grid, diagonal: float
 ) -> tuple[Float32[np.ndarray, "x y z"], Float32[np.ndarray, "x y z"]]:
     """Return how far inside the smaller hull each cell lies, and how far from the nearest touched point, meters."""
-    surface = closed_surface(hull, grid)
+    surface = enclose(hull, grid)
     points, faces = surface.vertices.double().numpy(), surface.faces.numpy()
     full = ndimage.gaussian_filter((hull > 0).astype(np.float32), _BLUR_RATIO * diagonal / grid.spacing)
     bent = ndimage.map_coordinates(full, ((points - grid.lowest) / grid.spacing).T, order=1, output=np.float64)
@@ -48,7 +48,9 @@ def fair_hull(
     if not touched.any():
         return hull, np.full(grid.shape, diagonal, dtype=np.float32)
     drawn = _membrane(points, faces, touched)
-    inward = np.maximum(((points - drawn) * _normals(points, faces)).sum(axis=1), 0.0)
+    across = trimesh.triangles.cross(points[faces])
+    normals = trimesh.geometry.mean_vertex_normals(len(points), faces, across)  # type: ignore[no-untyped-call]
+    inward = np.maximum(((points - drawn) * normals).sum(axis=1), 0.0)
     fall = np.zeros(grid.shape, dtype=np.float32)
     cells = tuple(np.rint((points - grid.lowest) / grid.spacing).astype(int).T)
     np.maximum.at(fall, cells, inward.astype(np.float32))
@@ -122,13 +124,3 @@ def _membrane(
             matrix, right[:, axis], x0=points[free, axis], rtol=1e-5, maxiter=_MAX_ITERATIONS, M=scale
         )[0]
     return drawn
-
-
-def _normals(
-    points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float64[np.ndarray, "points 3"]:
-    corners = points[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros_like(points)
-    np.add.at(total, faces.ravel(), np.repeat(across, 3, axis=0))
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)

@@ -8,10 +8,9 @@ from jaxtyping import Bool, Float32, Float64, Int
 from scipy import ndimage
 
 from avmsf._utils.caching import content_digest, source_digest
-from avmsf.errors import CaptureError, SceneError
-from avmsf.mesh.level_set import difference, enclose
+from avmsf.errors import SceneError
+from avmsf.mesh.level_set import Grid, difference, enclose
 from avmsf.mesh.surface import Surface
-from avmsf.photographs.visual_hull import Grid
 from avmsf.reconstruction.distance import distance_from
 
 MAX_FACES = 6000
@@ -178,7 +177,7 @@ class ObjectShape:
         # Triangles without area, where the surface passes through the middle of a cell, pinch coarser ones.
         least = np.float32(0.02 * grid.spacing)
         smooth = np.where(smooth > 0, np.maximum(smooth, least), np.minimum(smooth, -least))
-        return closed_surface(smooth, grid, faces)
+        return enclose(smooth, grid, faces)
 
     def describe(self) -> str:
         """Return sentences on the shape: its cavities, what no view saw, and masks that were left out."""
@@ -214,14 +213,3 @@ def facing_similarly(
     nearest = tuple(indices)
     along, length = (slopes * normals[nearest]).sum(axis=-1), np.linalg.norm(normals, axis=-1)[nearest]
     return along > _MIN_LID_COSINE * length, away, nearest
-
-
-def closed_surface(values: Float32[np.ndarray, "x y z"], grid: Grid, faces: int | None = None) -> Surface:
-    """Return the closed surface where values on a grid are zero, positive inside, of about `faces` triangles.
-
-    Raises SceneError where nothing is inside, and where the inside touches the grid's edge.
-    """
-    try:
-        return enclose(values, 0.0, lowest=grid.lowest, spacing=grid.spacing, faces=faces)
-    except CaptureError as error:
-        raise SceneError(f"expected a shape with an inside: {error}", name=error.name, value=error.value) from error

@@ -11,12 +11,13 @@ from scipy import ndimage
 
 from avmsf.errors import SceneError
 from avmsf.gaussians.visibility import DepthMap
+from avmsf.mesh.level_set import Grid, enclose, touches_edge
 from avmsf.photographs.cameras import Camera, View
-from avmsf.photographs.visual_hull import Grid, masked_views, no_common_point, object_extent, touches_edge
+from avmsf.photographs.visual_hull import masked_views, no_common_point, object_extent
 from avmsf.reconstruction.depth_fusion import free_space
 from avmsf.reconstruction.distance import depth_in_convex_hull
 from avmsf.reconstruction.fairing import fair_hull
-from avmsf.reconstruction.object_shape import LID_BLUR, ObjectShape, ShapeReport, closed_surface, facing_similarly
+from avmsf.reconstruction.object_shape import LID_BLUR, ObjectShape, ShapeReport, facing_similarly
 from avmsf.reconstruction.outlines import WRONG_FRACTION, Outline, consistent_masks, edge_offset, hull_distance
 
 _COARSE_CELLS = 48
@@ -189,7 +190,7 @@ def _closed(
 
     Return the cut solid, the hull cut likewise, which lids cavities, and the part of the surface that no view saw.
     """
-    surface = closed_surface(seen, grid, _CLOSING_FACES)
+    surface = enclose(seen, grid, _CLOSING_FACES)
     points = surface.vertices.double().numpy()
     rows = np.rint((points - grid.lowest) / grid.spacing).astype(int)
     known = ndimage.maximum_filter(view_counts, 3)[tuple(rows.T)] >= 1

@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float32
 
+from avmsf.mesh.level_set import Grid, enclose
 from avmsf.photographs.cameras import Camera, View
 from avmsf.photographs.mesh_views import MeshTracer
-from avmsf.photographs.visual_hull import Grid, project_votes
-from avmsf.reconstruction.object_shape import closed_surface
+from avmsf.photographs.visual_hull import project_votes
 
 _SUBPIXELS = 3
 """Times as many pixels across in which the distance to an outline is measured. It must be odd."""
@@ -159,8 +158,8 @@ def consistent_masks(
         return ~inconsistent
     # Half a cell larger, for cells are coarse.
     values = np.maximum(values + 0.5 * np.float32(grid.spacing), -grid.spacing)
-    tracer = MeshTracer(closed_surface(values, grid))
-    seen = [torch.isfinite(tracer.depth(view.camera)).numpy() for view in views]
+    tracer = MeshTracer(enclose(values, grid))
+    seen = [(tracer.depth(view.camera) > 0).numpy() for view in views]
     beyond = np.array([_part(~there, each.inside > 1) for each, there in zip(outlines, seen, strict=True)])
     shown = beyond > max(_MAX_BEYOND, _MIN_MEDIAN_RATIO * float(np.median(beyond)))
     # Outermost pixels are the background's in part.

@@ -142,7 +142,7 @@ def vary_thickness(solid: Solid, part: float, *, generator: np.random.Generator)
     share = np.bincount(triangles.ravel(), weights=np.repeat(areas, 3))
     field = torch.log(smooth_field(torch.from_numpy(places), 1.0, diagonal=solid.size, generator=generator)).numpy()
     factor = _factors(field, share, part)
-    _, reach = RayCaster(corners)(corners.mean(axis=1), -doubled / areas[:, None], lead=_RAY_LEAD)
+    _, reach, _ = RayCaster(corners)(corners.mean(axis=1), -doubled / areas[:, None], lead=_RAY_LEAD)
     hit = np.isfinite(reach)
     # At a rim the walls' thickness, not the rim's distance from what lies below it.
     walls = np.full(len(places), np.inf)
