@@ -208,8 +208,9 @@ def test_gains_are_those_of_the_mode_shapes_over_frequencies_and_opposite_from_t
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(4, 3)
     gains = rendered().gains(CONTACTS, directions=down)
     torch.testing.assert_close(rendered().gains(CONTACTS, directions=-down), -gains)
-    # From above that is straight into the surface.
+    # From above that is straight into the surface, as where no direction is known.
     torch.testing.assert_close(rendered().gains(CONTACTS), gains)
+    torch.testing.assert_close(rendered().gains(CONTACTS, directions=0.0 * down), gains)
     modes = known_fit().modes()
     along = modes.at(CONTACTS)[:, :, 2]
     level = gains / (along / rendered().bank.frequency)

@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +20,17 @@ from avmsf.evaluation import report
 from avmsf.evaluation.published import PUBLISHED, published_ratios
 from avmsf.evaluation.registry import METHODS
 from avmsf.evaluation.report import draw_spectrogram, markdown, picture_levels, write_page, write_summary
-from avmsf.evaluation.results import CaseRecord, ObjectRecord, Outcome, ResultsFolder, listening_gain, write_flac
+from avmsf.evaluation.results import (
+    CaseRecord,
+    ObjectRecord,
+    Outcome,
+    ResultsFolder,
+    file_word,
+    listening_gain,
+    write_flac,
+)
 from avmsf.evaluation.runner import run_objects
-from avmsf.evaluation.tables import CHOSEN_ON_TEST, Section, missing_of, sections, summarize, values_of
+from avmsf.evaluation.tables import CHOSEN_ON_TEST, Section, missing_of, sections, summarize, times_of, values_of
 from factories.plate_set import fill_plates
 
 IDENTITY = {
@@ -191,6 +200,22 @@ def test_edits_move_from_where_their_own_object_was(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(report, "_write_figure", lambda *_: tmp_path)
     report.write_figures(results)
     assert drawn == [{"edit-physics": [([0.0, 0.0], [1.0, 0.0]), ([5.0, 5.0], [6.0, 5.0])]}]
+
+
+def test_times_are_those_of_what_is_done() -> None:
+    def timed(name: str, **more: Any) -> ObjectRecord:
+        return replace(record(name, {}), outcomes=(Outcome("farthest", "knn3", **more),))
+
+    records = timed("1", fit_seconds=10.0), timed("2", failure="no"), ObjectRecord("3", failure="broken")
+    found = {name: each["methods"] for name, each in times_of(records).items()}
+    assert found == {"1": {"knn3": {"fit": 10.0, "render": 0.0}}, "2": {}}
+
+
+def test_methods_of_different_folders_have_files_of_different_names() -> None:
+    words = {file_word(f"recorded:{path}") for path in ("runs/v1", "runs-v1", "\u97f3" * 300)}
+    assert len(words) == 3
+    assert max(len(each.encode()) for each in words) < 200
+    assert file_word("16 shots") == "16-shots"
 
 
 def test_a_kept_sound_is_as_loud_beside_the_recording_as_it_was(tmp_path: Path) -> None:

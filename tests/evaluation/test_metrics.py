@@ -27,8 +27,8 @@ from avmsf.evaluation.metrics import (
     validate,
 )
 from avmsf.evaluation.registry import METRICS as REGISTERED
-from avmsf.evaluation.registry import MetricSettings, resolve
-from avmsf.evaluation.scores import Scores, evaluate, metric_values
+from avmsf.evaluation.registry import MetricEntry, MetricSettings, resolve
+from avmsf.evaluation.scores import Scores, evaluate, metric_values, score
 from avmsf.evaluation.simple_methods import MeanWaveform, NearestRecording, WhiteNoise
 from avmsf.evaluation.splits import split
 from avmsf.modal.spectra import magnitude_stft, resampled
@@ -284,6 +284,14 @@ def test_training_recordings_are_for_what_makes_a_renderer():
     for given, value in ((Silent(8000.0), "Silent"), (lambda heard: 3, "int")):
         with raises(EvaluationError, name="renderer", value=value):
             evaluate(given, test, train=train)
+
+
+def test_a_value_that_is_no_number_does_not_better_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = MetricEntry("mine", lambda predicted, truth, sample_rate: torch.tensor([1.0, math.inf]))
+    monkeypatch.setitem(REGISTERED, "mine", mine)
+    impacts = plate_impacts(2)
+    with raises(EvaluationError, row=1, name="mine", value=math.inf):
+        score(impacts.sounds, impacts)
 
 
 def test_recordings_that_do_not_fit_the_renderer_are_refused():

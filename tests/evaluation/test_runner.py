@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,9 +15,10 @@ from torch import Tensor
 
 from avmsf._utils.processes import write_lock
 from avmsf.capture import read_capture, write_capture
+from avmsf.capture.audio import read_recording
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.datasets import CaptureCollection
+from avmsf.datasets import CaptureCollection, open_dataset
 from avmsf.datasets.dataset import ObjectFacts
 from avmsf.errors import AvmsfError, EvaluationError, FitError, FolderInUseError
 from avmsf.evaluation import align_split, evaluate
@@ -230,6 +232,50 @@ def test_a_folder_of_other_things_and_damaged_results_are_refused(plates: Path, 
         (results.path / "objects" / "a.json").write_text(content)
         with raises(EvaluationError, file="objects/a.json"):
             results.records()
+
+
+def test_results_of_another_mesh_or_other_settings_are_not_mixed(tmp_path: Path) -> None:
+    folder, results = fill_plates(tmp_path / "plates", ("a",), truth=True), ResultsFolder(tmp_path / "results")
+    run_objects(planned(folder, "knn3"), ("a",), results)
+    settings = folder / "a" / "capture.toml"
+    settings.write_text(settings.read_text() + "held = [[0.0, 0.0, 0.0]]\n")
+    with raises(EvaluationError, file=results.path, name="a"):
+        run_objects(planned(folder, "knn3"), ("a",), results)
+
+
+def test_of_short_files_that_start_at_their_peaks_what_they_hold_is_scored(tmp_path, monkeypatch):
+    folder = fill_plates(tmp_path / "plates", ("a",), truth=True)
+    (folder / "a" / "capture.toml").write_text('name = "a"\n')
+    peaks, own = open_dataset(folder, time_zero="peak"), open_dataset(folder)
+    assert peaks.capture("a").impacts.duration < own.capture("a").impacts.duration
+    monkeypatch.setattr(FieldMethod, "fit", lambda method, task: NearestRecording(task.train))
+    plan = replace(planned(folder, "field-smooth"), inputs=PlateInputs(peaks, folder), time_zero="peak", own_starts=own)
+    run_objects(plan, ("a",), ResultsFolder(tmp_path / "results"))
+    assert summed(tmp_path / "results")["failures"] == []
+    # Each recording has a time zero of its own then, which the true gains have not.
+    (folder / "a" / "capture.toml").write_text('time_zero = "peak"\n')
+    assert ObjectData(planned(folder), "a").truth is None
+
+
+def test_edits_among_other_objects_or_of_other_features_are_not_mixed(plates: Path, tmp_path: Path) -> None:
+    def plan(names: str) -> Evaluation:
+        materials = dict.fromkeys(names, "wood")
+        edits = SimpleNamespace(spaces={}, materials=materials, field_method=method_named("field"))
+        return replace(planned(plates, "unedited", protocol="edit"), edits=edits, encoder="descriptors")
+
+    results = ResultsFolder(tmp_path / "results")
+    plan("ab").begin(results)
+    assert results.identity()["methods"]["unedited"]["encoder"] == "descriptors"
+    with raises(EvaluationError, file=results.path, name="among.c"):
+        plan("abc").begin(results)
+
+
+def test_stored_sounds_have_the_recordings_rate(tmp_path: Path) -> None:
+    run = run_of(strikes(STRIKES), tmp_path)
+    run.stored_rows, rate = [0], run.scored.test.sample_rate
+    (file,) = run._write_sounds("generation", torch.randn(1, 2000), 2 * rate).values()
+    heard = read_recording(tmp_path / file)
+    assert (heard.sample_rate, heard.frames) == (rate, 1000)
 
 
 def test_two_evaluations_exclude_each_other_in_one_folder(plates: Path, tmp_path: Path) -> None:

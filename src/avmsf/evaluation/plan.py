@@ -57,6 +57,8 @@ class Evaluation:
         """
         if self.protocol.scoring == "sounds" and self.metric_settings.cdpam:
             shared_cdpam()
+        # Edits are scored in an embedding of all of them.
+        among, read = {} if self.edits is None else self.edits.materials, self.inputs.dataset.capture
         identity = {
             "version": version("avmsf"),
             "source": source_digest(f"{__package__}.runner"),
@@ -69,6 +71,7 @@ class Evaluation:
             "columns": sorted(METRICS),
             "modes": _plain(self.finder),
             "settings": dict(self.settings),
+            "among": {name: f"{material} {read(name).impacts.digest()}" for name, material in among.items()},
         }
         results.begin(identity, {method.name: self._described(method) for method in self.methods})
         if self.edits is not None:
@@ -76,7 +79,8 @@ class Evaluation:
 
     def _described(self, method: Method) -> dict[str, str | None]:
         """Return what tells a method apart from another of its name. Methods that read no features share any folder."""
-        return {"settings": repr(method), "encoder": None if input_of(method).form == "surface" else self.encoder}
+        read = input_of(method if self.edits is None else self.edits.field_method)
+        return {"settings": repr(method), "encoder": None if read.form == "surface" else self.encoder}
 
 
 def _plain(settings: Any) -> dict[str, Any]:

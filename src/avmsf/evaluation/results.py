@@ -21,6 +21,7 @@ from jaxtyping import Float
 from scipy.signal import resample_poly
 from torch import Tensor
 
+from avmsf._utils.caching import content_digest
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import flat, in_order, json_text, read_json_object
 from avmsf.errors import AvmsfError, EvaluationError
@@ -30,6 +31,8 @@ IDENTITY, SPACES, OBJECTS = "protocol.json", "spaces.json", "objects"
 """The files that identify the evaluation and embed the objects of `edit`, and the folder of the objects' files."""
 _MAX_BYTES = 64 << 20
 """Largest file of results that is read: three million values, as of 100 contacts by 10 metrics in 3000 cases."""
+_MAX_WORD = 40
+"""Characters of a path in a file's name, which may take four bytes each."""
 _MAX_SHOWN = 160
 """Characters of a setting in a message."""
 RECORDED = "recorded"
@@ -148,6 +151,8 @@ class ResultsFolder:
                 named = {"without": lacks, "with": more}.items()
                 parts = [f"{word} {', '.join(in_order(names))}" for word, names in named if names]
                 made, got = "results of the same metrics", f"those {' and '.join(parts)}"
+            if name.startswith("among."):
+                made, got = "results scored among the same objects and recordings", "those among others"
             advice = "give the same options, or choose another --output"
             raise EvaluationError.expected(made, theirs, got=got, file=self.path, name=name, advice=advice)
         write_json(path, {**wanted, "methods": {**stored, **methods}})
@@ -235,8 +240,9 @@ def failure_of(error: Exception) -> str:
 
 
 def file_word(name: str) -> str:
-    """Return a name for files: methods that read a folder have its path in their name."""
-    return re.sub(r"[^\w-]", "-", name)
+    """Return a name for files: methods that read a folder have its path in their name, of which the end is kept."""
+    word = re.sub(r"[^\w-]", "-", name)
+    return word if ":" not in name else f"{word[-_MAX_WORD:]}-{content_digest(name)[:8]}"
 
 
 def _brief(value: object) -> str:

@@ -44,6 +44,7 @@ from avmsf.field.sound_field import SoundField
 from avmsf.field.store import load
 from avmsf.modal.extraction.extract import extract_once
 from avmsf.modal.extraction.finders import ModeFinder
+from avmsf.modal.spectra import resampled, with_length
 
 MAX_STORED_SOUNDS = 3
 """Test contacts of an experiment whose sounds are stored to be listened to."""
@@ -67,10 +68,12 @@ class ObjectData:
         """Where `impacts` start at their peaks, the same recordings with the dataset's own starts, for fields that are
         not of the paper's configuration: from its peak a recording's modes have phases of its own, which hide the
         signs of the gains, and which the truth of all does not have."""
-        truth = None if evaluation.time_zero == "peak" else truth_of(capture)
+        truth = None if capture.settings.from_peaks else truth_of(capture)
         known = () if truth is None else (truth.frequency, truth.damping, truth.gains)
-        self.digest = content_digest(self.impacts.digest(), *known)
-        """Of all that values depend on of the object's recordings and truth."""
+        shape = () if surface is None else (surface.vertices, surface.faces)
+        settings = replace(capture.settings, name=None)
+        self.digest = content_digest(self.impacts.digest(), *known, *shape, settings)
+        """Of all that values depend on of the object's recordings, truth, mesh and settings."""
         if truth is not None:
             truth = truth_from_first_sample(truth_at(truth, self.impacts.names), self.impacts)
         self.truth = truth
@@ -135,6 +138,9 @@ class CaseRun:
             with torch.no_grad():
                 sounds = renderer.render(recordings.test.contacts, directions=recordings.test.directions)
             render_seconds = time.perf_counter() - begun
+            if recordings is not self.scored:
+                # From its peak on a short file holds less than from its onset on.
+                sounds = with_length(sounds, self.scored.test.sounds.shape[1])
             maps, report = dict[str, str](), report_of(renderer)
             figures: Mapping[str, float | None] = {}
             if isinstance(task, EditTask) and isinstance(renderer, SoundField | Generated):
@@ -244,11 +250,12 @@ class CaseRun:
         return made
 
     def _write_sounds(self, name: str, sounds: Float[Tensor, "contacts samples"], sample_rate: float) -> dict[str, str]:
-        """Write the sounds to listen to, and return their files by the names of their recordings."""
+        """Write the sounds to listen to, at the recordings' rate, and return their files by the recordings' names."""
         stored, test = {}, self.scored.test
-        for row in self.stored_rows:
+        rows = resampled(sounds[self.stored_rows], sample_rate=sample_rate, wanted=test.sample_rate)
+        for row, sound in zip(self.stored_rows, rows, strict=True):
             file, gain = f"sounds/{self.name}/{row:03d} {file_word(name)}.flac", listening_gain(test.sounds[row])
-            write_flac(self.folder / file, sounds[row], sample_rate=sample_rate, gain=gain)
+            write_flac(self.folder / file, sound, sample_rate=test.sample_rate, gain=gain)
             stored[test.names[row]] = file
         return stored
 
@@ -295,7 +302,8 @@ def _begun(
     if record.digest != data.digest and all(each.failure is not None for each in record.outcomes):
         record = ObjectRecord(record.identifier)
     if record.digest not in ("", data.digest):
-        wanted, advice = f"results of the recordings of {record.identifier} in {title}", "choose another --output"
+        wanted = f"results of the recordings, mesh and settings of {record.identifier} in {title}"
+        advice = f"choose another --output, or delete objects/{record.identifier}.json to compute them again"
         raise EvaluationError.expected(
             wanted, record.digest, got="those of others", file=results.path, name=record.identifier, advice=advice
         )

@@ -129,6 +129,11 @@ def score(sounds: ArrayLike, impacts: Impacts) -> Scores:
         values[name] = resolve(entry.function)(sounds, impacts.sounds, sample_rate=impacts.sample_rate)
         if values[name].shape != (len(impacts),):
             raise EvaluationError.expected(f"{len(impacts)} values, a sound each", list(values[name].shape), name=name)
+        # As missing values they would be left out of means, to the method's advantage.
+        if len(bad := torch.nonzero(~torch.isfinite(values[name])).flatten()):
+            row = int(bad[0])
+            got = f"{float(values[name][row])} of {impacts.names[row]}"
+            raise EvaluationError.expected("finite values", float(values[name][row]), got=got, row=row, name=name)
     return Scores(impacts.names, values)
 
 

@@ -177,14 +177,19 @@ def failures_of(records: Iterable[ObjectRecord]) -> list[dict[str, str | None]]:
 
 
 def times_of(records: Iterable[ObjectRecord]) -> dict[str, dict[str, Any]]:
-    """Return each object's seconds: what methods share, and each method's to fit and to render all test contacts."""
+    """Return each object's seconds: what methods share, and each method's to fit and to render all test contacts.
+
+    A method has none of an object that it failed on or is not done with; objects that could not be read are left out.
+    """
     times = {}
-    for record in records:
-        methods: dict[str, dict[str, float]] = {}
-        for each in record.outcomes:
-            steps = methods.setdefault(each.method, {"fit": 0.0, "render": 0.0})
-            steps["fit"] += each.fit_seconds
-            steps["render"] += each.render_seconds
+    for record in (each for each in records if each.cases):
+        keys, methods = {case.key for case in record.cases}, dict[str, dict[str, float]]()
+        for method in dict.fromkeys(each.method for each in record.outcomes):
+            wanted = method, None
+            done = [each for each in record.outcomes if (each.method, each.failure) == wanted and each.case in keys]
+            if len(done) == len(keys):
+                steps = {"fit": [each.fit_seconds for each in done], "render": [each.render_seconds for each in done]}
+                methods[method] = {step: math.fsum(seconds) for step, seconds in steps.items()}
         shared = math.fsum(case.shared_seconds for case in record.cases)
         times[record.identifier] = {"shared": shared, "methods": methods}
     return times

@@ -150,7 +150,11 @@ def _displacements(
 ) -> Float64[Tensor, "contacts modes"]:
     """Return the amplitudes of the displacement that an impulse of 1 Ns sets the modes in motion with."""
     places = contacts.detach().cpu()
-    into = -elastic.normals(places) if directions is None else directions.detach().cpu().double()
+    into = -elastic.normals(places)
+    if directions is not None:
+        given = directions.detach().cpu().double()
+        # One of length zero is unknown.
+        into = torch.where(given.norm(dim=1, keepdim=True) > 0.0, given, into)
     return elastic.gains(places, into) / (2.0 * math.pi * bank.frequency)
 
 
