@@ -45,6 +45,18 @@ def test_new_files_and_folders_have_the_mode_of_the_umask_which_stays_as_it_is(t
     assert changed == []
 
 
+def test_what_a_link_leads_to_is_written_and_the_current_folder_refused(tmp_path, monkeypatch):
+    (tmp_path / "real").write_text("old")
+    (tmp_path / "link").symlink_to("real")
+    write_whole(tmp_path / "link", "new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real").read_text() == "new"
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    with pytest.raises(ExportError), new_folder(Path("."), raising=ExportError):
+        pass
+
+
 def test_a_folder_that_cannot_be_replaced_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "mine").touch()

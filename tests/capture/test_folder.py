@@ -160,6 +160,13 @@ def test_units_scale_contacts_and_surface(tmp_path: Path, surface_unit: str) -> 
     assert capture.surface.vertices.amax(0).tolist() == pytest.approx([0.1, 0.2, 0.3], rel=1e-6)
 
 
+def test_an_error_names_a_folder_that_a_files_name_begins_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    fill(Path("0"), sounds={"001.wav": np.zeros(5000)})
+    with raises(CaptureError, file=Path("0/001.wav")):
+        read_capture("0")
+
+
 def test_directions_become_unit_vectors(tmp_path: Path) -> None:
     rows = ("a.wav,0.1,0,0,0,0,-2", "b.wav,0,0.2,0,3,0,4", "c.wav,0,0,0.3,1,0,0")
     directions = read_capture(fill(tmp_path, header="file,x,y,z,nx,ny,nz", rows=rows)).impacts.directions

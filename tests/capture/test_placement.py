@@ -1,5 +1,6 @@
 """Contacts on and off a surface, and mistakes that the test makes and that must be named."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
+from avmsf.capture.checks import check_surface
 from avmsf.capture.placement import FACTORS, check_placement
-from avmsf.capture.table import parse_row, read_rows
+from avmsf.capture.table import Impact, parse_row, read_rows
 from avmsf.errors import CaptureError
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import contacted_part, surface_points
@@ -189,6 +191,11 @@ def test_of_a_scan_with_its_table_the_part_that_the_contacts_lie_on_is_kept() ->
     both = trimesh.util.concatenate([table, cup])
     scan = surface_of(both)
     contacts = torch.from_numpy(np.array(trimesh.sample.sample_surface(cup, 12, seed=0)[0]))
+    # What is left of the scan is checked against them as any other surface.
+    impacts = [Impact(f"{row}.wav", tuple(each), line=row + 2) for row, each in enumerate(contacts.tolist())]
+    far = replace(impacts[3], contact=(0.0, 0.0, 5.0))
+    with raises(CaptureError, row=5):
+        check_surface([*impacts[:3], far, *impacts[4:]], scan, settings=CaptureSettings())
     kept, areas = contacted_part(scan, contacts)
     assert len(kept.faces) == len(cup.faces)
     assert areas == pytest.approx([cup.area, table.area])

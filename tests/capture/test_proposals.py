@@ -1,5 +1,7 @@
 """Settings are proposed where the recordings show that they help, and what is written is read back the same."""
 
+import errno
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,7 @@ from avmsf.capture.proposals import Proposal, propose_settings, write_settings
 from avmsf.capture.settings import METRES
 from avmsf.errors import CaptureError
 from factories.capture_folder import RATE, fill, ring
+from factories.raising import raises
 
 SECONDS = 1.0
 TIME = np.arange(round(SECONDS * RATE)) / RATE
@@ -134,6 +137,16 @@ def test_settings_that_a_user_wrote_are_kept(tmp_path: Path) -> None:
     # A choice is not questioned, not even of the default.
     (folder / "capture.toml").write_text("highpass = 0.0\n")
     assert propose_settings(folder) == ()
+
+
+def test_settings_that_cannot_be_written_whole_are_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with raises(CaptureError, file=tmp_path / "capture.toml"):
+        write_settings(tmp_path, [Proposal("unit", "mm", "")])
+    assert not any(tmp_path.iterdir())
 
 
 def test_what_cannot_be_read_is_passed_over(tmp_path: Path) -> None:

@@ -269,3 +269,11 @@ def test_a_compressed_file_is_measured_by_its_header(tmp_path: Path) -> None:
     assert name.stat().st_size < 1e6
     with raises(CaptureError, file=name, value=17 * MAX_SAMPLES // 16):
         read_recording(name)
+
+
+def test_samples_without_a_header_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.raw").write_bytes(bytes(4000))
+    (tmp_path / "impacts.csv").write_text("file,x,y,z\na.raw,0,0,0\n")
+    assert "cannot be read" in check(tmp_path).recordings[0].problems[0]
+    with raises(CaptureError, file=tmp_path / "missing.wav"):
+        read_recording(str(tmp_path / "missing.wav"))

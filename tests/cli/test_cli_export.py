@@ -26,7 +26,7 @@ from avmsf.modal.modes import ModalBank
 from factories.believing_field import ELASTIC, bar, bar_points
 from factories.capture_folder import fill
 from factories.clouds import random_cloud
-from factories.made_fields import BANK, SIDES, directional, positional, saved, sounding
+from factories.made_fields import BANK, SIDES, directional, elastic, positional, saved, sounding
 from factories.made_tables import read_arrays
 from factories.raising import raises
 from factories.verbs import run_verb
@@ -260,3 +260,10 @@ def test_a_captures_mesh_is_as_large_as_the_field(size, field_file, tmp_path, ca
     (capture / "capture.toml").write_text('surface = "splats.ply"\n')
     with raises(AvmsfError, file=capture / "splats.ply", name="--capture", value=3.0):
         export(tmp_path / "large.safetensors", "web", tmp_path / "other", "--capture", capture)
+
+
+@pytest.mark.parametrize("kind", ["gltf", "web"])
+def test_one_contact_of_an_object_is_exported_with_its_surface(tmp_path: Path, kind: str) -> None:
+    output = {"gltf": tmp_path / "one.glb", "web": tmp_path / "one"}[kind]
+    made = export(saved(elastic(), tmp_path), kind, output, "--position", 0.05, 0.02, 0.002)
+    assert made.exists()

@@ -175,7 +175,7 @@ def test_a_texture_becomes_the_corners_colors(tmp_path):
     visual = trimesh.visual.TextureVisuals([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]], material=material)
     triangle = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     trimesh.Trimesh(triangle, [[0, 1, 2]], visual=visual, process=False).export(tmp_path / "thing.glb")
-    write_gltf(table(), tmp_path / "shown.glb", object=tmp_path / "thing.glb")
+    write_gltf(table(), tmp_path / "shown.glb", object=str(tmp_path / "thing.glb"))
     document, arrays = read(tmp_path / "shown.glb")
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     places, colors = arrays[attributes["POSITION"]], arrays[attributes["COLOR_0"]]
@@ -189,6 +189,8 @@ def test_other_endings_are_refused(tmp_path):
         write_gltf(field, tmp_path / "thing.obj")
     with raises(ExportError, file="thing.cpp", name="suffix", value=".cpp"):
         write_faust(field, tmp_path / "thing.cpp")
+    write_faust(field, tmp_path / "THING.DSP")
+    assert "process" in (tmp_path / "THING.DSP").read_text()
 
 
 DRIVER = Path(__file__).with_name("faust_driver.c")

@@ -19,6 +19,7 @@ from avmsf.export.geometry import read_object
 from avmsf.export.sampled_field import SampledField, outward_normals
 from avmsf.export.web import make_bundle, write_webpage
 from avmsf.field.config import FitConfig
+from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.scaled import ScaledGains
 from avmsf.field.sound_field import SUPPORTING, Origin, SoundField
 from avmsf.gaussians.ply import write_splats
@@ -27,7 +28,7 @@ from avmsf.modal.modes import ForcePulse, ModalBank
 from avmsf.modal.residual_noise import Residual
 from factories.clouds import random_cloud
 from factories.looked_at import surface_of
-from factories.made_fields import BANK, FIELDS, elastic, places, plate, positional
+from factories.made_fields import BANK, FIELDS, elastic, mixture, places, plate, positional
 from factories.made_tables import STRUCK_RATE as RATE
 from factories.made_tables import read_arrays, struck_table
 from factories.raising import raises
@@ -118,6 +119,15 @@ def test_what_cannot_be_sampled_is_refused(given, name, value):
         SampledField.of(sounding("positional"), **given)
     with raises(ExportError, name="modes", value=0):
         SampledField.of(adjust_modes(sounding("positional"), pitch=900.0))
+
+
+def test_normals_of_a_few_contacts_are_those_of_the_surface():
+    out = torch.nn.functional.normalize(torch.randn(2000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    values = torch.randn(20, len(BANK), generator=torch.Generator().manual_seed(1), dtype=torch.complex128)
+    gains = mixture(Sites(0.1 * out[:20].double(), -out[:20].double()), values, directional=False, points=0.1 * out)
+    for limit in (1, 16):
+        table = SampledField.of(replace(sounding("positional"), gain_field=gains), limit=limit)
+        assert float((10 * table.points * table.normals).sum(1).min()) > 0.95
 
 
 def test_supporting_poles_are_counted_among_the_modes_that_sound():

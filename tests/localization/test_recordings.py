@@ -14,6 +14,7 @@ from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import LocationError
 from avmsf.field.sound_field import SoundField
 from avmsf.localization.locate import locate, locate_impacts
+from avmsf.localization.locator import Locator
 from avmsf.localization.preprocess import at_field_rate, preprocess_recording
 from factories.located_plate import PLATE, RATE, locator_of, missed, struck, true_field
 from factories.raising import raises
@@ -40,6 +41,21 @@ def test_the_onset_is_found_and_the_impact_located():
         found = locate(true_field(), recorded(sound), locator=locator_of())
         assert missed(found, found.most_probable, contact) < 0.03
         assert found.modal_energy > 0.95
+
+
+def test_a_field_of_sounds_from_their_peaks_is_asked_for_sounds_from_their_peaks():
+    field, one = read_by(CaptureSettings(time_zero="peak")), recorded(struck(1, seed=21).sounds[0])
+    locator = Locator.of(field)
+    by_file = locate(field, one, locator=locator)
+    for found in (locate(field, one.channels[0], locator=locator), locate_impacts(field, one, locator=locator)[0][1]):
+        assert torch.allclose(found.distance, by_file.distance, atol=1e-3)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.003])
+def test_clipping_is_noted_whatever_the_recorders_offset(offset):
+    one = recorded(struck(1, seed=3).sounds[0])
+    loud = replace(one, channels=np.clip(5.0 * one.channels + offset, -1.0, 1.0))
+    assert "clipped at 1" in preprocess_recording(loud, true_field())[2][0]
 
 
 @pytest.mark.parametrize("rate", [44100.0, 48000.0, 12000.0])

@@ -13,7 +13,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from avmsf.errors import SceneError
+from avmsf.errors import CaptureWarning, SceneError
 from avmsf.mesh.level_set import Grid, decimated, enclose
 from avmsf.mesh.surface import Surface
 from avmsf.mesh.textured_mesh import GRAY, TexturedMesh, read_textured_mesh

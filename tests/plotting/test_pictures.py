@@ -79,6 +79,9 @@ def test_gains_are_colored_symmetrically_about_zero_strongest_modes_first_by_fre
 
 def test_a_flat_object_is_drawn_in_its_plane() -> None:
     points = torch.cartesian_prod(torch.linspace(0, 0.3, 9), torch.zeros(1), torch.linspace(0, 0.1, 5))
+    # Poles without a pitch are no modes.
+    none = ModalBank(MODES.frequency[:0], MODES.damping[:0])
+    assert draw_gains(points, torch.ones(45, 0), none, title="a thud").axes is not None
     one = ModalBank(MODES.frequency[:1], MODES.damping[:1])
     axes = draw_gains(points, torch.ones(45, 1), one, title="a plate").axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (m)", "z (m)")

@@ -62,8 +62,9 @@ def wavefront(folder: Path) -> Path:
     folder.mkdir()
     shape = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n"
     (folder / "bowl.obj").write_text(f"mtllib bowl.mtl\n{shape}")
-    (folder / "bowl.mtl").write_text("newmtl glazed\nmap_Kd pic.png\n")
-    (folder / "pic.png").write_bytes(b"the mesh's picture")
+    (folder / "bowl.mtl").write_text("newmtl glazed\nmap_Kd maps/pic.png\n")
+    (folder / "maps").mkdir()
+    (folder / "maps" / "pic.png").write_bytes(b"the mesh's picture")
     return folder / "bowl.obj"
 
 
@@ -77,7 +78,7 @@ def test_a_mesh_brings_its_pictures_and_overwrites_none(tmp_path: Path) -> None:
     assert (other / "pic.png").read_bytes() == b"the user's own picture"
     opened = open_target(mesh, capture=mesh.parent)
     assert find_object(opened) == mesh.parent.resolve() / "surface.obj"
-    assert (mesh.parent / "pic.png").read_bytes() == b"the mesh's picture"
+    assert (mesh.parent / "maps" / "pic.png").read_bytes() == b"the mesh's picture"
     beside = open_target(mesh)
     assert beside.capture is not None
     names = sorted(path.name for path in beside.capture.iterdir())
@@ -117,7 +118,15 @@ def test_a_folder_of_strikes_alone_is_clicked_where_its_contacts_are(tmp_path: P
         manifest = running.manifest()
         assert manifest["points"] > 100
         assert manifest["object"] == {"kind": "points", "file": None}
+        # Points between contacts have no sides, which would become the directions of impacts.
+        assert "normals" not in manifest["tensors"]
         assert len(running.get("capture").words["strikes"]) == 3
+
+
+def test_strikes_at_one_place_alone_are_opened(tmp_path: Path) -> None:
+    fill(tmp_path / "one", rows=("a.wav,0.1,0,0", "b.wav,0.1,0,0"))
+    (tmp_path / "files").mkdir()
+    assert Studio(open_target(tmp_path / "one"), tmp_path / "files").manifest()["points"] == 1
 
 
 @pytest.fixture

@@ -205,8 +205,9 @@ def test_the_table_of_an_edited_field_is_the_one_made_anew(kind: str) -> None:
     words = {"size": 0.7, "material": {"from": "ceramic", "to": "ceramic"}, "decay": 0.5, "brightness": 2.0}
     after, _ = Sliders.read({**words, "pitch": 1.3, "modes": [{"mode": 3, "db": None}]}).apply(before)
     assert after.gain_field.length == 0.7
-    found = resample(sampled, before, after)
+    found = resample(replace(sampled, name="another"), before, after)
     assert found is not None
+    assert found.name == after.origin.capture
     expected = SampledField.of(after, before.gain_field.points.double() * 0.7, normals)
     assert len(expected.frequency) < len(sampled.frequency)
     assert torch.equal(found.frequency, expected.frequency)

@@ -82,7 +82,7 @@ def as_floats(values: float | int | ArrayLike, name: str) -> Float[Tensor, "*sha
     """Return numbers of any shape as floats on the CPU. Raises ArrayError for what are no numbers."""
     try:
         if isinstance(values, Tensor):
-            found = values
+            found = values.clone()
         else:
             array = np.asarray(values)
             # A copy in native order: torch refuses reversed rows and foreign bytes, and shares others with the caller.

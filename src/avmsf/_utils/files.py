@@ -4,7 +4,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from avmsf.errors import AvmsfError, FieldFileError
@@ -54,7 +54,8 @@ def write_whole(
     until then: a full disk or a kill leaves the old file, a kill perhaps a hidden `.NAME.….part` beside it, which
     nothing reads. Raises `raising`.
     """
-    temporary = None
+    # What a link leads to is replaced, and the link stays.
+    temporary, named, path = None, path, Path(os.path.realpath(path))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = temporary_path(path)
@@ -68,10 +69,12 @@ def write_whole(
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise unwritable(path, error, raising=raising, unchanged="an old file is unchanged; ") from error
+        raise unwritable(named, error, raising=raising, unchanged="an old file is unchanged; ") from error
     finally:
         if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            # What could not be made cannot be looked for either, where its name is too long.
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
 def copy_whole(source: Path, path: Path, *, raising: type[AvmsfError] = FieldFileError) -> None:
@@ -86,10 +89,13 @@ def new_folder(folder: Path, *, raising: type[AvmsfError], replace: bool = False
     With `replace` all that was in the folder is deleted then. Raises `raising` where the folder cannot be written or is
     a file, and without `replace` where it is not empty.
     """
-    if folder.exists() and (not folder.is_dir() or (not replace and any(folder.iterdir()))):
-        raise raising.expected(
-            "a new or empty folder", got="an existing one", file=folder, advice="choose another name or remove it"
-        )
+    # The shell that runs this would stay in the folder that was there before.
+    here = folder.is_dir() and folder.samefile(os.curdir)
+    if here or (folder.exists() and (not folder.is_dir() or (not replace and any(folder.iterdir())))):
+        got, advice = "the current one" if here else "an existing one", "choose another name or remove it"
+        raise raising.expected("a new or empty folder", got=got, file=folder, advice=advice)
+    # What a link leads to is replaced, and the link stays.
+    named, folder = folder, Path(os.path.realpath(folder))
     begun, old = temporary_path(folder), temporary_path(folder)
     try:
         begun.mkdir(parents=True)
@@ -106,6 +112,6 @@ def new_folder(folder: Path, *, raising: type[AvmsfError], replace: bool = False
             raise
         shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
-        raise unwritable(folder, error, raising=raising) from error
+        raise unwritable(named, error, raising=raising) from error
     finally:
         shutil.rmtree(begun, ignore_errors=True)

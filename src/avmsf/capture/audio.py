@@ -136,13 +136,13 @@ def constant_offset(sound: Float64[np.ndarray, " frames"], *, sample_rate: float
     return offset if abs(offset) > limit else 0.0
 
 
-def read_recording(path: Path, name: str | None = None) -> Recording:
+def read_recording(path: str | Path, name: str | None = None) -> Recording:
     """Read every channel of a sound file, which messages call `name`.
 
     Raises `CaptureError` where the file is missing, corrupt, empty or longer than `MAX_SAMPLES`, or holds samples that
     are not numbers or larger than `MAX_PEAK`.
     """
-    name = name or str(path)
+    path, name = Path(path), name or str(path)
     if os.path.isdir(path):
         raise CaptureError.expected("a sound file", got="a folder", file=name, advice="name a file in it")
     # Unlike Path.is_file, this is False for what no file can be called.
@@ -180,7 +180,7 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
                 raise RecordingLengthError.expected(wanted, samples, got=got, file=name, advice=advice)
             channels = file.read(dtype="float64", always_2d=True).T
             rate, subtype = float(file.samplerate), str(file.subtype)
-    except (soundfile.LibsndfileError, OSError, UnicodeEncodeError) as error:
+    except (soundfile.LibsndfileError, OSError, TypeError, UnicodeEncodeError) as error:  # TypeError: samples alone
         reason = getattr(error, "error_string", str(error)).strip().rstrip(".")
         size = source.stat().st_size if isinstance(source, Path) else source.getbuffer().nbytes
         got, advice = f"{size} bytes that cannot be read ({reason})", "export it again as wav"

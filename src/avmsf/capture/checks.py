@@ -79,13 +79,14 @@ def check_surface(
     expect_held(settings.held_at, surface)
     contacts = torch.tensor([impact.contact for impact in impacts], dtype=torch.float64)
     surface, areas = contacted_part(surface, contacts)
+    warned = list[CaptureWarning]()
     if areas:
         sizes = " and ".join(f"{1e4 * area:.3g} cm2" for area in areas[1:3])
         message = f"the contacts lie on a part of {1e4 * areas[0]:.3g} cm2; larger ones ({sizes}) are left out"
-        return surface, [CaptureWarning(message, name="surface", value=areas)]
+        warned.append(CaptureWarning(message, name="surface", value=areas))
     placement = check_placement(contacts, surface_points(surface))
     if placement.fault == "none":
-        return surface, []
+        return surface, warned
     lines = [f'{key} = "{value}"' for key, value in fitting_units_of(placement, settings).items()]
     advice = f". If so, write {' and '.join(lines)} in capture.toml" if lines else ""
     found = placement.describe([f"row {impact.line}" for impact in impacts]) + advice
@@ -98,7 +99,8 @@ def check_surface(
         got = f"one {farthest:.3g} m off it, more than its extent of {placement.diagonal:.3g} m: {found}"
         wanted = "a contact on the surface"
         raise CaptureError.expected(wanted, farthest, got=got, file=TABLE, row=worst, name="surface")
-    return surface, [CaptureWarning(f"{TABLE}: {found}", file=TABLE, row=worst, name="surface", value=farthest)]
+    warned.append(CaptureWarning(f"{TABLE}: {found}", file=TABLE, row=worst, name="surface", value=farthest))
+    return surface, warned
 
 
 def check_one_unit(folder: Path, settings: CaptureSettings) -> None:

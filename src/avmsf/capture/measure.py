@@ -144,7 +144,7 @@ def check_impulsive(sound: Float64[np.ndarray, " samples"], *, sample_rate: floa
 
 
 def find_clipping(response: Float64[np.ndarray, " frames"], *, name: str) -> str | None:
-    """Return a message on how much of a sound is clipped; None where nothing is."""
+    """Return a message on how much of a channel, with its offset, is clipped; None where nothing is."""
     clipped = clipped_samples(response)
     found = f"{name}: {clipped} samples ({clipped / len(response):.2%}) are clipped at {np.abs(response).max():.3g}"
     return f"{found}, which no mode can explain; turn the gain down and record it again" if clipped else None

@@ -5,6 +5,7 @@ docs/decisions/reading-recordings.md has the measurements behind the limits.
 """
 
 import json
+import os
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -17,7 +18,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from avmsf._utils.files import unwritable
+from avmsf._utils.files import write_whole
 from avmsf._utils.text import read_toml
 from avmsf.capture.audio import Recording
 from avmsf.capture.checks import NARROWEST, WIDEST, find_surface, fitting_units_of
@@ -99,14 +100,10 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
     for each in proposals:
         reason = textwrap.wrap(each.reason, 100, initial_indent="# ", subsequent_indent="# ")
         parts.append("\n".join([*reason, each.line, ""]))
-    try:
-        with open(path, "x", encoding="utf-8") as file:
-            file.write("\n".join(parts))
-    except FileExistsError as error:
+    if os.path.lexists(path):
         advice = f"add to it by hand: {'; '.join(each.line for each in proposals)}"
-        raise CaptureError.expected("no such file", got="an existing one", file=path, advice=advice) from error
-    except OSError as error:
-        raise unwritable(path, error, raising=CaptureError) from error
+        raise CaptureError.expected("no such file", got="an existing one", file=path, advice=advice)
+    write_whole(path, "\n".join(parts), raising=CaptureError)
     return path
 
 

@@ -222,7 +222,7 @@ def in_folder(folder: Path) -> Iterator[None]:
     try:
         yield
     except CaptureError as error:
-        if str(error).startswith(str(folder)):
+        if str(error).startswith(tuple(f"{folder}{end}" for end in ("/", ":", ","))):
             raise
         named = folder if error.file is None else Path(error.file)
         file = named if named == folder or folder in named.parents else folder / named

@@ -113,7 +113,7 @@ class CaptureCollection:
             surface = find_surface_file(folder, settings)
             if surface is not None and not surface.is_file():
                 raise CaptureError(f"{surface.name}: the surface of capture.toml is missing", file=surface)
-        except (CaptureError, soundfile.LibsndfileError, OSError) as error:
+        except (CaptureError, soundfile.LibsndfileError, OSError, TypeError) as error:
             # One row that cannot be read makes `read_capture` refuse the folder.
             return ObjectReport(facts, 0, (str(error),))
         return ObjectReport(facts, len(files))

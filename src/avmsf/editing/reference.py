@@ -200,7 +200,7 @@ def _read_clip(path: Path, *, sample_rate: float) -> Float[Tensor, " samples"]:
     def note(message: str, name: str, value: float | tuple[float, float] | None = None) -> None:
         warnings.warn(AvmsfWarning(message, file=path, name=name, value=value), stacklevel=3)
 
-    clipped = find_clipping(mono.response(), name=mono.name)
+    clipped = find_clipping(mono.channel(1), name=mono.name)
     if clipped is not None:
         note(clipped, "clipping")
     if second is not None:

@@ -43,7 +43,7 @@ def write_faust(
         field = field if kept else field.without_noise()
     field = field if held <= contacts else field.take(field.spread(contacts))
     text = faust_library(field)
-    if path.suffix == ".dsp":
+    if path.suffix.lower() == ".dsp":
         text += _CONTROLS.format(*(field.average_force * factor for factor in (1.0, 100.0, 0.001)))
     remarks = ["all impacts share one bank of resonators; the force of an impact is half a sine over the contact time"]
     if not field.shared_damping:

@@ -31,7 +31,7 @@ ObjectKind = Literal["mesh", "gaussians", "points"]
 
 
 def read_object(
-    source: Path | Surface | None, points: Float[Tensor, "points 3"], *, meters: float = 1.0
+    source: str | Path | Surface | None, points: Float[Tensor, "points 3"], *, meters: float = 1.0
 ) -> tuple[ObjectKind, bytes, tuple[str, ...]]:
     """Return an object for a field at `points`: its kind, its file, and notes on differences from the given one.
 
@@ -41,6 +41,7 @@ def read_object(
     """
     if source is None:
         return "points", b"", ()
+    source = Path(source) if isinstance(source, str) else source
     if isinstance(source, Surface):
         scene = trimesh.Scene([trimesh.Trimesh(source.vertices.numpy(), source.faces.numpy(), process=False)])
     elif read_gaussians(source, points) is not None:
@@ -116,7 +117,7 @@ def _check_fits(
 
 
 def read_vertices(
-    source: Path | Surface | None, sampled: SampledField, *, meters: float = 1.0
+    source: str | Path | Surface | None, sampled: SampledField, *, meters: float = 1.0
 ) -> tuple[dict[str, Tensor], Path | None]:
     """Return the arrays of an object to show, by their names in glTF, and the file if it has Gaussians.
 
@@ -127,14 +128,15 @@ def read_vertices(
     """
     if source is None:
         return {"POSITION": sampled.points, "NORMAL": sampled.normals}, None
+    source = Path(source) if isinstance(source, str) else source
     if isinstance(source, Surface):
         mesh = TexturedMesh.plain(source)
-    elif (cloud := read_gaussians(source, sampled.points)) is not None:
+    elif (cloud := read_gaussians(source, sampled.extent)) is not None:
         normals = sampled.normals[sampled.nearest(cloud.centers)]
         return {"POSITION": cloud.centers, "NORMAL": normals, "COLOR_0": cloud.colors}, source
     else:
         mesh = read_textured_mesh(source, meters=meters)
-    _check_fits(mesh.vertices.double().numpy(), sampled.points, source)
+    _check_fits(mesh.vertices.double().numpy(), sampled.extent, source)
     # Vertices are split where normals or colors differ between faces.
     corners = torch.cat([mesh.vertices[mesh.faces], mesh.normals, mesh.corner_colors], dim=2).reshape(-1, 9)
     table, rows = np.unique(corners.numpy(), axis=0, return_inverse=True)

@@ -59,6 +59,8 @@ class SampledField:
     """Name of the object."""
     supporting: tuple[int, ...] = ()
     """Columns of the modes' tensors that are supporting poles, see `SoundField.is_mode`."""
+    box: Float[Tensor, "corners 3"] | None = None
+    """Lowest and highest corner of the object's own points, object frame, meters; None where only these are known."""
 
     @classmethod
     def of(
@@ -73,7 +75,7 @@ class SampledField:
         """Return the field at `points` (object frame, meters), by default at its own that lie on the object.
 
         More than `limit` points are reduced to evenly spread ones. `normals` are outward normals; by default those of
-        the field's body, or without a body estimated from the points. `directions` are those of the impacts at given
+        the field's body, or without a body estimated from its points. `directions` are those of the impacts at given
         points, as in `SoundField.render`; one of length zero is against the normal. Raises `ExportError` for no
         points, points that are not finite, and a field without a mode below half the sample rate.
         """
@@ -85,8 +87,10 @@ class SampledField:
             normals, directions = (None if each is None else each[rows] for each in (normals, directions))
         if normals is None:
             normals = sound_field.gain_field.normals(places)
+        own = sound_field.gain_field.points.detach()
         if normals is None:
-            normals = outward_normals(places)
+            # Of all its points: a few do not tell how the surface lies.
+            normals = outward_normals(own)[nearest_points(own, places)[:, 0]]
         if directions is not None:
             normals = torch.where(directions.any(1, keepdim=True), -directions.double(), normals.double())
         audible = torch.nonzero(sound_field.audible).flatten()
@@ -107,12 +111,18 @@ class SampledField:
             sound_field.residual.force,
             sound_field.origin.capture,
             supporting_columns(sound_field),
+            torch.stack([own.amin(0), own.amax(0)]),
         )
 
     @property
     def samples(self) -> int:
         """Length of the training sounds."""
         return len(self.noise)
+
+    @property
+    def extent(self) -> Float[Tensor, "places 3"]:
+        """Places that span the object, meters: the corners of its box, or where it is not known the contacts."""
+        return self.points if self.box is None else self.box
 
     @property
     def average_force(self) -> float:

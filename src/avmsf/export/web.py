@@ -65,8 +65,8 @@ def make_bundle(
     strikes: Impacts | None = None,
 ) -> Bundle:
     """Return a field's bundle, with options as `write_webpage`. Raises `ExportError`."""
-    kind, shown, notes = read_object(object, field.points, meters=meters)
-    other, triangles, further_notes = read_object(surface, field.points)
+    kind, shown, notes = read_object(object, field.extent, meters=meters)
+    other, triangles, further_notes = read_object(surface, field.extent)
     content, places = pack(_tensors(field))
     files, name = {"field.bin": content}, _OBJECTS[kind]
     if name is not None:

@@ -103,8 +103,7 @@ def write_folder(
     check_free(folder, folder=True, overwrite=overwrite)
     record = {"generator": generator(), **manifest, "files": [*sorted(files), MANIFEST]}
     contents = {**files, MANIFEST: (json.dumps(record, indent=1) + "\n").encode()}
-    # What a link leads to is replaced, and the link stays.
-    with new_folder(folder.resolve(), raising=ExportError, replace=overwrite) as begun:
+    with new_folder(folder, raising=ExportError, replace=overwrite) as begun:
         for name, content in contents.items():
             (begun / name).parent.mkdir(parents=True, exist_ok=True)
             (begun / name).write_bytes(content)

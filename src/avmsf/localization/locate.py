@@ -166,6 +166,8 @@ def locate_impacts(
         own = resampled[start : min(end, start + field.samples)].double()
         if number:
             own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
+        if chosen.from_peaks:
+            own = own[int(own.abs().argmax()) :]
         seconds = onset / whole.sample_rate
         try:
             located = assess_match(finder.locate(own.float(), highest=highest, force=force))

@@ -87,10 +87,11 @@ def open_recording(
         raise LocationError.expected("a SoundField, as of avmsf.load(path)", type(field).__name__, name="field")
     if isinstance(recording, str | Path):
         recording = read_recording(Path(recording))
-    own = replace(field.origin.settings, align=True)
+    time_zero = "peak" if field.origin.settings.from_peaks else "onset"
+    own = replace(field.origin.settings, align=True, time_zero=time_zero)
     if not isinstance(recording, Recording):
         with location_errors():
-            samples, own = as_samples(recording, "recording").double().numpy(), CaptureSettings()
+            samples, own = as_samples(recording, "recording").double().numpy(), CaptureSettings(time_zero=time_zero)
         rate = field.sample_rate if sample_rate is None else sample_rate
         recording = Recording("the recording", samples[None], rate, "FLOAT")
     elif sample_rate is not None and sample_rate != recording.sample_rate:
@@ -110,8 +111,8 @@ def open_recording(
         response_channel=channel if channel is not None and channel <= count else None,
     )
     with location_errors():
-        response = recording.response(chosen.response_channel, force_channel=chosen.force_channel)
-    clipped = find_clipping(response, name=recording.name)
+        number = recording.response_channel(chosen.response_channel, force_channel=chosen.force_channel)
+        clipped = find_clipping(recording.channel(number), name=recording.name)
     return recording, chosen, [] if clipped is None else [clipped]
 
 

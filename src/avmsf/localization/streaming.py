@@ -204,7 +204,10 @@ class StreamingLocalizer:
         # As in recordings.
         behind = min(len(self.residual), self.clock - pending.onset + round(_ONSET_SEARCH_SECONDS * self.rate))
         there = self.residual[len(self.residual) - behind :]
-        pending.onset = self.clock - behind + find_onset(there.numpy(), sample_rate=self.rate)
+        start = find_onset(there.numpy(), sample_rate=self.rate)
+        if self.locator.field.origin.settings.from_peaks:
+            start += int(there[start : start + self.window].abs().argmax())
+        pending.onset = self.clock - behind + start
         if self.clock < pending.onset + self.window:
             return None
         pending.answered = True

@@ -89,8 +89,9 @@ def draw_gains(
     """
     frequency = bank.frequency
     strongest = torch.argsort(gains.square().mean(0) / bank.damping, descending=True)[:most]
-    columns = min(3, len(strongest))
-    rows = math.ceil(len(strongest) / columns)
+    # Poles that are all without a pitch leave no mode to draw.
+    columns = max(1, min(3, len(strongest)))
+    rows = max(1, math.ceil(len(strongest) / columns))
     places, plane = points.double().numpy(), plane_of(points.double().numpy())
     view = view_from(_SIDE) if plane is None else plane
     seen = places @ view.T

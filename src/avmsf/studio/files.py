@@ -78,6 +78,10 @@ class Showcase:
         # By revision, so that a page never reads one's manifest with another's numbers.
         file = {"file": f"revisions/{revision.number}/field.bin"}
         manifest["tensors"] = {name: {**tensor, **file} for name, tensor in manifest["tensors"].items()}
+        shapeless = revision.field is None or revision.field.gain_field.body is None
+        if shapeless and self.editor is not None and find_object(self.opened) is None:
+            # Points that only fill the space between contacts have no sides, and impacts there no known direction.
+            del manifest["tensors"]["normals"]
         made = Shown(manifest, files, sampled, revision, remarks)
         # A page may still be reading the files of the revisions before. A new dict: others read it meanwhile.
         self._shown = dict([*self._shown.items(), (revision.number, made)][-4:])
@@ -107,7 +111,7 @@ class Showcase:
             found = resample(before.sampled, before.revision.field, field)
             return sample(field, before.sampled.points, before.sampled.normals) if found is None else found
         sampled = SampledField.of(field, _thinned(points_on_object(field.gain_field), MAX_POINTS))
-        return replace(sampled, points=(sampled.points.double() / field.gain_field.length).float())
+        return replace(sampled, points=(sampled.points.double() / field.gain_field.length).float(), box=None)
 
     def _is_other_field(self, revision: Revision) -> bool:
         """Whether a revision is of another field than the one shown before it, or of the first."""
@@ -122,7 +126,7 @@ class Showcase:
             points = read_splats(path).centers
         else:
             impacts = [] if self.editor is None else self.editor.impacts()
-            contacts = [each["contact"] for each in impacts if each["digest"]]
+            contacts = list(dict.fromkeys(tuple(each["contact"]) for each in impacts if each["digest"]))
             if len(contacts) >= 2:
                 points = FeatureField.from_contacts(torch.tensor(contacts, dtype=torch.float64)).points
             else:
@@ -174,7 +178,7 @@ def _thinned(points: Float[Tensor, "points 3"], most: int) -> Float[Tensor, "kep
 def sample(field: SoundField, points: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"]) -> SampledField:
     """Return the table of a field at points of the object that it was fitted to, meters."""
     sampled = SampledField.of(field, points.double() * field.gain_field.length, normals)
-    return replace(sampled, points=points)
+    return replace(sampled, points=points, box=None)
 
 
 def resample(sampled: SampledField, before: SoundField, after: SoundField) -> SampledField | None:
@@ -197,4 +201,5 @@ def resample(sampled: SampledField, before: SoundField, after: SoundField) -> Sa
         damping=sampled.damping[..., columns] * change,
         gains=(sampled.gains[:, columns] * factor).to(torch.complex64),
         supporting=supporting_columns(after),
+        name=after.origin.capture,
     )

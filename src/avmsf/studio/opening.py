@@ -2,13 +2,14 @@
 
 import filecmp
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from avmsf._utils.files import copy_whole
 from avmsf.capture.filenames import SHAPE_SUFFIXES, SPLATS, find_surface_file
 from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
+from avmsf.capture.table import is_inside
 from avmsf.errors import StudioError
 from avmsf.gaussians.ply import holds_gaussians
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE
@@ -128,12 +129,16 @@ def _named_by(mesh: Path) -> Iterator[Path]:
     """Yield the files that a Wavefront mesh refers to: its materials and their textures."""
     if mesh.suffix.lower() != ".obj":
         return
-    for name in _MATERIALS.findall(mesh.read_text(errors="replace")):
-        material = mesh.parent / Path(name).name
-        if material.is_file():
-            yield material
-            names = _TEXTURES.findall(material.read_text(errors="replace"))
-            yield from (path for name in names if (path := mesh.parent / Path(name).name).is_file())
+    for material in _found(mesh.parent, _MATERIALS.findall(mesh.read_text(errors="replace"))):
+        yield material
+        yield from _found(mesh.parent, _TEXTURES.findall(material.read_text(errors="replace")))
+
+
+def _found(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield the files of a folder that these are the paths of, or else the last parts of a path, as readers do."""
+    for name in names:
+        inside = [folder / each for each in (name, Path(name).name) if is_inside(PurePosixPath(each))]
+        yield from [path for path in inside if path.is_file()][:1]
 
 
 def _copy(sources: Mapping[Path, Path]) -> None:

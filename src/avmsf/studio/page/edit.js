@@ -111,7 +111,7 @@ export function editTab(studio, load) {
     const title =
       mode === null
         ? "Choose a mode in the tab Modes."
-        : `Mode ${studio.bank}, now at ${studio.modes.frequency(mode).toFixed(1)} Hz.`;
+        : `Mode ${studio.bank + 1}, now at ${studio.modes.frequency(mode).toFixed(1)} Hz.`;
     modeTitle.textContent = title + (count ? ` Changed modes: ${count}.` : "");
     const values = ofModes.get(studio.bank) ?? {};
     for (const [which, slider] of Object.entries(modeSliders)) {

@@ -57,6 +57,8 @@ function showTitle({ bundle: { manifest }, live }) {
 async function startSound(studio) {
   at("charts").hidden = false;
   studio.spectra = new SpectrumView(at("spectrum"), at("decay"));
+  // The panel can be used before there is sound.
+  studio.spectra.listen(studio.modes, null);
   try {
     studio.engine = await SoundEngine.start(studio.bundle);
   } catch (error) {

@@ -4,7 +4,7 @@ import { signScale } from "./colors.js";
 import { button, element, faint, seconds, section, smallButton } from "./dom.js";
 
 const COLUMNS = [
-  ["mode", "#", "Index of the mode in the field, from 0"],
+  ["mode", "#", "Number of the mode in the field, from 1"],
   ["frequency", "Frequency, Hz", "Damped frequency"],
   ["decay", "Decay, s", "Time in which the mode decays by 60 dB"],
   ["level", "Level, dB", "Relative to the loudest mode, at the last contact"],
@@ -47,7 +47,7 @@ export function modesTab(studio) {
   };
   const rowOf = ({ mode, frequency, decay, level }) => {
     // The button is for keys and for who does not see; a click anywhere in its row presses it.
-    const choose = smallButton(String(mode + 1), () => {});
+    const choose = smallButton(String((studio.live?.rows?.[mode] ?? mode) + 1), () => {});
     choose.ariaPressed = String(mode === studio.mode);
     choose.title = `Color the object by the gain of the mode at ${frequency.toFixed(1)} Hz`;
     choose.ariaLabel = choose.title;
