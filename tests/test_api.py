@@ -120,6 +120,10 @@ def test_lists_and_arrays_sound_like_tensors(kind):
     if not isinstance(given, list):
         given[0] = 5.0
         assert float(impacts.contacts.max()) < 5.0
+    # Directions of any length count as unit vectors, and one of length zero as none.
+    directions = kind([[0.0, 0.0, -0.5], [0.0, 0.0, 0.0]])
+    made = Impacts.of(contacts=kind(contacts), sounds=sounds, sample_rate=48_000.0, directions=directions)
+    assert made.directions.tolist() == [[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]
     assert field().render(kind(contacts), kind([[0.0, 0.0, -1.0]] * 2), 2).shape == sounds.shape
     assert field().known(kind(contacts)).mean.shape == (2, len(field().bank))
     assert field().relative_gain_std(kind(contacts)).shape == (2,)

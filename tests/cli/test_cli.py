@@ -16,6 +16,7 @@ import trimesh
 
 import avmsf
 from avmsf.capture import read_capture, write_capture
+from avmsf.capture.settings import settings_of
 from avmsf.cli import VERBS, main
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.paths import OutputError
@@ -302,3 +303,12 @@ def test_the_peak_of_what_is_written_is_said(path: Path, capsys: Streams, level:
     assert np.abs(soundfile.read(output)[0]).max() == pytest.approx(10 ** (level / 20), rel=1e-4)
     # Quiet ones and those that clip are noted, once.
     assert err.count("--normalize peak") == (0 if level == -10 else 1)
+
+
+def test_info_reads_recordings_from_where_the_fields_sounds_start(capture, field, tmp_path, capsys):
+    made, settings = load(field), settings_of(capture).starting("peak")
+    origin = replace(made.origin, settings=settings, trained_on=())
+    save(replace(made, origin=origin, alignment=None), tmp_path / "peak.safetensors")
+    told, _ = results_of(capsys, "info", tmp_path / "peak.safetensors", "--capture", capture)
+    wanted = avmsf.evaluate(load(tmp_path / "peak.safetensors"), read_capture(capture, settings)).mean()
+    assert told["compared_with"]["scores"]["field"] == pytest.approx(wanted)

@@ -39,11 +39,12 @@ from avmsf.field.gains.attention import Attention
 from avmsf.field.gains.symmetry import Symmetric
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh import Surface
+from avmsf.modal.extraction.alignment import align
 from avmsf.pipeline.config import PipelineConfig
 from avmsf.pipeline.fit import fit
 from avmsf.simulate.ground_truth import TRUTH, read_truth, write_truth
 from factories.delayed_plate import delays, strikes
-from factories.plate_field import QUICK
+from factories.plate_field import QUICK, plate_fit
 from factories.plate_set import PlateInputs, fill_plates, plate_named
 from factories.raising import raises
 from oracles.plate import plate_surface_points
@@ -268,6 +269,12 @@ def test_edits_among_other_objects_or_of_other_features_are_not_mixed(plates: Pa
     assert results.identity()["methods"]["unedited"]["encoder"] == "descriptors"
     with raises(EvaluationError, file=results.path, name="among.c"):
         plan("abc").begin(results)
+
+
+def test_recordings_at_another_rate_are_refused_before_they_are_aligned() -> None:
+    made = replace(plate_fit(replace(QUICK, warmup_steps=4, steps=2)), alignment=align(strikes(8, starts=delays(8))))
+    with raises(EvaluationError, name="sample_rate"):
+        evaluate(made, replace(strikes(8), sample_rate=2000.0))
 
 
 def test_stored_sounds_have_the_recordings_rate(tmp_path: Path) -> None:

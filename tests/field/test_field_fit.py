@@ -285,3 +285,9 @@ def test_resolutions_follow_the_sample_rate():
     assert PAPER.resolutions(48000.0)[1] == (64, 64, 64, 64)
     assert PAPER.interleave == 1, "the paper compares all frames at every step"
     assert FitConfig(fft_sizes=(24,)).resolutions(400.0)[0] == (6,)
+
+
+def test_a_fit_needs_no_gradients_of_its_caller():
+    with torch.no_grad():
+        found = plate_fit(SHORT)
+    assert same(found, short_fit())

@@ -226,3 +226,14 @@ def test_edits_and_supporting_poles_that_cannot_be_are_refused(report, name, tmp
     damaged = replace(field, origin=replace(field.origin, report={**field.origin.report, **report}))
     with raises(FieldFileError, name=f"origin.report.{name}"):
         damaged.save(tmp_path / "field.safetensors")
+
+
+def test_files_are_of_one_type_whatever_that_of_forces_or_torchs_default(tmp_path):
+    impacts, path = plate_impacts(forces=True), tmp_path / "plate.safetensors"
+    save(plate_fit(CONFIG, train=replace(impacts, forces=impacts.forces.double())), path)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert load(path).bank.frequency.dtype == torch.float64
+        save(plate_fit(CONFIG, train=impacts), path)
+    finally:
+        torch.set_default_dtype(torch.float32)

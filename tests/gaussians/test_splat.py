@@ -78,6 +78,10 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
             splat(others, settings, checkpoint=place)
 
 
+def test_a_background_of_whole_numbers_is_a_color() -> None:
+    assert choose_background([], replace(QUICK, background=(1, 1, 1))).dtype == torch.float32
+
+
 def test_a_checkpoint_is_of_the_views_whatever_their_cameras_were_asked(tmp_path: Path) -> None:
     start = visual_hull(ball_views(12), points=200)
     views = [replace(view, camera=replace(view.camera)) for view in ball_views(12)]

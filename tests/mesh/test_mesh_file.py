@@ -167,3 +167,16 @@ def test_parts_of_a_scene_stay_where_they_lie(tmp_path: Path) -> None:
     assert surface.faces.shape == (24, 3)
     assert surface.faces.max() == len(surface.vertices) - 1
     assert [surface.vertices[:, 0].min(), surface.vertices[:, 0].max()] == pytest.approx([-0.05, 0.25], rel=1e-6)
+
+
+@pytest.mark.parametrize("material", [{}, {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}])
+def test_16_bit_colors_beside_a_material_are_read(tmp_path: Path, material: dict) -> None:
+    body = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + np.full((3, 4), 32768, "<u2").tobytes()
+    views = [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 24}]
+    places = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
+    colors = {"bufferView": 1, "componentType": 5123, "normalized": True, "count": 3, "type": "VEC4"}
+    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "material": 0}
+    scene = {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}]}
+    parts = {"accessors": [places, colors], "bufferViews": views, "buffers": [{"byteLength": 60}]}
+    (tmp_path / "a.glb").write_bytes(glb({**scene, **parts, "materials": [material]}, body))
+    assert np.allclose(read_textured_mesh(tmp_path / "a.glb").corner_colors, 0.5, atol=0.01)

@@ -145,6 +145,17 @@ def test_what_encloses_nothing_or_reaches_the_edge_is_refused() -> None:
             enclose(values - 0.5, Grid(np.zeros(3), 0.1, values.shape))
 
 
+@pytest.mark.parametrize("library", [None, "newmtl skin\nKd 1 1 1\nmap_Kd -s 1 1 1 skin.png\n"])
+def test_a_texture_that_trimesh_does_not_find_is_warned_of(tmp_path: Path, library: str | None) -> None:
+    Image.new("RGB", (4, 4), "red").save(tmp_path / "skin.png")
+    shape = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+    (tmp_path / "card.obj").write_text(f"mtllib card.mtl\nusemtl skin\n{shape}")
+    if library:
+        (tmp_path / "card.mtl").write_text(library)
+    with warns(CaptureWarning, file="card.obj", name="texture" if library else "colors"):
+        assert bool((read_textured_mesh(tmp_path / "card.obj").corner_colors == GRAY).all())
+
+
 def test_meshes_that_threads_thin_at_a_time_are_those_of_one_thread():
     spheres = [trimesh.creation.icosphere(4, radius) for radius in (1.0, 2.0)]
     alone = [decimated(each.vertices, each.faces, 300)[0] for each in spheres]

@@ -21,10 +21,11 @@ from avmsf.gaussians.ply import write_splats
 from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.mesh import Surface
 from avmsf.photographs.folder import write_frames
-from avmsf.pipeline.config import PRESETS, LiftConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig
 from avmsf.pipeline.features import finish_features
-from avmsf.pipeline.scene import shape_of_cloud, without_far
+from avmsf.pipeline.scene import SceneStages, shape_of_cloud, without_far
 from avmsf.pipeline.shape import OFF_MESH, moved_onto
+from avmsf.pipeline.stages import StageFolder
 from avmsf.pipeline.visual_checks import expect_contacts_in_views, expect_mesh_in_views
 from factories.ball_views import MIDDLE, RADIUS
 from factories.clouds import cloud, random_cloud
@@ -221,3 +222,11 @@ def test_given_gaussians_are_read_and_an_object_that_nothing_shows_is_refused(tm
     assert torch.equal(looks.cloud("shown", views=12).centers, given.centers)
     with pytest.raises(SceneError):
         looks.cloud("hidden")
+
+
+def test_gaussians_need_no_cameras_of_pictures_beside_them(tmp_path: Path) -> None:
+    write_splats(random_cloud(200), tmp_path / "splats.ply")
+    (tmp_path / "walk.mp4").touch()
+    made = SceneStages(tmp_path, StageFolder(tmp_path / "cache"), SceneConfig(), settings=CaptureSettings())
+    assert made.source is None
+    assert "motion" not in made.stages

@@ -1,5 +1,6 @@
 """Stages and the settings that decide them."""
 
+import json
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -8,6 +9,7 @@ from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import avmsf
@@ -24,6 +26,7 @@ from avmsf.pipeline.bodies import candidate_bodies
 from avmsf.pipeline.config import PRESETS, BodyConfig, LiftConfig, PipelineConfig, ViewsConfig
 from avmsf.pipeline.fit import RECORD, fit_in_stages, with_record
 from avmsf.pipeline.stages import Pipeline, Stage, StageFolder
+from avmsf.pipeline.views import find_source
 from factories.plate_capture import fill_plate
 from factories.plate_field import plate_impacts
 from factories.raising import raises
@@ -250,3 +253,17 @@ def test_a_field_knows_the_configuration_that_made_it() -> None:
     config = PRESETS["paper"]
     now = with_record(field, config, {"scene": asdict(config.scene)}).origin.report[RECORD]
     assert {**now, "fit": asdict(config.fit)} == {**asdict(config), "encoder": None}
+
+
+def test_photographs_count_by_content_wherever_the_camera_file_names_them(tmp_path: Path) -> None:
+    (tmp_path / "train").mkdir()
+    image = tmp_path / "train" / "a.png"
+    image.write_bytes(b"1")
+    frame = {"file_path": "./train/a", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": [frame]}))
+    before = find_source(tmp_path, CaptureSettings()).digest
+    # What another command wrote there is none of them.
+    (tmp_path / "gaussians.ply").touch()
+    assert find_source(tmp_path, CaptureSettings()).digest == before
+    image.write_bytes(b"2")
+    assert find_source(tmp_path, CaptureSettings()).digest != before

@@ -278,3 +278,5 @@ def test_a_roving_mass_shifts_frequencies_as_it_does_in_the_equations_of_motion(
         mass = np.eye(len(shape)) + share * plate.mass * np.outer(shape, shape)
         squares = scipy.linalg.eigh(np.diag(plate.frequency.numpy() ** 2), mass, eigvals_only=True)
         np.testing.assert_allclose(factor.numpy(), warm * np.sqrt(squares) / plate.frequency.numpy(), rtol=1e-6)
+    # A heavy one does not turn them below zero.
+    assert (frequency_factors(plate, vibration, places, replace(Imperfections.none(), sensor=0.5)) > 0).all()

@@ -295,3 +295,11 @@ def test_a_tube_of_twelve_sides_is_nearly_round_and_yet_has_an_order():
     assert test.holds(test.squared_errors(Motions.about(MIDDLE, rotations(Z, [0.3, 0.9, 2.0]))))
     group, _ = find_group(test, [turn(Z, math.pi)])
     assert [order for _, order, _ in group.axes()] == [12]
+
+
+def test_points_in_one_place_count_once():
+    ball = trimesh.creation.uv_sphere(count=[12, 12])
+    assert find_symmetries(torch.tensor(ball.vertices[ball.faces].reshape(-1, 3)), seed=0).tolerance > 0
+    few = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)).repeat(3, 1)
+    with raises(SceneError, name="points", value=100):
+        find_symmetries(few)

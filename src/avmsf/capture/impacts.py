@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
-from avmsf._utils.arrays import ArrayLike, as_forces, as_rate, as_vectors
+from avmsf._utils.arrays import ArrayLike, as_directions, as_forces, as_rate, as_vectors
 from avmsf._utils.caching import content_digest
 from avmsf.errors import ArrayError
 
@@ -78,7 +78,7 @@ class Impacts:
             as_vectors(sounds, "sounds", count=count, size=None).float(),
             as_rate(sample_rate),
             named,
-            None if directions is None else as_vectors(directions, "directions", count=count).float(),
+            None if directions is None else as_directions(directions, "directions", count=count).float(),
             None if forces is None else as_forces(forces, "forces", count=count).float(),
         )
 

@@ -66,8 +66,9 @@ class Options(Common):
 
     @property
     def is_dataset(self) -> bool:
-        """Whether the folder is a dataset: it holds no recordings itself."""
-        return not (self.capture / TABLE).is_file() and not any(self.capture.glob("*.wav"))
+        """Whether the folder is a dataset: it holds captures, or no recordings itself."""
+        captures, recordings = (any(self.capture.glob(pattern)) for pattern in (f"[!.]*/{TABLE}", "*.wav"))
+        return not (self.capture / TABLE).is_file() and (captures or not recordings)
 
     def _check(self) -> None:
         if self.is_dataset:
@@ -115,7 +116,8 @@ def run(options: Options) -> int:
     said = {str(each) for each in warned} & of_units
     lines += [each for each in problems if each not in said]
     if not options.write_settings:
-        lines += [f"proposed: {each.line} (--write-settings writes it). {each.reason}" for each in proposals]
+        how = f"add it to {SETTINGS}" if (options.capture / SETTINGS).exists() else "--write-settings writes it"
+        lines += [f"proposed: {each.line} ({how}). {each.reason}" for each in proposals]
     elif not proposals:
         left = "; settings that the messages above name are yours to choose" if problems else ""
         lines.append(f"the folder's files determine no further setting: nothing was written{left}")

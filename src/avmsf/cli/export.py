@@ -213,7 +213,9 @@ def _for_format(field: "SoundField", options: Options) -> "tuple[SoundField | Sa
             if options.capture is not None and field.origin.report.get(EDITS):
                 note("the field is edited, so the page has no recordings to compare it with")
             elif options.capture is not None:
-                settings["strikes"] = read_capture(options.capture).impacts
+                # From where the field's sounds start.
+                starting = settings_of(options.capture).starting(field.origin.settings.time_zero)
+                settings["strikes"] = read_capture(options.capture, starting).impacts
         case "gltf":
             shown, meters = _object(field, options)
             settings = {"object": shown, "meters": meters, "up": options.up}

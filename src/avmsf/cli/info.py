@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from avmsf._utils.text import counted
+from avmsf.capture.settings import settings_of
 from avmsf.cli.options import Common, Flag, expect_capture
 from avmsf.cli.output import doing, next_command, print_json, say, show
 from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, kind_of
@@ -78,7 +79,9 @@ def _describe_field(options: Options) -> None:
     compared = None
     if options.capture is not None:
         doing("comparing the field with the capture's recordings")
-        read = read_capture(options.capture)
+        # Its sounds start where those of the recordings did that it was fitted to.
+        settings = settings_of(options.capture).starting(field.origin.settings.time_zero)
+        read = read_capture(options.capture, settings)
         impacts, trained = read.impacts, field.origin.trained_on if read.name == field.origin.capture else ()
         others = [row for row, name in enumerate(impacts.names) if name not in trained]
         what = "all of them training recordings"

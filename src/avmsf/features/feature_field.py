@@ -199,4 +199,5 @@ def _check_record(record: dict[str, Any]) -> None:
 
 def _skeleton(record: dict[str, Any]) -> dict[str, Tensor]:
     points, dim = (record["sizes"][name] for name in ("points", "dim"))
-    return {name: torch.empty(points, size, device="meta") for name, size in (("points", 3), ("features", dim))}
+    sizes = {"points": (points, 3), "features": (points, dim)}
+    return {name: torch.empty(size, dtype=torch.float32, device="meta") for name, size in sizes.items()}

@@ -195,7 +195,7 @@ def thinned(mesh: Trimesh, *, log: Callable[[str], None]) -> Trimesh:
     # Quadrics follow each noisy corner, and tie the mesh into knots.
     noisy = rough >= TOLERANCES.min_roughness_deg
     even = averaged(mesh, math.ceil(_ROUNDS * count / most)) if noisy else mesh
-    tolerance, places = TOLERANCES.max_distance * 2.0 * abs(_volume(even.triangles)) / even.area, even_points(even)
+    tolerance, places = TOLERANCES.max_distance * 2.0 * abs(_held(even)) / even.area, even_points(even)
     for target in (enough, 2 * enough, most):
         found = simplified(even, target, like=mesh)
         distances = ClosestPoints(found.triangles)(places).distances

@@ -32,6 +32,7 @@ _SPREAD_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Spread shares that are tried."""
 
 
+@torch.enable_grad()
 def fit(
     train: Impacts,
     features: FeatureField,
@@ -108,7 +109,7 @@ def _with_noise(field: SoundField, train: Impacts) -> SoundField:
     if not config.residual or config.noise_rate or not config.steps:
         return field
     modes = field.render(train.contacts, directions=train.directions, noise=False)
-    forces = torch.ones(len(train)) if train.forces is None else train.forces
+    forces = (torch.ones(len(train)) if train.forces is None else train.forces).to(train.sounds)
     # In recordings that are not divided by their forces, the background has one level.
     average = float(forces.log().mean().exp())
     relative = (forces / average)[:, None]

@@ -214,8 +214,10 @@ class SoundField:
         return (parts.double().square().sum(2) * self.audible / (4.0 * self.bank.damping.double())).sum(1)
 
     def aligned(self, impacts: Impacts) -> Impacts:
-        """Return recordings of the object with the starts that the field's sounds have."""
-        return impacts if self.alignment is None else self.alignment.apply(impacts)
+        """Return recordings of the object with the starts that the field's sounds have; as they are at another rate."""
+        if self.alignment is None or impacts.sample_rate != self.sample_rate:
+            return impacts
+        return self.alignment.apply(impacts)
 
     def gains(self, contacts: ArrayLike, *, directions: ArrayLike | None = None) -> Float[Tensor, "contacts modes"]:
         """Return the signed amplitudes at the contacts (object frame, meters), in the unit of the training sounds.

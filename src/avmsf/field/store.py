@@ -176,13 +176,13 @@ def _skeleton(record: Mapping[str, Any]) -> dict[str, Tensor]:
         raise RecordError.expected(", ".join(_KINDS), kind, name="gains.kind")
     bank = torch.empty(modes, dtype=torch.float64, device="meta")
     skeleton = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
-    skeleton["residual.magnitude"] = torch.empty(bins, device="meta")
+    skeleton["residual.magnitude"] = torch.empty(bins, dtype=torch.float32, device="meta")
     if sizes["recordings"] is not None:
         contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
         if gains.get("contacts") != contacts:
             wanted = f"{gains.get('contacts')} contacts as in gains"
             raise RecordError.expected(wanted, contacts, name="sizes.recordings")
-        skeleton["residual.recordings"] = torch.empty(contacts, length, device="meta")
+        skeleton["residual.recordings"] = torch.empty(contacts, length, dtype=torch.float32, device="meta")
     skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
     if (alignment := record["alignment"]) is not None:
         names, keys = (like(alignment[name], [], f"alignment.{name}") for name in ("names", "keys"))

@@ -36,7 +36,7 @@ def choose_background(views: Sequence[View], config: SplatConfig) -> Float[Tenso
     """
     masked = any(view.mask is not None for view in views)
     if not isinstance(config.background, str):
-        return torch.tensor(config.background)
+        return torch.tensor(config.background, dtype=torch.float32)
     if config.background == "random":
         if not masked:
             raise SceneError.expected(

@@ -42,7 +42,7 @@ _UNUSUAL = re.compile(rb"\A\xef\xbb\xbf|^[ \t]+[vf]|^[vf][^\n]*\t|^f[^\n]*[ /]-"
 """A byte-order mark, tabs or spaces where one space is usual, and negative indices."""
 _INTEGERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2"}
 _WIDTHS = {"VEC2": 2, "VEC3": 3, "VEC4": 4}
-_FLOAT32 = 5126
+_FLOAT32, _USHORT = 5126, 5123
 """Types of numbers in a glTF's accessors, and of what they form."""
 _COMPRESSED = {"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression": "meshoptimizer"}
 # Of a missing texture trimesh logs a traceback, which goes to the terminal where nothing else takes it.
@@ -86,7 +86,13 @@ def load_parts(path: Path) -> list[Any]:
         # A copy of a texture that is cut off would be gray without an error.
         if np.array_equal(transform, np.eye(4)):
             return [scene.geometry[name]]
-    return list(scene.dump())
+    parts: list[Any] = list(scene.dump())
+    for node, part in zip(nodes, parts, strict=True):
+        given = getattr(scene.geometry[scene.graph[node][1]], "visual", None)
+        # Copies lack the colors at vertices beside a material.
+        if isinstance(given, trimesh.visual.TextureVisuals) and "color" in given.vertex_attributes:
+            part.visual.vertex_attributes["color"] = given.vertex_attributes["color"]
+    return parts
 
 
 def _check_size(path: Path) -> None:
@@ -209,10 +215,12 @@ def _check_gltf(record: Any) -> None:
 
 
 def _normalized(record: Any) -> list[dict[str, Any]]:
-    """Return the accessors of positions, normals and texture coordinates whose integers stand for -1 to 1."""
+    """Return the accessors whose integers stand for -1 to 1; trimesh reads those of colors if they have 8 bits."""
     primitives = [each for mesh in record.get("meshes", ()) for each in mesh["primitives"]]
-    used = {row for each in primitives for name, row in each["attributes"].items() if not name.startswith("COLOR")}
-    chosen = (record["accessors"][row] for row in sorted(used))
+    kinds = {(name.startswith("COLOR"), row) for each in primitives for name, row in each["attributes"].items()}
+    accessors = record.get("accessors", ())
+    used = {row for color, row in kinds if not color or accessors[row]["componentType"] == _USHORT}
+    chosen = (accessors[row] for row in sorted(used))
     return [each for each in chosen if each.get("normalized") and each["componentType"] in _INTEGERS]
 
 

@@ -1,6 +1,7 @@
 """A triangle mesh with its colors, as scanners and modelling programs write it: obj, ply, glb or stl."""
 
 import math
+import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -125,8 +126,8 @@ def read_textured_mesh(path: str | Path, *, meters: float = 1.0) -> TexturedMesh
         wanted = "a mesh with triangles to render"
         advice = "export the mesh with its faces, or give the points as the capture's surface"
         raise CaptureError.expected(wanted, 0, got="none", file=path, name="faces", advice=advice)
-    lacking = _missing_images(path)
-    colors, coordinates, textures, remarks = zip(*(_paint(part, lacking) for part in parts), strict=True)
+    images = _images_of_obj(path)
+    colors, coordinates, textures, remarks = zip(*(_paint(part, images) for part in parts), strict=True)
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in parts]) * meters
     faces = np.concatenate([np.asarray(part.faces, dtype=np.int64) + start for part, start in zip(parts, offsets)])  # noqa: B905
@@ -157,11 +158,13 @@ def corner_normals(vertices: Float[np.ndarray, "points 3"], faces: Int[np.ndarra
     return np.where(sharp, flat, smooth)
 
 
+_PLACEHOLDER = trimesh.visual.material.empty_material().image.tobytes()
+"""What trimesh puts in place of a material that it does not find, 2 x 2 dark pixels."""
 _COLORLESS = CaptureWarning("has neither texture nor colors; it is rendered gray", name="colors")
 
 
 def _paint(
-    part: trimesh.Trimesh, lacking: dict[str, str]
+    part: trimesh.Trimesh, images: dict[str, str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, CaptureWarning | None]:
     """Return the colors and the places in its texture of a part's corners, the texture, and what is to be said."""
     visual: Any = part.visual
@@ -169,6 +172,8 @@ def _paint(
     coordinates, texture = np.zeros((len(faces), 3, 2)), np.full((1, 1, 3), 255, dtype=np.uint8)
     material: Any = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is not None and image.size == (2, 2) and image.tobytes() == _PLACEHOLDER:
+        image = None
     factor, name = getattr(material, "baseColorFactor", None), str(getattr(material, "name", ""))
     colors = np.full(3, GRAY)
     if visual.kind == "vertex":
@@ -183,31 +188,41 @@ def _paint(
         else:
             coordinates = np.nan_to_num(np.asarray(visual.uv, dtype=np.float64)[faces])
             colors = np.asarray([255.0] * 3 if factor is None else factor, dtype=np.float64)[:3] / 255.0
-    elif visual.kind == "texture" and name in lacking:
-        message = f"its texture {lacking[name]} is missing; the part is rendered gray"
-        remark = CaptureWarning(message, name="texture", value=lacking[name])
+    elif visual.kind == "texture" and name in images:
+        message = f"its texture {images[name]} is missing or cannot be placed; the part is rendered gray"
+        remark = CaptureWarning(message, name="texture", value=images[name])
     elif visual.kind == "texture" and (factor is not None or "kd" in getattr(material, "kwargs", {})):
         colors = np.asarray(material.main_color, dtype=np.float64)[:3] / 255.0
     else:
         remark = _COLORLESS
+    if visual.kind == "texture" and "color" in visual.vertex_attributes:
+        # A glTF's colors at vertices multiply those of its material.
+        own = trimesh.visual.color.to_rgba(np.array(visual.vertex_attributes["color"]))[faces][..., :3] / 255.0
+        colors, remark = own * (1.0 if remark else colors), None if remark is _COLORLESS else remark
     return np.broadcast_to(colors, (len(faces), 3, 3)), coordinates, texture, remark
 
 
-def _missing_images(path: Path) -> dict[str, str]:
-    """Return, for each material of an obj file whose image is not there, the image's name."""
+def _images_of_obj(path: Path) -> dict[str, str]:
+    """Return, for each material of an obj file that names an image, the image's path from the file's folder."""
     if path.suffix.lower() != ".obj":
         return {}
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lacking = {}
+    text, named = path.read_text(encoding="utf-8", errors="replace"), dict[str, str]()
     for library in re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, flags=re.MULTILINE):
         source = path.parent / library
-        if not source.is_file():
-            continue
-        material = ""
-        for line in source.read_text(encoding="utf-8", errors="replace").splitlines():
-            key, _, rest = line.strip().partition(" ")
-            if key == "newmtl":
-                material = rest.strip()
-            elif key.lower() == "map_kd" and rest.strip() and not (source.parent / rest.split()[-1]).is_file():
-                lacking[material] = rest.split()[-1]
-    return lacking
+        if source.is_file():
+            named |= {name: os.path.relpath(image, path.parent) for name, image in images_of_library(source).items()}
+    return named
+
+
+def images_of_library(path: Path) -> dict[str, Path]:
+    """Return, for each material of an mtl file that names an image, where the image should be."""
+    named, material = dict[str, Path](), ""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        key, _, rest = line.strip().partition(" ")
+        if key == "newmtl":
+            material = rest.strip()
+        elif key.lower() == "map_kd" and rest.strip():
+            # The name may hold blanks, or come after options.
+            whole = path.parent / rest.strip()
+            named[material] = whole if whole.is_file() else path.parent / rest.split()[-1]
+    return named

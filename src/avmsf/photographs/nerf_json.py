@@ -60,10 +60,9 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
 
     Gray where they have none; None where it names no file or there are no points.
     """
-    named = read_json_object(path, raising=CaptureError).get("ply_file_path")
-    if not isinstance(named, str) or not named:
+    cloud = points_file(path)
+    if cloud is None:
         return None
-    cloud = path.parent / named.replace("\\", "/")
     clouds: list[Any] = load_parts(cloud)
     if len(clouds) != 1:
         got, key = f"{len(clouds)} parts", "ply_file_path"
@@ -74,6 +73,12 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
     if painted.shape[:1] == points.shape[:1]:
         colors = painted[:, :3].astype(np.uint8)
     return (points, colors) if len(points) else None
+
+
+def points_file(path: Path) -> Path | None:
+    """Return the file of points that a transforms.json names; None where it names none."""
+    named = read_json_object(path, raising=CaptureError).get("ply_file_path")
+    return path.parent / named.replace("\\", "/") if isinstance(named, str) and named else None
 
 
 def _lens(settings: Mapping[str, Any], where: Location, fisheye: bool, image_width: int, image_height: int) -> Lens:

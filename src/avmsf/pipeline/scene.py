@@ -49,10 +49,10 @@ _SIZE = 256
 class SceneStages(Pipeline):
     """The stages that lead from a folder's photographs, video, mesh or Gaussians to features on the object.
 
-    Gaussians that lie in the folder are the object's; where there are no photographs beside them, pictures of them from
-    all sides are described. A mesh needs no Gaussians: its own surface is the object unless the settings say otherwise,
-    and pictures of it are described. `VIEWS` is the folder of views, `CLOUD` the file of Gaussians. Each raises what it
-    raises; SceneError where the folder shows nothing of the object.
+    Gaussians that lie in the folder are the object's; where no photographs with cameras are beside them, pictures of
+    them from all sides are described. A mesh needs no Gaussians: its own surface is the object unless the settings say
+    otherwise, and pictures of it are described. `VIEWS` is the folder of views, `CLOUD` the file of Gaussians. Each
+    raises what it raises; SceneError where the folder shows nothing of the object.
     """
 
     def __init__(
@@ -74,7 +74,9 @@ class SceneStages(Pipeline):
         found = find_source(folder, settings, prefer=config.views.source)
         meshed = found is not None and found.kind == "mesh"
         self.splats = None if meshed and config.views.source == "mesh" else find_splats(folder)
-        self.source: Source | None = None if self.splats and meshed else found
+        # Cameras that structure from motion would find are in another frame than the Gaussians.
+        placed = found is not None and found.kind == "cameras"
+        self.source: Source | None = None if self.splats and not placed else found
         super().__init__(stages, listener=listener or ProgressListener())
         if self:
             self.stages |= {stage.name: stage for stage in self._stages()}

@@ -161,8 +161,10 @@ def digest_of(path: Path) -> str:
 def digest_files(paths: Iterable[Path], *, root: Path) -> str:
     """Return a digest of files' contents and of their names relative to the folder `root`, in sorted order."""
     digest = hashlib.sha256()
-    for path in sorted(paths):
-        digest.update(f"{path.relative_to(root).as_posix()}\0{path.stat().st_size}\0".encode())
+    for path in sorted({*paths}):
+        # A camera file may name what lies outside of its folder.
+        name = Path(os.path.relpath(path, root)).as_posix()
+        digest.update(f"{name}\0{path.stat().st_size}\0".encode())
         with open(path, "rb") as file:
             # The digest of all goes on with each file, as the function returns it in place of a new one.
             hashlib.file_digest(file, lambda: digest)

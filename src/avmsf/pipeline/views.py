@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,14 +11,15 @@ import torch
 
 from avmsf.capture.filenames import SPLATS, VIDEO_SUFFIXES, find_surface_file, pictures_in
 from avmsf.capture.settings import CaptureSettings
-from avmsf.errors import SceneError
+from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.points import farthest_points
 from avmsf.mesh.textured_mesh import read_textured_mesh
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import MIN_VIEWS, View
 from avmsf.photographs.colmap import find_model
-from avmsf.photographs.folder import write_views
+from avmsf.photographs.folder import read_camera_file, write_views
 from avmsf.photographs.mesh_views import orbit_cameras, render_views
+from avmsf.photographs.nerf_json import points_file
 from avmsf.photographs.sfm import estimate_cameras
 from avmsf.photographs.video import pick_frames
 from avmsf.pipeline.config import ViewsConfig
@@ -63,10 +65,10 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
     surface = find_surface_file(folder, settings)
     shaped = surface is not None and surface.is_file()
     if (model is not None or transforms.is_file()) and not (prefer == "mesh" and shaped):
-        named = [transforms] if model is None else sorted(each for each in model.iterdir() if each.is_file())
-        return Source("cameras", (*named, *images, *masks, *sorted(folder.glob("*.ply"))), folder, folder)
+        parts = [transforms] if model is None else [each for each in model.iterdir() if each.is_file()]
+        return Source("cameras", (*parts, *_named_by_cameras(folder), *images, *masks), folder, folder)
     if surface is not None and shaped:
-        companions = (*pictures_in(surface.parent, deep=False), *sorted(surface.parent.glob("*.mtl")))
+        companions = (*pictures_in(surface.parent, deep=True), *sorted(surface.parent.glob("*.mtl")))
         return Source("mesh", (surface, *companions), surface, folder)
     if len(images) >= MIN_VIEWS or (images and photographs != folder):
         if len(images) < MIN_VIEWS:
@@ -81,6 +83,17 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
             "one video of the object", names, got=", ".join(names), file=folder, advice="remove the others"
         )
     return Source("video", tuple(videos), videos[0], folder) if videos else None
+
+
+def _named_by_cameras(folder: Path) -> list[Path]:
+    """Return the photographs, masks and points that the camera file names, wherever they are."""
+    # Where it cannot be read, who reads the views says why.
+    with suppress(CaptureError):
+        found = read_camera_file(folder)
+        named = [path for each in found.photographs for path in (each.image, each.mask)]
+        named.append(points_file(found.path) if found.path.suffix == ".json" else None)
+        return [path for path in named if path is not None and path.is_file()]
+    return []
 
 
 def find_splats(folder: Path) -> Path | None:

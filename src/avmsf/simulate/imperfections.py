@@ -51,13 +51,13 @@ def frequency_factors(
 ) -> Float64[Tensor, "contacts modes"]:
     """Return what multiplies the frequency of each damped mode in the recording of each contact.
 
-    A point mass m lowers the frequency of a mode of mass-normalized shape phi by m |phi|^2 / 2, to first order.
+    A point mass m lowers the frequency of a mode of mass-normalized shape phi to 1 / sqrt(1 + m |phi|^2) (Rayleigh).
     """
     shapes = torch.stack([modes.gains(places, axis.expand_as(places)) for axis in torch.eye(3, dtype=torch.float64)])
     parts = vibration.pushes.abs().square()
     loads = shapes.square().sum(0) @ (parts / parts.sum(1, keepdim=True)).T
     times = torch.linspace(0.0, 1.0, len(places), dtype=torch.float64)[:, None]
-    return (1.0 - 0.5 * imperfections.sensor * modes.mass * loads) * (1.0 - imperfections.warming * times)
+    return (1.0 + imperfections.sensor * modes.mass * loads).rsqrt() * (1.0 - imperfections.warming * times)
 
 
 def smooth_field(

@@ -145,7 +145,8 @@ class Showcase:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", CaptureWarning)
-                impacts = read_capture(self.opened.capture).impacts
+                settings = self.opened.settings.starting(field.origin.settings.time_zero)
+                impacts = read_capture(self.opened.capture, settings).impacts
         except CaptureError as error:
             return None, (f"recorded impacts are not shown: {error}",)
         if impacts.sample_rate != field.sample_rate:

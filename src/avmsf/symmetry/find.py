@@ -90,10 +90,7 @@ def _normalized(
     points: Float[Tensor, "points 3"],
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " 3"], float]:
     """Return the points about their middle in units of their diagonal, and both."""
-    if len(points) < _MIN_POINTS:
-        wanted = f"at least {_MIN_POINTS} points of a surface to find symmetries"
-        advice = "draw more points from it, or reconstruct with more Gaussians"
-        raise SceneError.expected(wanted, len(points), name="points", advice=advice)
+    _expect_enough(len(points))
     wrong = torch.nonzero(~torch.isfinite(points).all(dim=1)).flatten()
     if len(wrong):
         row = int(wrong[0])
@@ -105,9 +102,20 @@ def _normalized(
         wanted = "points all over an object's surface, not on one line or at one position"
         got = f"{len(points)} with an extent of {extent[0]:.3g}, {extent[1]:.3g} and {extent[2]:.3g} m"
         raise SceneError.expected(wanted, extent.tolist(), got=got, name="points")
+    # To each of several points in one place no area falls.
+    places = places[np.sort(np.unique(places, axis=0, return_index=True)[1])]
+    _expect_enough(len(places))
     # A box along the principal axes: the diagonal must not depend on how the object lies.
     diagonal = float(np.linalg.norm(np.ptp((places - middle) @ axes.T, axis=0)))
     return (places - middle) / diagonal, middle, diagonal
+
+
+def _expect_enough(count: int) -> None:
+    """Raise SceneError for too few points."""
+    if count < _MIN_POINTS:
+        wanted = f"at least {_MIN_POINTS} points of a surface to find symmetries"
+        advice = "draw more points from it, or reconstruct with more Gaussians"
+        raise SceneError.expected(wanted, count, name="points", advice=advice)
 
 
 _NEARLY_ROUND = 8

@@ -12,7 +12,7 @@ from torch import Tensor
 from avmsf.capture.audio import read_recording
 from avmsf.capture.impacts import Impacts
 from avmsf.capture.onset import find_onset
-from avmsf.modal.extraction.alignment import align, coherence
+from avmsf.modal.extraction.alignment import _common_onset, align, coherence
 from avmsf.modal.extraction.extract import extract_modes, extract_once
 from avmsf.modal.extraction.finders import HighResolution
 from factories.delayed_plate import cut
@@ -158,3 +158,12 @@ def test_measured_impulse_responses_cut_by_a_threshold_get_their_starts_back(sha
     assert len(set(onsets)) > 1
     assert error(found.delays, -torch.tensor(onsets, dtype=torch.float64)) < 0.05
     assert found.coherence_after > 0.99 > found.coherence_before
+
+
+def test_the_common_start_of_sounds_as_short_as_their_margins_is_that_of_long_ones() -> None:
+    starts = jitter(8, 1.0)
+    whole = damped(gains(8, 6), starts, noise_db=-60.0)
+    files = torch.cat([whole.sounds, whole.after], dim=1)
+    short = replace(whole, sounds=files[:, :LEAD], after=files[:, LEAD : 2 * LEAD])
+    one, other = (_common_onset(each, starts, torch.ones(8).double()) for each in (whole, short))
+    assert one == other

@@ -86,3 +86,12 @@ def test_poles_that_move_along_damping_as_much_as_along_frequency_do_not_shift()
         found.append(HighResolution().find_shifts(sounds, ModalBank(FREQUENCY, DAMPING), RATE))
     assert found[0] is not None
     assert found[1] is None
+
+
+def test_a_silent_recording_takes_no_modes_away():
+    sounds = torch.cat([draw(5e-4)[0], torch.zeros(1, SAMPLES)])
+    found = extract_sounds(sounds, sample_rate=RATE)
+    assert found.shifts is not None
+    assert len(found.bank) == len(FREQUENCY)
+    # Rows may be any sequence.
+    assert torch.equal(found.take((0, 2)).gains, found.gains[[0, 2]])

@@ -70,6 +70,8 @@ class AttentionGains(TrainableGains, GainModel):
             self.head = nn.Sequential(*layers)
             self.to_gains = nn.Linear(sizes[-1], modes)
             self.to_dampings = nn.Linear(sizes[-1], modes) if shape.spatial_damping else None
+        # Files hold float32, whatever the program's default type is.
+        self.float()
         with torch.no_grad():
             for layer in self.modules():
                 if isinstance(layer, nn.Linear):

@@ -54,7 +54,7 @@ class GainData:
 
     def take(self, rows: Sequence[int]) -> "GainData":
         """Return the data of some of the recordings, with the same modes and phases."""
-        return replace(self, train=self.train.take(rows), modes=self.modes.take(rows), gains=self.gains[rows])
+        return replace(self, train=self.train.take(rows), modes=self.modes.take(rows), gains=self.gains[list(rows)])
 
 
 def gain_data(train: Impacts, features: FeatureField, modes: Extraction, config: FitConfig) -> GainData:
@@ -103,7 +103,7 @@ def orientation_signs(
     """
     count = len(contacts)
     if directions is None or count < 2:
-        return torch.ones(count)
+        return torch.ones(count, dtype=torch.float32)
     places = contacts.detach().double().cpu().numpy()
     # Contacts in one place are at distance zero, which the sparse graph would take for no edge.
     tree = minimum_spanning_tree(cdist(places, places) + 1e-9)

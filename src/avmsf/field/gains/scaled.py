@@ -57,7 +57,7 @@ class BodyGains(GainModel):
     @classmethod
     def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return tensors like those of a body of these sizes."""
-        points = torch.empty(count_of(record["points"], "points"), 3, device="meta")
+        points = torch.empty(count_of(record["points"], "points"), 3, dtype=torch.float32, device="meta")
         return {"points": points, **_named(_BODY, mode_skeleton({**record, "shapes": record["modes"]}))}
 
     @classmethod

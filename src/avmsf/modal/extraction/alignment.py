@@ -44,6 +44,7 @@ from avmsf.modal.extraction.phase_likelihood import (
 )
 from avmsf.modal.modes import ModalBank
 from avmsf.modal.residual_noise import background_power
+from avmsf.modal.spectra import with_length
 
 _MIN_SEARCHED_RECORDINGS, _MIN_SEARCHED_SAMPLES = 32, 1_400_000
 """Modes are looked for in so many recordings, or in as many as hold so many samples together, whichever is more. Where
@@ -226,7 +227,9 @@ def _common_onset(impacts: Impacts, delays: PerContact, agreement: PerContact) -
     assert impacts.before is not None
     assert impacts.after is not None
     lead = impacts.before.shape[1]
-    early = replace(impacts, sounds=impacts.sounds[:, : 3 * lead], after=impacts.after[:, :0])
+    # Sounds may be shorter than what is looked at.
+    held = with_length(torch.cat([impacts.sounds[:, : 3 * lead], impacts.after], dim=1), 3 * lead)
+    early = replace(impacts, sounds=held, after=impacts.after[:, :0])
     fractions = torch.arange(_ONSET_FRACTIONS, dtype=torch.float64) / _ONSET_FRACTIONS
     moved = (early.delayed(delays - lead + each).sounds[:, : 2 * lead] for each in fractions)
     power = torch.stack([each.double().square() for each in moved], dim=2).flatten(1)

@@ -57,7 +57,7 @@ class Extraction:
     def take(self, rows: Sequence[int]) -> "Extraction":
         """Return the gains of some of the recordings, with the same modes."""
         shifts = None if self.shifts is None else replace(self.shifts, poles=self.shifts.poles[list(rows)])
-        return replace(self, gains=self.gains[rows], shifts=shifts)
+        return replace(self, gains=self.gains[list(rows)], shifts=shifts)
 
     def aligned(self, impacts: Impacts) -> Impacts:
         """Return recordings, these or others of the object, with the starts that the gains are of."""

@@ -74,6 +74,8 @@ _FREE_ITERATIONS = 2
 """Steps of them before the prior counts, whose center is not known yet."""
 _MIN_SHIFT = 1e-6
 """Least relative standard deviation of the prior."""
+_MIN_NOISE_POWER = 1e-12
+"""Least power of the noise, of sounds of mean power one: that of a silent recording is none."""
 _PASSES = 5
 """Rounds over all bands, each with the shifts of the round before as the prior."""
 
@@ -131,7 +133,7 @@ def find_shifts(sounds: Sounds, bank: ModalBank, *, sample_rate: float, signific
         return None
     order = torch.argsort(mean.imag)
     found = ModalBank(mean.imag / (2 * math.pi), -mean.real).take(order)
-    noise = background_power(search.sounds, found, sample_rate)
+    noise = background_power(search.sounds, found, sample_rate).clamp_min(_MIN_NOISE_POWER)
     kept = _needed(search.sounds, poles[:, order], noise, significance, sample_rate)
     relative = float(_median(moves.square().mean(0).sqrt(), energy))
     return FrequencyShifts(found.take(kept), poles[:, order[kept]], relative)
