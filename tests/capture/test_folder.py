@@ -63,9 +63,10 @@ def test_settings_given_replace_those_of_the_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize("sample_rate", [48_000.0, 44_100.0, 512 * 1.3, 8000 / 3, 100.01, 7839.059834067738])
 def test_a_written_capture_reads_back_bit_for_bit(tmp_path: Path, sample_rate: float) -> None:
     full = invented(sample_rate=sample_rate)
+    unknown = replace(full.impacts, directions=full.impacts.directions * torch.tensor([[0.0], [1.0]]))
     bare = replace(full, impacts=replace(full.impacts, directions=None, forces=None), surface=None)
     cloud = replace(bare, surface=Surface(torch.randn(5, 3), torch.zeros(0, 3, dtype=torch.int64)))
-    for number, capture in enumerate((full, bare, cloud)):
+    for number, capture in enumerate((full, bare, cloud, replace(full, impacts=unknown))):
         with warnings.catch_warnings():
             # These few random points make no shape about the contacts.
             warnings.simplefilter("ignore" if capture is cloud else "error")
@@ -78,6 +79,14 @@ def test_a_written_capture_is_aligned_held_and_measured_as_the_one_it_was_read_f
     read = read_capture(fill(tmp_path / "cup", sounds=sounds, settings='unit = "ft"\nheld = [[1, 2, 3]]'))
     read.write(tmp_path / "again" / "cup")
     again = read_capture(tmp_path / "again" / "cup")
+    # Starts that a hammer's channel told stay.
+    pushed = {
+        name: np.stack([np.eye(1, len(sound), 400 + 80 * row)[0], sound], axis=1)
+        for row, (name, sound) in enumerate(sounds.items())
+    }
+    told = read_capture(fill(tmp_path / "told", sounds=pushed, settings="force_channel = 1\nresponse_channel = 2"))
+    told.write(tmp_path / "again" / "told")
+    assert torch.equal(read_capture(tmp_path / "again" / "told").impacts.sounds, told.impacts.sounds)
     for name in ("sounds", "before", "after", "contacts"):
         torch.testing.assert_close(
             getattr(again.impacts, name), getattr(read.impacts, name), rtol=0, atol=0, equal_nan=True

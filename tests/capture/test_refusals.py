@@ -78,7 +78,6 @@ TABLES = [
     (HEADER, (ROWS[0], "/b.wav,0,0.2,0"), 3, "file", "/b.wav"),
     (HEADER, (ROWS[0], "C:\\b.wav,0,0.2,0"), 3, "file", "C:\\b.wav"),
     (HEADER, (ROWS[0], ROWS[1], "a.wav,0,0,1"), 4, "file", "a.wav"),
-    (DIRECTIONS, ("a.wav,0,0,0,1,0,0", "b.wav,0,1,0,0,0,0"), 3, "nx", [0.0, 0.0, 0.0]),
     (FORCES, ("a.wav,0,0,0,2", "b.wav,0,1,0,0"), 3, "force_newtons", 0.0),
     # A force so small would lift the sound beyond float32.
     (FORCES, ("a.wav,0,0,0,2", "b.wav,0,1,0,1e-300"), 3, "force_newtons", 1e-300),

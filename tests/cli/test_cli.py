@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,18 +16,20 @@ import torch
 import trimesh
 
 import avmsf
-from avmsf.capture import read_capture, write_capture
+from avmsf.capture import read_capture
 from avmsf.capture.settings import settings_of
 from avmsf.cli import VERBS, main
 from avmsf.cli.fit import Options as FitOptions
+from avmsf.cli.info import _not_trained_on
 from avmsf.cli.paths import OutputError
 from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField, save_features
 from avmsf.field.store import load, save
+from avmsf.modal.extraction.alignment import recording_keys
 from avmsf.modal.modes import ForcePulse
 from factories.made_fields import directional, sounding
 from factories.plate_capture import PLATE, TINY, fill_plate
-from factories.plate_field import CONTACT_TIME, HIGHEST, RATE
+from factories.plate_field import CONTACT_TIME, HIGHEST, RATE, plate_impacts
 from factories.raising import raises
 from factories.verbs import results_of, run_verb, sets
 from oracles.plate import plate_modes
@@ -233,10 +236,10 @@ def test_info_says_and_draws(field: Path, capture: Path, tmp_path: Path, capsys:
     assert len(told["compared_with"]["recordings"]) == 3
     assert (len(told["trained_on"]), told["trained_on"][0]) == (5, "001.wav")
     assert (told["pipeline"]["extraction"], told["pipeline"]["fit"]["seed"]) == ("high-resolution", 0)
-    # A later session may number its recordings as this one did.
-    write_capture(replace(read_capture(capture), name="another day"), tmp_path / "later")
-    told, _ = results_of(capsys, "info", field, "--capture", tmp_path / "later")
-    assert told["compared_with"]["which"] == "none a training recording"
+    # A folder may have another name.
+    shutil.copytree(capture, tmp_path / "renamed")
+    told, _ = results_of(capsys, "info", field, "--capture", tmp_path / "renamed")
+    assert told["compared_with"]["which"] == "not training recordings"
     for name in ("modes", "gains", "spectrograms"):
         assert (output / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     # It has no body.
@@ -312,3 +315,13 @@ def test_info_reads_recordings_from_where_the_fields_sounds_start(capture, field
     told, _ = results_of(capsys, "info", tmp_path / "peak.safetensors", "--capture", capture)
     wanted = avmsf.evaluate(load(tmp_path / "peak.safetensors"), read_capture(capture, settings)).mean()
     assert told["compared_with"]["scores"]["field"] == pytest.approx(wanted)
+
+
+def test_training_recordings_are_told_by_what_they_hold_where_the_field_knows() -> None:
+    impacts = plate_impacts(4)
+    alignment = SimpleNamespace(keys=recording_keys(impacts.take([0, 1])))
+    field = SimpleNamespace(alignment=alignment, sample_rate=impacts.sample_rate)
+    assert _not_trained_on(field, SimpleNamespace(impacts=impacts)) == [2, 3]
+    # A later session may number its recordings as the first did.
+    later = replace(impacts, sounds=0.5 * impacts.sounds)
+    assert _not_trained_on(field, SimpleNamespace(impacts=later)) == [0, 1, 2, 3]

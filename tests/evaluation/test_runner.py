@@ -288,9 +288,10 @@ def test_stored_sounds_have_the_recordings_rate(tmp_path: Path) -> None:
 def test_two_evaluations_exclude_each_other_in_one_folder(plates: Path, tmp_path: Path) -> None:
     results = ResultsFolder(tmp_path / "results")
     run_objects(planned(plates, "knn3"), ("a",), results)
-    with write_lock(results.path, "results", command="avmsf evaluate"), ThreadPoolExecutor(1) as other:
-        found = other.submit(run_objects, planned(plates, "knn3"), ("b",), results).exception()
+    with write_lock(results.path, ".results", command="avmsf evaluate"), ThreadPoolExecutor(1) as other:
+        found = other.submit(run_objects, planned(plates, "nearest"), ("b",), results).exception()
     assert isinstance(found, FolderInUseError)
+    assert [*results.identity()["methods"]] == ["knn3"]
 
 
 def test_methods_with_modes_are_compared_with_the_truth(tmp_path: Path) -> None:

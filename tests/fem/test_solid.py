@@ -232,7 +232,8 @@ def test_a_filling_ends_when_its_parent_does(tmp_path):
     command = [sys.executable, "-P", str(tetrahedra.WORKER), "job.npz", "result.npz"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, cwd=tmp_path) as worker:
         flags = Path(f"/proc/{worker.pid}/fdinfo/0")
-        while not int(flags.read_text().split()[3], 8) & os.O_ASYNC:
+        end = time.monotonic() + 60.0
+        while not int(flags.read_text().split()[3], 8) & os.O_ASYNC and time.monotonic() < end:
             time.sleep(0.05)
         # What a dying parent leaves behind: its end of the pipe, closed.
         worker.stdin.close()

@@ -49,6 +49,8 @@ def test_a_field_of_sounds_from_their_peaks_is_asked_for_sounds_from_their_peaks
     by_file = locate(field, one, locator=locator)
     for found in (locate(field, one.channels[0], locator=locator), locate_impacts(field, one, locator=locator)[0][1]):
         assert torch.allclose(found.distance, by_file.distance, atol=1e-3)
+    # Settings of another recording do not move its start.
+    assert torch.equal(locate(field, one, locator=locator, settings=CaptureSettings()).distance, by_file.distance)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.003])

@@ -54,9 +54,10 @@ def write_whole(
     until then: a full disk or a kill leaves the old file, a kill perhaps a hidden `.NAME.….part` beside it, which
     nothing reads. Raises `raising`.
     """
-    # What a link leads to is replaced, and the link stays.
-    temporary, named, path = None, path, Path(os.path.realpath(path))
+    temporary, named = None, path
     try:
+        # What a link leads to is replaced, and the link stays.
+        path = Path(os.path.realpath(path))
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = temporary_path(path)
         # Unlike tempfile.mkstemp, this lets the system apply the umask, as for any file that is to be shared.

@@ -176,7 +176,7 @@ def _unlisted(folder: Path, names: Collection[str]) -> list[str]:
 
 
 def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float | None = None) -> None:
-    """Write a folder that `read_capture` reads back to the same values, bit for bit.
+    """Write a folder that `read_capture` reads back to the same values, bit for bit where onsets are found again.
 
     Sounds become float32 wav files under the recordings' names where these are wav paths inside a folder, else under
     numbers. Everything is written to a temporary folder first and then renamed into place: a folder of this name is
@@ -187,8 +187,10 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     be written.
     """
     impacts, read_by, names = capture.impacts, capture.settings, _file_names(capture.impacts.names)
-    sounds, final = list(impacts.sounds), onsets_within is None and impacts.before is None
-    if impacts.before is not None and impacts.after is not None:
+    # Starts that a hammer's channel told are not found anew without it.
+    found = read_by.force_channel is None and impacts.before is not None
+    sounds, final = list(impacts.sounds), onsets_within is None and not found
+    if not final and impacts.before is not None and impacts.after is not None:
         whole = torch.cat([impacts.before, impacts.sounds, impacts.after], dim=1)
         sounds = [each[~each.isnan()] for each in whole]
     rate, speed = _whole_rate(impacts.sample_rate)

@@ -183,11 +183,8 @@ def parse_row(row: Row, settings: CaptureSettings) -> Impact:
     if DIRECTION[0] in row.cells:
         vector = [row.number(name) for name in DIRECTION]
         length = math.hypot(*vector)
-        if length == 0:
-            wanted, advice = "a direction as nx,ny,nz", "give a direction or remove the columns"
-            raise row.error(wanted, vector, got="the zero vector", name=DIRECTION[0], advice=advice)
-        # What has unit length already stays as it is, so that writing and reading again changes no digit.
-        scale = 1.0 if abs(length - 1) < 1e-6 else 1 / length
+        # What has unit length already stays as it is, so that writing and reading again changes no digit; 0 is unknown.
+        scale = 1.0 if length == 0 or abs(length - 1) < 1e-6 else 1 / length
         direction = (vector[0] * scale, vector[1] * scale, vector[2] * scale)
     if FORCE in row.cells:
         newtons = row.number(FORCE)

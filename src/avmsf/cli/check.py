@@ -70,6 +70,11 @@ class Options(Common):
         captures, recordings = (any(self.capture.glob(pattern)) for pattern in (f"[!.]*/{TABLE}", "*.wav"))
         return not (self.capture / TABLE).is_file() and (captures or not recordings)
 
+    @property
+    def how(self) -> str:
+        """How a proposed setting gets into the capture."""
+        return f"add it to {SETTINGS}" if (self.capture / SETTINGS).exists() else "--write-settings writes it"
+
     def _check(self) -> None:
         if self.is_dataset:
             detect_dataset(self.capture)
@@ -116,8 +121,7 @@ def run(options: Options) -> int:
     said = {str(each) for each in warned} & of_units
     lines += [each for each in problems if each not in said]
     if not options.write_settings:
-        how = f"add it to {SETTINGS}" if (options.capture / SETTINGS).exists() else "--write-settings writes it"
-        lines += [f"proposed: {each.line} ({how}). {each.reason}" for each in proposals]
+        lines += [f"proposed: {each.line} ({options.how}). {each.reason}" for each in proposals]
     elif not proposals:
         left = "; settings that the messages above name are yours to choose" if problems else ""
         lines.append(f"the folder's files determine no further setting: nothing was written{left}")

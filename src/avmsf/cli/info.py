@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
-    from avmsf.capture import Impacts
+    from avmsf.capture import Capture, Impacts
     from avmsf.field.sound_field import SoundField
 
     _Described = tuple[str, dict[str, Any], Callable[[], Figure]]
@@ -82,8 +82,7 @@ def _describe_field(options: Options) -> None:
         # Its sounds start where those of the recordings did that it was fitted to.
         settings = settings_of(options.capture).starting(field.origin.settings.time_zero)
         read = read_capture(options.capture, settings)
-        impacts, trained = read.impacts, field.origin.trained_on if read.name == field.origin.capture else ()
-        others = [row for row, name in enumerate(impacts.names) if name not in trained]
+        impacts, others = read.impacts, _not_trained_on(field, read)
         what = "all of them training recordings"
         if others:
             what = "not training recordings" if len(others) < len(impacts) else "none a training recording"
@@ -98,6 +97,16 @@ def _describe_field(options: Options) -> None:
         draw_field(field, options.plots, recorded=compared)
     print_json(values)
     next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
+
+
+def _not_trained_on(field: "SoundField", capture: "Capture") -> list[int]:
+    """Return the recordings' rows that a field was not fitted to, by what they hold where it knows that, or by name."""
+    from avmsf.modal.extraction.alignment import recording_keys
+
+    alignment, keys = field.alignment, recording_keys(capture.impacts)
+    if alignment is not None and capture.impacts.sample_rate == field.sample_rate:
+        return [row for row, key in enumerate(keys) if key not in alignment.keys]
+    return [row for row, name in enumerate(capture.impacts.names) if name not in field.origin.trained_on]
 
 
 def draw_field(field: "SoundField", folder: Path, *, recorded: "Impacts | None" = None) -> None:

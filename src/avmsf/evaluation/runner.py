@@ -349,16 +349,17 @@ def run_objects(
     def log(message: str) -> None:
         progress(message, len(whole), total)
 
-    with workers_at(workers, address, raising=EvaluationError) as parallel:
+    # The lock's file is hidden: a new folder holds nothing else.
+    lock = write_lock(results.path, ".results", command="avmsf evaluate", advice=", or choose another --output")
+    with workers_at(workers, address, raising=EvaluationError) as parallel, lock:
         evaluation.begin(results)
-        with write_lock(results.path, "results", command="avmsf evaluate", advice=", or choose another --output"):
-            if workers > 1 or address is not None:
-                act = partial(_run_elsewhere, (evaluation, results, METRICS))
-                run_tasks(act, {each: each for each in identifiers}, parallel, done, log)
-                return
-            for identifier in identifiers:
-                run_object(evaluation, identifier, results, log)
-                done(identifier, None)
+        if workers > 1 or address is not None:
+            act = partial(_run_elsewhere, (evaluation, results, METRICS))
+            run_tasks(act, {each: each for each in identifiers}, parallel, done, log)
+            return
+        for identifier in identifiers:
+            run_object(evaluation, identifier, results, log)
+            done(identifier, None)
 
 
 def _run_elsewhere(shared: tuple[Evaluation, ResultsFolder, dict[str, MetricEntry]], identifier: str) -> None:

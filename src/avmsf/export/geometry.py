@@ -37,7 +37,7 @@ def read_object(
 
     A mesh becomes a `.glb`, Gaussians stay as they are, and without either the field's points are shown. A file's
     coordinates count `meters` each; Gaussians are in meters. Meshes of more than `MAX_FACES` triangles are reduced.
-    Raises `ExportError` for a file that is missing, not a mesh, huge, or not in the field's unit.
+    Raises `ExportError` for a file that is missing, not a mesh, a huge mesh, or not in the field's unit.
     """
     if source is None:
         return "points", b"", ()
@@ -124,7 +124,7 @@ def read_vertices(
     `POSITION` (object frame, meters), outward unit `NORMAL`, `COLOR_0` as displayed (sRGB, 0 to 1), and `indices` of
     triangles. A mesh file's coordinates count `meters` each, and its textures become vertex colors; a `Surface` is in
     meters, as are Gaussians, of which the centers are shown; without a source the field's points are. Raises
-    `ExportError` for one that is huge, or not in the field's unit, and `CaptureError` for a file that is not a mesh.
+    `ExportError` for one that is not in the field's unit, and `CaptureError` for a file that is no mesh, or a huge one.
     """
     if source is None:
         return {"POSITION": sampled.points, "NORMAL": sampled.normals}, None

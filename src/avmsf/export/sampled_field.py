@@ -23,6 +23,8 @@ from avmsf.mesh.points import farthest_points, nearest_points
 from avmsf.modal.modes import ForcePulse, common_phase, synthesize
 from avmsf.modal.spectra import magnitude_stft
 
+_POINTS_OF_NORMALS = 20_000
+"""Points that tell how the surface lies; their neighbors are searched."""
 _RENDER_BATCH = 32
 """Contacts rendered at once; bounds the memory."""
 _DRAWN = 4
@@ -90,7 +92,8 @@ class SampledField:
         own = sound_field.gain_field.points.detach()
         if normals is None:
             # Of all its points: a few do not tell how the surface lies.
-            normals = outward_normals(own)[nearest_points(own, places)[:, 0]]
+            some = own[:: max(1, len(own) // _POINTS_OF_NORMALS)]
+            normals = outward_normals(some)[nearest_points(some, places)[:, 0]]
         if directions is not None:
             normals = torch.where(directions.any(1, keepdim=True), -directions.double(), normals.double())
         audible = torch.nonzero(sound_field.audible).flatten()

@@ -4,7 +4,6 @@ Run as a script, with the paths of the job and of the result. Importing pytetwil
 which serves its front for pyvista's meshes alone, so the core is loaded by its file.
 """
 
-import fcntl
 import os
 import signal
 import sys
@@ -20,7 +19,9 @@ def main(job_path: str, result_path: str) -> None:
     with np.load(job_path) as job:
         # Time of the processor, so that what else it does decides nothing; the system ends this process then.
         signal.setitimer(signal.ITIMER_PROF, float(job["seconds"]))
-        # The core holds the interpreter's lock: the system ends this process (SIGIO) as the parent's end closes.
+        # The core holds the interpreter's lock: Linux ends this process (SIGIO) as the parent's end closes.
+        import fcntl
+
         fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(0, fcntl.F_SETFL, fcntl.fcntl(0, fcntl.F_GETFL) | os.O_ASYNC)
         core = _load_core(str(job["library"]))

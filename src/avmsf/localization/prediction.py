@@ -144,8 +144,8 @@ def calibrate_tempering(field: SoundField) -> float:
     1 where the field has too few contacts, or no posterior. How strongly the errors of modes are correlated depends on
     what is wrong with a field: a body that is nearly the object's errs in all modes at once, splines between few
     contacts err in each mode by itself. No constant serves both. But every field with a posterior can predict the gains
-    at each of its own contacts from the others, and their positions are known: the exponent is the one with which these
-    positions are most probable (the logarithmic score, which is best for the true probabilities).
+    at each of its own contacts from those at other places, and their positions are known: the exponent is the one with
+    which these positions are most probable (the logarithmic score, which is best for the true probabilities).
     """
     if not can_self_calibrate(field):
         return 1.0

@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
@@ -19,12 +21,13 @@ from avmsf.capture.preprocess import latest_start
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import ArrayError, CaptureError, LocationError
 from avmsf.field.sound_field import SoundField
-from avmsf.modal.spectra import resampled
 
 Sound = str | Path | Recording | ArrayLike
 """The path of a sound file, a recording, or samples alone: [samples]."""
 _USABLE_BANDWIDTH = 0.9
 """Part of half a sample rate up to which a recording of another rate still holds all of a sound."""
+_MAX_RATIO_TERMS = 2000
+"""Largest terms of the ratio between two rates."""
 
 
 def preprocess_recording(
@@ -100,7 +103,8 @@ def open_recording(
     with location_errors(recording.name):
         recording = replace(recording, sample_rate=as_rate(recording.sample_rate))
     check_sound(recording.channels, recording.sample_rate, file=recording.name)
-    given, count = own if settings is None else settings, len(recording.channels)
+    # Whatever the settings say, the field's sounds start where they do.
+    given, count = own if settings is None else settings.starting(time_zero), len(recording.channels)
     force, channel = given.force_channel, given.response_channel
     # A single channel is the sound, wherever the capture has its force.
     pushed = force is not None and 1 < count >= force
@@ -150,7 +154,9 @@ def at_field_rate(
         lowest = f"sound at {float(frequency.min()):.4g} Hz, the lowest of the object's {len(frequency)} modes"
         got, advice = f"{own:g} Hz samples with sound up to {highest:.4g} Hz", f"record at {rate:g} Hz"
         raise LocationError.expected(lowest, own, got=got, file=recording.name, name="sample_rate", advice=advice)
-    at_rate = resampled(torch.from_numpy(sound)[None], sample_rate=own, wanted=rate)[0]
+    # A sound may start at its peak: a line through its ends continues it better than silence.
+    ratio = Fraction(rate / own).limit_denominator(_MAX_RATIO_TERMS)
+    at_rate = scipy.signal.resample_poly(sound, ratio.numerator, ratio.denominator, padtype="line")
     note = f"{recording.name} was resampled from {own:g} Hz to the field's {rate:g} Hz"
     if held < int(field.audible.sum()):
         energy = field.amplitudes.square() / field.bank.damping
@@ -159,4 +165,4 @@ def at_field_rate(
             f"; located by {held} of the object's {counted(len(frequency), 'mode')}, with {share:.0f} % of the energy "
             f"of its sounds: those above {highest:.4g} Hz are left out"
         )
-    return at_rate.float(), highest, [note]
+    return torch.from_numpy(at_rate.astype(np.float32)), highest, [note]

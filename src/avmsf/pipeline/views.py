@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ from avmsf.capture.filenames import SPLATS, VIDEO_SUFFIXES, find_surface_file, p
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.points import farthest_points
-from avmsf.mesh.textured_mesh import read_textured_mesh
+from avmsf.mesh.textured_mesh import images_of_library, read_textured_mesh
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import MIN_VIEWS, View
 from avmsf.photographs.colmap import find_model
@@ -37,16 +38,17 @@ class Source:
 
     kind: Kind
     files: tuple[Path, ...]
-    """All files that decide the views."""
+    """Files that decide the views, but for those elsewhere that a camera file names."""
     path: Path
     """Folder of cameras or photographs, or the video or the mesh itself."""
     folder: Path
     """The folder that holds all of it."""
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """Of all that decides the views."""
-        return digest_files(self.files, root=self.folder)
+        named = _named_by_cameras(self.folder) if self.kind == "cameras" else []
+        return digest_files((*self.files, *named), root=self.folder)
 
 
 def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["best", "mesh"] = "best") -> Source | None:
@@ -66,9 +68,11 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
     shaped = surface is not None and surface.is_file()
     if (model is not None or transforms.is_file()) and not (prefer == "mesh" and shaped):
         parts = [transforms] if model is None else [each for each in model.iterdir() if each.is_file()]
-        return Source("cameras", (*parts, *_named_by_cameras(folder), *images, *masks), folder, folder)
+        return Source("cameras", (*parts, *images, *masks), folder, folder)
     if surface is not None and shaped:
-        companions = (*pictures_in(surface.parent, deep=True), *sorted(surface.parent.glob("*.mtl")))
+        libraries = sorted(surface.parent.glob("*.mtl")) if surface.suffix.lower() == ".obj" else []
+        textures = [path for each in libraries for path in images_of_library(each).values() if path.is_file()]
+        companions = (*pictures_in(surface.parent, deep=False), *libraries, *textures)
         return Source("mesh", (surface, *companions), surface, folder)
     if len(images) >= MIN_VIEWS or (images and photographs != folder):
         if len(images) < MIN_VIEWS:

@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -187,10 +187,11 @@ class CaptureEditor:
                 if added["digest"] == _digest(content) and math.dist(added["contact"], impact.contact) < 1e-9:
                     return added
             self._check_usable(recording, newtons=None)
-            missing = {"force": FORCE} if impact.direction else {"direction": DIRECTION[0], "force": FORCE}
-            for name in (name for name, column in missing.items() if column in table.names):
-                wanted = f"a {name} as in all rows"
-                raise bad_request(name, wanted, got="none", advice="add it", status=422, file=table.path)
+            if FORCE in table.names:
+                wanted = "a force as in all rows"
+                raise bad_request("force", wanted, got="none", advice="add it", status=422, file=table.path)
+            if impact.direction is None and DIRECTION[0] in table.names:
+                impact = replace(impact, direction=(0.0, 0.0, 0.0))
             file = self._next_name(table)
             write_whole(self.folder / file, content, raising=CaptureError)
             try:
