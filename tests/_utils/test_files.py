@@ -55,6 +55,12 @@ def test_what_a_link_leads_to_is_written_and_the_current_folder_refused(tmp_path
     monkeypatch.chdir(tmp_path / "empty")
     with pytest.raises(ExportError), new_folder(Path("."), raising=ExportError):
         pass
+    # As where another program has deleted it.
+    (tmp_path / "empty").rmdir()
+    with pytest.raises(ExportError), new_folder(Path("x"), raising=ExportError):
+        pass
+    with pytest.raises(ExportError):
+        write_whole(Path("x"), "new", raising=ExportError)
 
 
 def test_a_folder_that_cannot_be_replaced_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

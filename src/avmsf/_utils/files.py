@@ -95,10 +95,11 @@ def new_folder(folder: Path, *, raising: type[AvmsfError], replace: bool = False
     if here or (folder.exists() and (not folder.is_dir() or (not replace and any(folder.iterdir())))):
         got, advice = "the current one" if here else "an existing one", "choose another name or remove it"
         raise raising.expected("a new or empty folder", got=got, file=folder, advice=advice)
-    # What a link leads to is replaced, and the link stays.
-    named, folder = folder, Path(os.path.realpath(folder))
-    begun, old = temporary_path(folder), temporary_path(folder)
+    begun, named = None, folder
     try:
+        # What a link leads to is replaced, and the link stays.
+        folder = Path(os.path.realpath(folder))
+        begun, old = temporary_path(folder), temporary_path(folder)
         begun.mkdir(parents=True)
         yield begun
         if replace and folder.exists():
@@ -115,4 +116,5 @@ def new_folder(folder: Path, *, raising: type[AvmsfError], replace: bool = False
     except OSError as error:
         raise unwritable(named, error, raising=raising) from error
     finally:
-        shutil.rmtree(begun, ignore_errors=True)
+        if begun is not None:
+            shutil.rmtree(begun, ignore_errors=True)

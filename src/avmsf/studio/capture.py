@@ -176,8 +176,8 @@ class CaptureEditor:
     def add(self, content: bytes, impact: Impact) -> dict[str, Any]:
         """Write the recording of an impact and return it; one of the same recording and contact is returned as it is.
 
-        Raises CaptureError for a recording that cannot be used, and RequestError (422) for an impact without a value
-        that every row of the table has.
+        In a table of directions an unknown one is zero. Raises CaptureError for a recording that cannot be used, and
+        RequestError (422) where every row of the table has a force.
         """
         with self._lock():
             settings, table, recording = self.settings, ImpactTable(self.folder), read_upload(content)
