@@ -262,8 +262,6 @@ def test_a_captures_mesh_is_as_large_as_the_field(size, field_file, tmp_path, ca
         export(tmp_path / "large.safetensors", "web", tmp_path / "other", "--capture", capture)
 
 
-@pytest.mark.parametrize("kind", ["gltf", "web"])
-def test_one_contact_of_an_object_is_exported_with_its_surface(tmp_path: Path, kind: str) -> None:
-    output = {"gltf": tmp_path / "one.glb", "web": tmp_path / "one"}[kind]
-    made = export(saved(elastic(), tmp_path), kind, output, "--position", 0.05, 0.02, 0.002)
-    assert made.exists()
+def test_one_contact_of_an_object_is_exported_with_its_surface(tmp_path: Path) -> None:
+    output = export(saved(elastic(), tmp_path), "gltf", tmp_path / "one.glb", "--position", 0.05, 0.02, 0.002)
+    np.testing.assert_allclose(sorted(shown_in(output).extents), sorted(SIDES), rtol=0.05)
