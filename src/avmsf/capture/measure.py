@@ -28,9 +28,10 @@ def measure(recording: Recording, prepared: Prepared, *, settings: CaptureSettin
     rate = recording.sample_rate
     channel = recording.response_channel(settings.response_channel, force_channel=settings.force_channel)
     response, seconds = recording.channel(channel), settings.kept_seconds(rate)
-    level = decibels(float(np.abs(response).max()))
     # An offset, and rumble that the settings remove, are not in the sounds.
-    filtered = remove_rumble(recording.response(channel), settings.highpass, recording)
+    sound = recording.response(channel)
+    level = decibels(float(np.abs(sound).max()))
+    filtered = remove_rumble(sound, settings.highpass, recording)
     noise = decibels(noise_level(filtered, prepared.onset, rate) / float(np.abs(filtered).max()))
     clipped = clipped_samples(response)
     if settings.force_channel is not None:
