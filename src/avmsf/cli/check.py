@@ -3,6 +3,7 @@
 import shlex
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -121,7 +122,8 @@ def run(options: Options) -> int:
     said = {str(each) for each in warned} & of_units
     lines += [each for each in problems if each not in said]
     if not options.write_settings:
-        lines += [f"proposed: {each.line} ({options.how}). {each.reason}" for each in proposals]
+        for reason, alike in groupby(proposals, lambda each: each.reason):
+            lines.append(f"proposed: {', '.join(each.line for each in alike)} ({options.how}). {reason}")
     elif not proposals:
         left = "; settings that the messages above name are yours to choose" if problems else ""
         lines.append(f"the folder's files determine no further setting: nothing was written{left}")
