@@ -21,11 +21,11 @@ from avmsf.gaussians.ply import write_splats
 from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.mesh import Surface
 from avmsf.photographs.folder import write_frames
-from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig
+from avmsf.pipeline.config import PRESETS, LiftConfig, SceneConfig, ViewsConfig
 from avmsf.pipeline.features import finish_features
 from avmsf.pipeline.scene import SceneStages, shape_of_cloud, without_far
 from avmsf.pipeline.shape import OFF_MESH, moved_onto
-from avmsf.pipeline.stages import StageFolder
+from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.pipeline.visual_checks import expect_contacts_in_views, expect_mesh_in_views
 from factories.ball_views import MIDDLE, RADIUS
 from factories.clouds import cloud, random_cloud
@@ -230,3 +230,22 @@ def test_gaussians_need_no_cameras_of_pictures_beside_them(tmp_path: Path) -> No
     made = SceneStages(tmp_path, StageFolder(tmp_path / "cache"), SceneConfig(), settings=CaptureSettings())
     assert made.source is None
     assert "motion" not in made.stages
+
+
+def test_new_weights_in_an_encoders_folder_make_features_anew(tmp_path: Path) -> None:
+    transformers = pytest.importorskip("transformers")
+    write_splats(cloud(200), tmp_path / "splats.ply")
+    config = transformers.Dinov2Config(hidden_size=8, num_hidden_layers=1, num_attention_heads=1)
+    lift = LiftConfig(encoder=str(tmp_path / "model"), components=0, symmetry=False, longest=28)
+    given = SceneConfig(views=ViewsConfig(rendered=32), lift=lift)
+
+    def features() -> Kept:
+        stages = StageFolder(tmp_path / "cache")
+        return SceneStages(tmp_path, stages, given, settings=CaptureSettings()).features
+
+    fresh = []
+    for seed in (0, 1, 1):
+        torch.manual_seed(seed)
+        transformers.Dinov2Model(config).save_pretrained(tmp_path / "model")
+        fresh.append(features().fresh)
+    assert fresh == [True, True, False]

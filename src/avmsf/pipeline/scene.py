@@ -171,7 +171,9 @@ class SceneStages(Pipeline):
         return choose_encoder(self.config.lift, log=self.listener.note, device=self.device)
 
     def _features_recipe(self) -> dict[str, object]:
-        return {"encoder": self.encoder.name, "lift": asdict(self.config.lift)}
+        weights = Path(self.config.lift.encoder).expanduser()
+        given = {"weights": digest_of(weights)} if weights.is_dir() else {}
+        return {"encoder": self.encoder.name, "lift": asdict(self.config.lift), **given}
 
     def _make_features(self, path: Path, views_path: Path, cloud: Path | None = None) -> None:
         views, config, encoder = read_views(views_path), self.config.lift, self.encoder
