@@ -267,3 +267,16 @@ def test_photographs_count_by_content_wherever_the_camera_file_names_them(tmp_pa
     assert find_source(tmp_path, CaptureSettings()).digest == before
     image.write_bytes(b"2")
     assert find_source(tmp_path, CaptureSettings()).digest != before
+
+
+def test_a_mesh_counts_with_materials_and_textures_in_any_folder(tmp_path: Path) -> None:
+    (tmp_path / "look").mkdir()
+    (tmp_path / "surface.obj").write_text("mtllib look/card.mtl\nusemtl skin\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    library, texture = tmp_path / "look" / "card.mtl", tmp_path / "look" / "skin.png"
+    library.write_text("newmtl skin\nmap_Kd skin.png\n")
+    digests = []
+    for changed in (texture, texture, library):
+        with open(changed, "a") as file:
+            file.write("#")
+        digests.append(find_source(tmp_path, CaptureSettings()).digest)
+    assert len({*digests}) == 3

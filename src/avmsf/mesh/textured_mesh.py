@@ -204,14 +204,20 @@ def _paint(
 
 def _images_of_obj(path: Path) -> dict[str, str]:
     """Return, for each material of an obj file that names an image, the image's path from the file's folder."""
+    return {
+        name: os.path.relpath(image, path.parent)
+        for library in libraries_of(path)
+        for name, image in images_of_library(library).items()
+    }
+
+
+def libraries_of(path: Path) -> list[Path]:
+    """Return the mtl files that an obj file names and that are there; none of other files."""
     if path.suffix.lower() != ".obj":
-        return {}
-    text, named = path.read_text(encoding="utf-8", errors="replace"), dict[str, str]()
-    for library in re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, flags=re.MULTILINE):
-        source = path.parent / library
-        if source.is_file():
-            named |= {name: os.path.relpath(image, path.parent) for name, image in images_of_library(source).items()}
-    return named
+        return []
+    text = path.read_text(encoding="utf-8", errors="replace")
+    named = (path.parent / each for each in re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, flags=re.MULTILINE))
+    return [library for library in named if library.is_file()]
 
 
 def images_of_library(path: Path) -> dict[str, Path]:

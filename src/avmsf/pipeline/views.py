@@ -14,7 +14,7 @@ from avmsf.capture.filenames import SPLATS, VIDEO_SUFFIXES, find_surface_file, p
 from avmsf.capture.settings import CaptureSettings
 from avmsf.errors import CaptureError, SceneError
 from avmsf.mesh.points import farthest_points
-from avmsf.mesh.textured_mesh import images_of_library, read_textured_mesh
+from avmsf.mesh.textured_mesh import images_of_library, libraries_of, read_textured_mesh
 from avmsf.photographs import find_foreground, read_views
 from avmsf.photographs.cameras import MIN_VIEWS, View
 from avmsf.photographs.colmap import find_model
@@ -70,7 +70,7 @@ def find_source(folder: Path, settings: CaptureSettings, *, prefer: Literal["bes
         parts = [transforms] if model is None else [each for each in model.iterdir() if each.is_file()]
         return Source("cameras", (*parts, *images, *masks), folder, folder)
     if surface is not None and shaped:
-        libraries = sorted(surface.parent.glob("*.mtl")) if surface.suffix.lower() == ".obj" else []
+        libraries = libraries_of(surface)
         textures = [path for each in libraries for path in images_of_library(each).values() if path.is_file()]
         companions = (*pictures_in(surface.parent, deep=False), *libraries, *textures)
         return Source("mesh", (surface, *companions), surface, folder)
