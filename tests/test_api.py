@@ -231,6 +231,7 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         ),
         (lambda: impacts_of(contacts=CONTACT), ArrayError, {"name": "contacts"}),
         (lambda: impacts_of(names=["a"]), ArrayError, {"name": "names"}),
+        (lambda: impacts_of(forces=0), ArrayError, {"name": "forces", "row": 0, "value": 0.0}),
         *(
             (lambda rate=rate: impacts_of(sample_rate=rate), ArrayError, {"name": "sample_rate"})
             for rate in (0, -1.0, math.nan)

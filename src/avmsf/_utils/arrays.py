@@ -55,17 +55,21 @@ def as_count(value: SupportsIndex, name: str, *, raising: type[AvmsfError] = Arr
     return count
 
 
-def as_forces(values: float | int | ArrayLike, name: str, *, count: int) -> Float[Tensor, " rows"]:
+def as_forces(
+    values: float | int | ArrayLike, name: str, *, count: int, positive: bool = False
+) -> Float[Tensor, " rows"]:
     """Return `count` numbers of 0 or more, or one that holds for all, as a tensor of `count`. Raises as `as_vectors`.
 
-    An impact pushes: a negative force would be a pull.
+    An impact pushes: a negative force would be a pull. What was recorded had one: `positive` refuses 0.
     """
     found = as_floats(values, name)
     if found.ndim > 1 or (found.ndim == 1 and len(found) != count):
         raise ArrayError.expected(f"one number or {count}", list(found.shape), name=name)
     forces = _finite(found.expand(count), name)
-    if len(wrong := torch.nonzero(forces < 0)):
-        raise ArrayError.expected("0 or more", float(forces[wrong[0]]), name=name, row=int(wrong[0]))
+    if len(wrong := torch.nonzero(forces <= 0 if positive else forces < 0)):
+        raise ArrayError.expected(
+            "above 0" if positive else "0 or more", float(forces[wrong[0]]), name=name, row=int(wrong[0])
+        )
     return forces
 
 

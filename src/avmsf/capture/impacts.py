@@ -79,7 +79,7 @@ class Impacts:
             as_rate(sample_rate),
             named,
             None if directions is None else as_directions(directions, "directions", count=count).float(),
-            None if forces is None else as_forces(forces, "forces", count=count).float(),
+            None if forces is None else as_forces(forces, "forces", count=count, positive=True).float(),
         )
 
     @property

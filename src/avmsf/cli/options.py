@@ -106,7 +106,7 @@ def parse_options(kind: type[T], words: Sequence[str], default: T | None = None)
         # The first line of the box is its title.
         found = _MORE.split(box.getvalue().strip().partition("\n")[2])[0]
         commas = any(re.fullmatch(r"-?[\d.]+(,-?[\d.]+)+", word) for word in words)
-        advice = "separate numbers by blanks, decimals by a point" if commas else f"`avmsf {verb} --help` lists the options"
+        advice = "separate numbers by blanks (0.5, not 0,5)" if commas else f"`avmsf {verb} --help` lists the options"
         advice += ", --print-config what --set changes" * (issubclass(kind, Configured) and not commas)
         words_of_tyro = " ".join(_BORDERS.sub(" ", found).split()).rstrip(".")
         raise InputError(f"{words_of_tyro}; {advice}", name=verb) from None
