@@ -293,9 +293,9 @@ class CandidateBodies:
     def _converged(self, thickness: float | None) -> ElasticModes:
         """Return the modes of one body, of twice the degrees of freedom where their frequencies still change much."""
         name, make = body_name(thickness), partial(self.modes, thickness, dofs=COARSE_DOFS, perturbed=False)
-        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(1) as pool:
-            check = pool.submit(make)
-            modes = self.modes(thickness)
+        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(lane_count()) as pool:
+            fine, check = pool.submit(self.modes, thickness), pool.submit(make)
+            modes = fine.result()
         coarse = self._attempt(f"{name}: mesh convergence not checked", check.result)
         if coarse is None or (error := _frequency_error(coarse, modes)) <= MAX_FREQUENCY_ERROR:
             return modes

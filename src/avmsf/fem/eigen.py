@@ -18,6 +18,7 @@ from jaxtyping import Float64
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
+from avmsf._utils.compiled import lane_count
 from avmsf.errors import SimulationError
 
 _PRECISION = 1e-8
@@ -108,10 +109,9 @@ def factorize(
 
     def solve(forces: np.ndarray) -> np.ndarray:
         # Two halves side by side, which is the same on any number of processors: it releases the interpreter's lock.
-        first, second = np.array_split(np.asfortranarray(forces), 2, axis=1)
-        with ThreadPoolExecutor(1) as pool:
-            solved = pool.submit(factored.solve, second)
-            return np.concatenate([factored.solve(first), solved.result()], axis=1)
+        halves = np.array_split(np.asfortranarray(forces), 2, axis=1)
+        with ThreadPoolExecutor(lane_count()) as pool:
+            return np.concatenate([*pool.map(factored.solve, halves)], axis=1)
 
     return solve
 
