@@ -1,7 +1,6 @@
 """How long a training step, a whole fit, a rendered sound and a command take, and the memory of a step."""
 
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -101,28 +100,33 @@ def _commands(settings: Settings) -> Iterator[Record]:
 def _many(settings: Settings) -> Iterator[Record]:
     """Fields of ten simulated objects: ten commands in turn, one command of one worker, one of two workers.
 
-    The first ten of sim-20, with 8 impacts of .5 s and a mesh; default settings, one thread each, no stage cached; the
-    commands make the tetrahedra that all have. speed: over one worker. agreement: part of the fields that are one
-    worker's to the bit. gigabytes: most memory of a process. megabytes: of ten fields with records, and of the caches.
-    export: web pages of these fields, by one worker.
+    The first ten of sim-20, with 8 impacts of .5 s and a mesh; default settings, one thread each, no stage cached.
+    first: two workers that make the tetrahedra, which the others find. speed: over one worker. agreement: part of the
+    fields that are one worker's to the bit. gigabytes: most memory of a process. megabytes: of ten fields with records,
+    and of the caches. export: web pages of these fields, by one worker.
     """
     names = settings.some(list(SIM20)[:10], 2)
     with tempfile.TemporaryDirectory() as name:
         place, fields, found = Path(name), dict[str, list[bytes]](), dict[str, dict[str, float]]()
-        simulate_set({each: replace(SIM20[each], impacts=8, seconds=0.5, views=0) for each in names}, place / "sim")
+        recipes = {each: replace(SIM20[each], impacts=8, seconds=0.5, views=0) for each in names}
+        # A process's memory begins at that of the one that starts it.
+        apart(simulate_set, recipes, place / "sim")
         captures, more = [place / "sim" / each for each in names], ["--gain-model", "smooth"] * settings.quick
-        for way, workers in (("commands", 0), ("one worker", 1), ("two workers", 2)):
+        for way, workers in (("first", 2), ("commands", 0), ("one worker", 1), ("two workers", 2)):
             output, cache, before = place / way, place / f"{way} cache", processor_seconds()
             together = [*captures, "-o", output, "--cache", cache, "--workers", workers, *more]
-            apart = [
+            alone = [
                 [each, "-o", output / f"{each.name}.safetensors", "--cache", cache / each.name, *more]
                 for each in captures
             ]
-            _, taken = timed(partial(_run, "fit", [together] if workers else apart, place))
+            memory, taken = timed(partial(_run, "fit", [together] if workers else alone, place))
             fields[way] = [(output / f"{each}.safetensors").read_bytes() for each in names]
             values = {"seconds": taken, "processor_seconds": processor_seconds() - before}
-            values |= {"gigabytes": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9}
-            found[way] = values | {"megabytes": _megabytes(output), "cache_megabytes": _megabytes(cache)}
+            found[way] = values | {
+                "gigabytes": memory,
+                "megabytes": _megabytes(output),
+                "cache_megabytes": _megabytes(cache),
+            }
         made, pages, before = [output / f"{each}.safetensors" for each in names], place / "pages", processor_seconds()
         words = [*made, "--to", "web", "--capture", place / "sim", "-o", pages]
         _, taken = timed(partial(_run, "export", [words], place))
@@ -134,12 +138,22 @@ def _many(settings: Settings) -> Iterator[Record]:
     yield from records(exported, object="export")
 
 
-def _run(verb: str, commands: list[list[object]], place: Path) -> None:
-    """Run a verb of `avmsf` with the words of each command, on one thread and with tetrahedra of its own."""
+def _run(verb: str, commands: list[list[object]], place: Path) -> float:
+    """Run a verb of `avmsf` with the words of each command, on one thread and with tetrahedra of its own.
+
+    Returns the most memory of one of their processes, 10^9 bytes.
+    """
     avmsf, environment = Path(sys.executable).with_name("avmsf"), os.environ | {"AVMSF_CACHE": str(place)}
     environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    most = 0
     for words in commands:
-        subprocess.run([str(avmsf), verb, "--quiet", *map(str, words)], check=True, env=environment)
+        process = subprocess.Popen([str(avmsf), verb, "--quiet", *map(str, words)], env=environment)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if status:
+            raise subprocess.CalledProcessError(process.returncode, process.args)
+        most = max(most, usage.ru_maxrss)
+    return most * 1024 / 1e9
 
 
 def _megabytes(folder: Path) -> float:
