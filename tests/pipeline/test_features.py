@@ -104,12 +104,12 @@ def test_a_mesh_of_another_size_or_place_or_a_tenth_of_wrong_masks_is_no_other_u
 def test_cameras_or_contacts_in_another_unit_are_refused_with_it(unit: str) -> None:
     """A mesh and contacts in meters, cameras in another unit that the settings do not name; and the other way round."""
     settings, factor, contacts = CaptureSettings(), METRES[unit], slab().vertices
-    for each in (factor, 1 / factor):
-        with raises(CaptureError, name="surface_unit", value=pytest.approx(1 / each)):
+    for each, key in ((factor, "views_unit"), (1 / factor, "unit")):
+        with raises(CaptureError, name="surface_unit", value={key: unit}):
             expect_mesh_in_views(scaled(each), VIEWS, settings)
     expect_contacts_in_views(contacts, VIEWS, settings)
     expect_contacts_in_views(contacts / factor, [replace(view, mask=None) for view in VIEWS], settings)
-    with raises(CaptureError, name="unit", value=pytest.approx(factor)):
+    with raises(CaptureError, name="unit", value={"unit": unit}):
         expect_contacts_in_views(contacts / factor, VIEWS, settings)
 
 

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -87,9 +87,8 @@ def check_surface(
     placement = check_placement(contacts, surface_points(surface))
     if placement.fault == "none":
         return surface, warned
-    lines = [f'{key} = "{value}"' for key, value in fitting_units_of(placement, settings).items()]
-    advice = f". If so, write {' and '.join(lines)} in capture.toml" if lines else ""
-    found = placement.describe([f"row {impact.line}" for impact in impacts]) + advice
+    advice = units_words(fitting_units_of(placement, settings))
+    found = placement.describe([f"row {impact.line}" for impact in impacts]) + (advice and f". If so, {advice}")
     farthest = float(placement.distances.max())
     if placement.fault == "unit":
         message = f"{TABLE}: expected contacts and surface in one unit; {found}"
@@ -103,39 +102,59 @@ def check_surface(
     return surface, warned
 
 
+def readable_impacts(folder: Path, settings: CaptureSettings) -> list[Impact]:
+    """Return the rows of a folder's table that can be read: none where there is no table, or one that cannot."""
+    with suppress(CaptureError):
+        return parse_rows(read_rows(folder)[0], settings, Issues(collect=True))
+    return []
+
+
 def check_one_unit(folder: Path, settings: CaptureSettings) -> None:
     """Raise `CaptureError` where a folder's surface and the contacts of its table are in different units.
 
-    For callers that read only the surface. Rows, and tables, that cannot be read are skipped.
+    For callers that read only the surface.
     """
-    impacts = list[Impact]()
-    with suppress(CaptureError):
-        impacts += parse_rows(read_rows(folder)[0], settings, Issues(collect=True))
+    impacts = readable_impacts(folder, settings)
     surface = find_surface(folder, settings) if impacts else None
     if surface is not None:
         check_surface(impacts, surface, settings=settings)
 
 
 def fitting_units_of(placement: Placement, settings: CaptureSettings) -> dict[str, str]:
-    """Return the settings `unit` and `surface_unit` to change so that contacts and surface fit, as far as units do it.
-
-    Where both count one unit, the surface's size says which: the one that gives an object of `NARROWEST` to `WIDEST`,
-    the present one if it does, else the one that comes nearest to `USUAL_SIZE`. Empty where nothing is to change, or
-    no units explain what is wrong.
-    """
+    """Return the settings `unit` and `surface_unit` to change so that contacts and surface fit, as `units_by`."""
     mismatch = placement.mismatch
     if placement.mostly_off if mismatch is None else not mismatch.unit_only:
         return {}
-    ratio = settings.meters * (1.0 if mismatch is None else mismatch.factor) / settings.surface_meters
+    factor = 1.0 if mismatch is None else mismatch.factor
+    return units_by(settings, placement.diagonal, {"unit": factor, "surface_unit": 1.0})
+
+
+def units_by(settings: CaptureSettings, size: float, factors: Mapping[str, float]) -> dict[str, str]:
+    """Return the units to change so that coordinates are multiplied by these factors, or by others in proportion.
+
+    `factors` are those of contacts, surface and cameras, by their settings: `unit`, `surface_unit`, `views_unit`. The
+    object, `size` meters across after these factors, says which: units that make it `NARROWEST` to `WIDEST` across, the
+    present ones if they do, else those that come nearest to `USUAL_SIZE`. Empty where no unit is to change, or none
+    does it.
+    """
+    present = {"unit": settings.meters, "surface_unit": settings.surface_meters, "views_unit": settings.views_meters}
     ranked = list[tuple[bool, bool, float, dict[str, str]]]()
-    for unit, surface_unit in itertools.product(METRES, repeat=2):
-        if math.isclose(METRES[unit] / METRES[surface_unit], ratio, rel_tol=1e-6):
-            changes = {} if unit == settings.unit else {"unit": unit}
-            changes |= {} if surface_unit == (settings.surface_unit or unit) else {"surface_unit": surface_unit}
-            size = placement.diagonal * METRES[surface_unit] / settings.surface_meters
-            unusual = not NARROWEST <= size <= WIDEST
-            ranked.append((unusual, bool(changes), abs(math.log(size / USUAL_SIZE)), changes))
+    for names in itertools.product(METRES, repeat=len(factors)):
+        units = dict(zip(factors, names, strict=True))
+        scales = [METRES[unit] / (present[key] * factors[key]) for key, unit in units.items()]
+        if math.isclose(min(scales), max(scales), rel_tol=1e-6):
+            # The surface's is the contacts' where it is not stated.
+            changes = {key: unit for key, unit in units.items() if unit != (getattr(settings, key) or units["unit"])}
+            across = max(size * scales[0], 1e-9)
+            unusual = not NARROWEST <= across <= WIDEST
+            ranked.append((unusual, bool(changes), abs(math.log(across / USUAL_SIZE)), changes))
     return min(ranked, key=lambda each: each[:3])[3] if ranked else {}
+
+
+def units_words(units: Mapping[str, str]) -> str:
+    """Return what to write in capture.toml to change units; empty for none."""
+    lines = [f'{key} = "{unit}"' for key, unit in units.items()]
+    return f"write {' and '.join(lines)} in capture.toml" if lines else ""
 
 
 def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:

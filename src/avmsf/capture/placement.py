@@ -7,6 +7,7 @@ discrete is fitted by iterated closest points (Besl and McKay, 1992). They are c
 
 import itertools
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from avmsf._utils.text import listed
 from avmsf.capture.settings import unit_named
-from avmsf.errors import CaptureError, FitError
+from avmsf.errors import CaptureError, CaptureWarning, FitError
 from avmsf.mesh.surface import MOST_POINTS
 
 TOLERANCE = 0.05
@@ -202,23 +203,33 @@ def check_placement(contacts: Float[Tensor, "contacts 3"], points: Float[Tensor,
 
 
 def expect_placed(
-    contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, names: Sequence[str] = ()
+    contacts: Float[Tensor, "contacts 3"],
+    points: Float[Tensor, "points 3"],
+    *,
+    names: Sequence[str] = (),
+    what: str = "surface",
+    strict: bool = False,
+    elastic: bool = False,
+    advice: str = "",
 ) -> None:
-    """Raise FitError where contacts are not on a surface, with the transform that would bring them onto it.
+    """Raise CaptureError for contacts in another frame or unit than an object's points, and warn of others off these.
 
-    `points` are all over the surface, as `surface_points` has them; both in meters. Rough surfaces, glue, single wrong
-    rows and small shifts pass (`Placement.fault`). `names` are for the message.
+    `points` are all over `what` there is; both in meters. CaptureError too for a contact farther off than the object is
+    large, and if `strict` for any off it. For `elastic` mode shapes it is a FitError, and rough surfaces, glue, single
+    wrong rows and small shifts pass (`Placement.fault`). The `value` is the largest distance, meters.
     """
     placement = check_placement(contacts, points)
-    if placement.fault in ("frame", "unit"):
-        raise FitError.expected(
-            "contacts on the surface for elastic mode shapes",
-            float(placement.distances.max()),
-            got=placement.describe(names),
-            name="contacts",
-            advice="bring both into one frame and unit (unit, surface_unit in capture.toml), or use a gain model "
-            "without elastic mode shapes",
-        )
+    words, distance = placement.describe(names, what=what), float(placement.distances.max())
+    apart = placement.fault in ("frame", "unit")
+    if elastic and apart:
+        wanted = "contacts on the surface for elastic mode shapes"
+        advice = "bring both into one frame and unit (unit, surface_unit in capture.toml), or use another gain model"
+        raise FitError.expected(wanted, distance, got=words, name="contacts", advice=advice)
+    if elastic or not words:
+        return
+    if apart or distance > placement.diagonal or (strict and placement.off):
+        raise CaptureError(f"{words}{advice}", name="contacts", value=distance)
+    warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)
 
 
 def _find_mismatch(

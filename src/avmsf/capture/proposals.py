@@ -30,7 +30,7 @@ from avmsf.capture.placement import check_placement
 from avmsf.capture.prepare import prepare, remove_rumble
 from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of
 from avmsf.capture.table import Impact, Row, parse_rows, read_rows
-from avmsf.errors import CaptureError
+from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError
 from avmsf.mesh.surface import surface_points
 
 
@@ -69,11 +69,11 @@ class Proposal:
         return f"{self.key} = {json.dumps(self.value)}"
 
 
-def propose_settings(folder: str | Path) -> tuple[Proposal, ...]:
+def propose_settings(folder: str | Path, wrong: Sequence[AvmsfError | AvmsfWarning] = ()) -> tuple[Proposal, ...]:
     """Return the settings other than the present ones that would help to read a folder, with the reasons.
 
     A key that the folder's `capture.toml` holds was chosen and is left alone. Recordings that cannot be read are passed
-    over; raises nothing for bad input.
+    over; raises nothing for bad input. Of what else was found `wrong`, units have those that mend them as their value.
     """
     folder, found = Path(folder), list[Proposal]()
     try:
@@ -88,6 +88,11 @@ def propose_settings(folder: str | Path) -> tuple[Proposal, ...]:
     ):
         if not chosen & keys:
             found += propose(folder, rows, replace(settings, **{each.key: each.value for each in found}))
+    for each in wrong:
+        mends = each.name in ("unit", "surface_unit") and each.value and not each.value.keys() & chosen
+        if mends and not any(proposal.key.endswith("unit") for proposal in found):
+            reason = str(each).rpartition("; ")[0]
+            found += [Proposal(key, unit, reason) for key, unit in each.value.items()]
     return tuple(found)
 
 
@@ -107,15 +112,14 @@ def write_settings(folder: str | Path, proposals: Sequence[Proposal]) -> Path:
     return path
 
 
-def contacts_of(rows: Sequence[Row], settings: CaptureSettings) -> Float64[Tensor, "contacts 3"]:
-    """Return the contacts of all rows that can be read, meters, float64."""
-    contacts = [each.contact for each in parse_rows(rows, settings, Issues(collect=True))]
-    return torch.tensor(contacts, dtype=torch.float64).reshape(-1, 3)
+def contacts_of(impacts: Sequence[Impact]) -> Float64[Tensor, "contacts 3"]:
+    """Return the contacts of impacts, meters, float64."""
+    return torch.tensor([each.contact for each in impacts], dtype=torch.float64).reshape(-1, 3)
 
 
 def _units(folder: Path, rows: Sequence[Row], settings: CaptureSettings) -> list[Proposal]:
     """Return the units in which contacts lie on the object, where the present ones cannot be meant."""
-    placement, contacts = None, contacts_of(rows, settings)
+    placement, contacts = None, contacts_of(parse_rows(rows, settings, Issues(collect=True)))
     with suppress(CaptureError):
         surface = find_surface(folder, settings)
         placement = None if surface is None else check_placement(contacts, surface_points(surface))

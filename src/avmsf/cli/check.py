@@ -13,7 +13,7 @@ from avmsf._utils.text import counted
 from avmsf.capture.settings import SETTINGS, TABLE, settings_of
 from avmsf.capture.table import read_rows
 from avmsf.cli.options import Common, Flag
-from avmsf.cli.output import decimals, doing, next_command, next_step, print_json, say, show, table
+from avmsf.cli.output import command, decimals, doing, finish, say, show, table
 from avmsf.cli.paths import ContactData, Existing
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, ExtractionError
@@ -127,28 +127,25 @@ def run(options: Options) -> int:
     elif not proposals:
         left = "; settings that the messages above name are yours to choose" if problems else ""
         lines.append(f"the folder's files determine no further setting: nothing was written{left}")
-    show("\n".join(lines))
-    print_json(
-        {
-            **asdict(report),
-            "visual_inputs": None if visual is None else asdict(visual),
-            "proposals": [asdict(each) for each in proposals],
-            "alignment": None if aligned is None else asdict(aligned),
-        }
-    )
+    values = {
+        **asdict(report),
+        "visual_inputs": None if visual is None else asdict(visual),
+        "proposals": [asdict(each) for each in proposals],
+        "alignment": None if aligned is None else asdict(aligned),
+    }
     if not report.readable:
+        show("\n".join(lines))
         say(f"avmsf check: {options.capture} cannot be read; correct the errors above and check again", always=True)
-        if proposals and not options.write_settings:
-            next_step(_next_command(options, proposals, visual, wrong))
-        return UNREADABLE
-    lines = [*report.remarks, *(aligned.sentences() if aligned else ())]
+        needed = () if options.write_settings else proposals
+        steps = [_next_command(options, needed, visual, wrong)] if needed else []
+        return finish("", values, *steps, code=UNREADABLE)
+    said_of_modes = [*report.remarks, *(aligned.sentences() if aligned else ())]
     if modes is None:
-        lines = ["no mode was found to align the recordings: noisy or too short (see avmsf modes)"]
+        said_of_modes = ["no mode was found to align the recordings: noisy or too short (see avmsf modes)"]
     count = sum(each not in of_units for each in problems) + bool(units) + (modes is None)
     count += 0 if aligned is None else len(aligned.warnings())
-    show("\n".join([*lines, f"readable, with {counted(count, 'warning')}" if count else "no problem found"]))
-    next_step(_next_command(options, units, visual, wrong))
-    return 0
+    said_of_modes.append(f"readable, with {counted(count, 'warning')}" if count else "no problem found")
+    return finish("\n".join([*lines, *said_of_modes]), values, _next_command(options, units, visual, wrong))
 
 
 def _propose(
@@ -156,12 +153,10 @@ def _propose(
 ) -> "tuple[tuple[Proposal, ...], list[AvmsfWarning | AvmsfError]]":
     """Return the settings that would help, written if asked for, and what then shows the object elsewhere."""
     from avmsf.capture.proposals import propose_settings, write_settings
-    from avmsf.pipeline.visual_checks import misplaced, propose_units
+    from avmsf.pipeline.visual_checks import misplaced
 
-    proposals = propose_settings(options.capture)
     wrong = [] if visual is None else misplaced(options.capture, visual)
-    if not any(each.key in _UNITS for each in proposals):
-        proposals += propose_units(options.capture, wrong)
+    proposals = propose_settings(options.capture, wrong)
     if proposals and options.write_settings:
         path = write_settings(options.capture, proposals)
         show(f"{path}: written, with {', '.join(each.line for each in proposals)}")
@@ -218,12 +213,10 @@ def _check_dataset(options: Options) -> int:
     problems = [f"{each.facts.identifier}: {problem}" for each in report.objects for problem in each.problems]
     lines = [f"missing: {part}" for part in report.missing] + problems + [f"note: {each}" for each in report.remarks]
     show("\n".join([table(f"{report.dataset} in {options.capture}", columns, rows, words=4), *lines]))
-    print_json(asdict(report))
     if not readable:
         wanted = "expected a readable object, found none; fix the listed problems"
         say(f"avmsf check: {options.capture}: {wanted}", always=True)
-        return UNREADABLE
+        return finish("", asdict(report), code=UNREADABLE)
     recordings = counted(sum(each.recordings for each in report.objects), "recording")
-    show(f"{readable} of {counted(len(report.objects), 'object')} can be read, with {recordings}")
-    next_command("avmsf evaluate farthest", options.capture)
-    return 0
+    text = f"{readable} of {counted(len(report.objects), 'object')} can be read, with {recordings}"
+    return finish(text, asdict(report), command("avmsf evaluate farthest", options.capture))

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from avmsf.cli.options import Configured, Flag
-from avmsf.cli.output import next_command, print_json, show
+from avmsf.cli.output import command, finish, show
 from avmsf.cli.paths import FieldFile, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.editing.config import STABLE_AUDIO, EditSettings
 from avmsf.errors import EditError
@@ -137,17 +137,14 @@ def run(options: Options) -> int:
     show("\n".join([changes_table(modes, old, new), *notes]))
     if options.plots is not None:
         draw(options.plots, (old, contact), (new, options.scale * contact), edits[-1])
-    show(f"wrote {options.output}")
-    print_json(
-        {
-            "field": str(options.field),
-            "output": str(options.output),
-            "capture": new.origin.capture,
-            "edits": edits,
-            "silent_modes": int(silenced(new).sum()),
-            "modes": modes,
-            "supporting_poles": supporting,
-        }
-    )
-    next_command("avmsf render", options.output, "--position X Y Z -o impact.wav")
-    return 0
+    values = {
+        "field": str(options.field),
+        "output": str(options.output),
+        "capture": new.origin.capture,
+        "edits": edits,
+        "silent_modes": int(silenced(new).sum()),
+        "modes": modes,
+        "supporting_poles": supporting,
+    }
+    step = command("avmsf render", options.output, "--position X Y Z -o impact.wav")
+    return finish(f"wrote {options.output}", values, step)

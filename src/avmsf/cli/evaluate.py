@@ -1,6 +1,5 @@
 """`avmsf evaluate`: the errors of methods on a dataset, as tables and as a page."""
 
-import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ import tyro
 
 from avmsf._utils.text import counted
 from avmsf.cli.options import Configured, Device, Flag
-from avmsf.cli.output import display, next_command, next_step, note, print_json, say, show, table
+from avmsf.cli.output import command, display, finish, note, say, table
 from avmsf.cli.paths import CacheFolder, ContactData, Existing, OutputFolder, arg
 from avmsf.datasets.detect import detect_dataset
 from avmsf.errors import EvaluationError
@@ -115,7 +114,7 @@ def run(options: Options) -> int:
     from avmsf.evaluation.objects import SUBSETS, choose_objects, members
     from avmsf.evaluation.plan import dataset_title, plan_evaluation
     from avmsf.evaluation.registry import MetricSettings
-    from avmsf.evaluation.report import write_figures, write_page, write_summary
+    from avmsf.evaluation.report import PAGE, write_figures, write_page, write_summary
     from avmsf.evaluation.results import IDENTITY, ResultsFolder
     from avmsf.evaluation.runner import run_objects
 
@@ -162,15 +161,14 @@ def run(options: Options) -> int:
             write()
         raise
     summary, parts = write(), write_page(results)
-    _print_results(folder, summary, parts, write_figures(results) if options.figures else [])
-    next_command(f"avmsf evaluate {'farthest' if protocol.name == 'shots' else 'shots'}", options.data)
-    return FAILED if summary["failures"] else 0
+    text = _words(folder, summary, parts, write_figures(results) if options.figures else [])
+    another = f"avmsf evaluate {'farthest' if protocol.name == 'shots' else 'shots'}"
+    steps = command("open", folder / PAGE, "in a browser"), command(another, options.data)
+    return finish(text, {**summary, "results": str(folder)}, *steps, code=FAILED if summary["failures"] else 0)
 
 
-def _print_results(
-    folder: Path, summary: Mapping[str, Any], parts: "Sequence[Section]", figures: Sequence[Path]
-) -> None:
-    """Print the main tables, failures and files. Raises EvaluationError where no method has a result."""
+def _words(folder: Path, summary: Mapping[str, Any], parts: "Sequence[Section]", figures: Sequence[Path]) -> str:
+    """Return the main tables, failures and files. Raises EvaluationError where no method has a result."""
     from avmsf.evaluation.report import PAGE, SUMMARY, TABLES
 
     failures = summary["failures"]
@@ -186,11 +184,8 @@ def _print_results(
     lines += [f"failed: {each['object']}, {each['method'] or 'all'}: {each['failure']}" for each in failures]
     if failures:
         lines.append(f"{counted(len(failures), 'failure')}; run the command again to retry")
-    show(
-        "\n".join([*lines, f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}", *(f"wrote {path}" for path in figures)])
-    )
-    print_json({**summary, "results": str(folder)})
-    next_step(f"open {shlex.quote(str(folder / PAGE))} in a browser")
+    lines.append(f"wrote {SUMMARY}, {TABLES} and {PAGE} in {folder}")
+    return "\n".join([*lines, *(f"wrote {path}" for path in figures)])
 
 
 def _protocol_of(options: Options) -> "Protocol":

@@ -14,7 +14,7 @@ from avmsf.capture.filenames import find_surface_file
 from avmsf.capture.settings import METRES, settings_of
 from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import Flag, Int, Number, Unit, option_of
-from avmsf.cli.output import next_step, note, print_result
+from avmsf.cli.output import finish, note
 from avmsf.cli.paths import ContactTable, FieldFiles, New, OtherCapture, PositionList, ShapeFile, arg
 from avmsf.errors import ExportError
 from avmsf.export.writing import FORMATS, Axis, Format, Precision, check_free
@@ -183,13 +183,12 @@ def run(options: Options) -> int:
     elif options.to == "faust":
         values["contacts"] = str(contacts_path(options.output))
         text += f"; {values['contacts']} has the coordinates of each contact"
-    print_result(text, values)
     following = _NEXT.get(options.output.suffix.lower(), _NEXT[options.to])
-    next_step(following.format(shlex.quote(str(options.output)), options.output.name))
+    steps = [following.format(shlex.quote(str(options.output)), options.output.name)]
     if options.to == "wavs" and len(options.forces) < 2:
         forces = " ".join(format_number(factor * (field.residual.force or 1.0), 2) for factor in (0.3, 1.0, 3.0))
-        next_step(f"the same command with --overwrite --forces {forces}, for a layer at each force")
-    return 0
+        steps.append(f"the same command with --overwrite --forces {forces}, for a layer at each force")
+    return finish(text, values, *steps)
 
 
 def _for_format(field: "SoundField", options: Options) -> "tuple[SoundField | SampledField, dict[str, Any]]":

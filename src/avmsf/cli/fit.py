@@ -11,11 +11,11 @@ import tyro
 
 from avmsf._utils.text import format_number, listed
 from avmsf.capture.filenames import expect_views
-from avmsf.capture.settings import TABLE, CaptureSettings, settings_of
+from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.cli.info import describe_shape, draw_field
 from avmsf.cli.many import Many, run_many
 from avmsf.cli.options import Configured, Device, Flag, Int, Name, Number, expect_capture, option_of, with_settings
-from avmsf.cli.output import display, next_command, next_step, print_json, print_result, show
+from avmsf.cli.output import command, display, finish, show
 from avmsf.cli.paths import CacheFolder, Existing, New, OutputError, PlotsFolder, arg, expect_free
 from avmsf.errors import FitError
 from avmsf.fem.material import material_named
@@ -185,15 +185,13 @@ def run(options: Options) -> int:
     usable_device(options.all_settings.device, raising=FitError, kinds=TRAINABLE)
     settings, stages = settings_of(options.capture).starting(options.all_settings.time_zero), options.stages
     if options.until is not None:
-        _make_stage(options, settings, stages)
-    elif options.material is not None:
-        _guess(options, options.material, settings, stages)
-    else:
-        _fit(options, settings, stages)
-    return 0
+        return _make_stage(options, settings, stages)
+    if options.material is not None:
+        return _guess(options, options.material, settings, stages)
+    return _fit(options, settings, stages)
 
 
-def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> None:
+def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> int:
     from avmsf.capture import read_capture
     from avmsf.cli.report import compare, features_lines, field_lines, parts_words, score_table
     from avmsf.evaluation.splits import split
@@ -227,33 +225,29 @@ def _fit(options: Options, settings: CaptureSettings, stages: "StageFolder") -> 
     show("\n".join(lines))
     if options.plots is not None:
         draw_field(fitted, options.plots, recorded=None if test is None else made.modes.aligned(test))
-    print_json(
-        {
-            "field": str(path),
-            "capture": fitted.origin.capture,
-            "preset": options.preset,
-            "config": asdict(config.fit),
-            "modes": int(fitted.is_mode.sum()),
-            "supporting_poles": int((~fitted.is_mode).sum()),
-            "sample_rate": fitted.sample_rate,
-            "trained_on": list(train.names),
-            "tested_on": [] if test is None else list(test.names),
-            "scores": {name: each.mean() for name, each in scores.items()},
-            "quality": None if fitted.quality is None else fitted.quality.level,
-            "body": None if fitted.body is None else fitted.body.record(),
-            "report": fitted.origin.report,
-            "surface": None if made.surface is None else str(made.surface),
-            "features_report": made.report,
-            "stages": [
-                {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
-                for name, each in made.stages.items()
-            ],
-        }
-    )
-    if test is None:
-        next_command("avmsf render", path, _RENDER)
-    else:
-        next_step("the same command without --train-fraction and --train-count fits all recordings")
+    values = {
+        "field": str(path),
+        "capture": fitted.origin.capture,
+        "preset": options.preset,
+        "config": asdict(config.fit),
+        "modes": int(fitted.is_mode.sum()),
+        "supporting_poles": int((~fitted.is_mode).sum()),
+        "sample_rate": fitted.sample_rate,
+        "trained_on": list(train.names),
+        "tested_on": [] if test is None else list(test.names),
+        "scores": {name: each.mean() for name, each in scores.items()},
+        "quality": None if fitted.quality is None else fitted.quality.level,
+        "body": None if fitted.body is None else fitted.body.record(),
+        "report": fitted.origin.report,
+        "surface": None if made.surface is None else str(made.surface),
+        "features_report": made.report,
+        "stages": [
+            {"stage": _STAGES.get(name, Path(name).stem), "seconds": each.seconds, "fresh": each.fresh}
+            for name, each in made.stages.items()
+        ],
+    }
+    again = "the same command without --train-fraction and --train-count fits all recordings"
+    return finish("", values, command("avmsf render", path, _RENDER) if test is None else again)
 
 
 def _given_features(options: Options, path: Path) -> "tuple[FeatureField, dict[str, Any]]":
@@ -279,7 +273,7 @@ def _written(made: Path, output: Path | None) -> "tuple[SoundField, Path]":
     return field, output or made
 
 
-def _guess(options: Options, material: str, settings: CaptureSettings, stages: "StageFolder") -> None:
+def _guess(options: Options, material: str, settings: CaptureSettings, stages: "StageFolder") -> int:
     """Compute a field without recordings, and print a summary."""
     from avmsf.cli.report import quality_words
     from avmsf.pipeline.fit import guess_in_stages
@@ -290,18 +284,17 @@ def _guess(options: Options, material: str, settings: CaptureSettings, stages: "
         guessed, path = _written(made, options.output)
     values = {"field": str(path), "capture": guessed.origin.capture, "modes": len(guessed.bank)}
     values |= {"sample_rate": guessed.sample_rate, "trained_on": [], "report": guessed.origin.report}
-    print_result("\n".join([*quality_words(guessed, path), f"wrote {path}"]), values)
     if options.plots is not None:
         draw_field(guessed, options.plots)
-    next_command("avmsf render", path, _RENDER)
+    text = "\n".join([*quality_words(guessed, path), f"wrote {path}"])
+    return finish(text, values, command("avmsf render", path, _RENDER))
 
 
-def _make_stage(options: Options, settings: CaptureSettings, stages: "StageFolder") -> None:
+def _make_stage(options: Options, settings: CaptureSettings, stages: "StageFolder") -> int:
     """Make Gaussians, features or a surface of the folder's views, and print what they are."""
     from avmsf._utils.files import copy_whole, write_whole
-    from avmsf.capture.checks import check_one_unit, find_surface
+    from avmsf.capture.checks import check_one_unit, find_surface, readable_impacts
     from avmsf.capture.proposals import contacts_of
-    from avmsf.capture.table import in_folder, read_rows
     from avmsf.mesh.surface import Surface
     from avmsf.pipeline.scene import CLOUD, SceneStages
     from avmsf.pipeline.shape import keep_surface, object_shape
@@ -311,10 +304,7 @@ def _make_stage(options: Options, settings: CaptureSettings, stages: "StageFolde
     config, listener = options.all_settings, display.listener
     scene = SceneStages(folder, stages, config.scene, settings=settings, listener=listener, device=config.device)
     scene.expect_any()
-    contacts = None
-    if options.plots is not None and (folder / TABLE).is_file():
-        with in_folder(folder):
-            contacts = contacts_of(read_rows(folder)[0], settings)
+    contacts = contacts_of(readable_impacts(folder, settings))
     with stages.lock("avmsf fit"):
         match options.until:
             case "gaussians":
@@ -332,5 +322,4 @@ def _make_stage(options: Options, settings: CaptureSettings, stages: "StageFolde
         elif options.output is not None:
             copy_whole(made.path, options.output)
         values = describe_shape(path, options.plots, contacts)
-    print_result(f"wrote {path}", values)
-    next_command("avmsf fit", folder, words)
+    return finish(f"wrote {path}", values, command("avmsf fit", folder, words))

@@ -10,7 +10,7 @@ import tyro
 from avmsf._utils.text import counted
 from avmsf.capture.settings import settings_of
 from avmsf.cli.options import Common, Flag, expect_capture
-from avmsf.cli.output import doing, next_command, print_json, say, show
+from avmsf.cli.output import command, doing, finish, say, show
 from avmsf.cli.paths import Existing, OtherCapture, PlotsFolder, kind_of
 
 if TYPE_CHECKING:
@@ -57,15 +57,12 @@ class Options(Common):
 def run(options: Options) -> int:
     """Describe and draw a file, whose kind its content shows."""
     if kind_of(options.file) == "a sound field":
-        _describe_field(options)
-        return 0
-    print_json(describe_shape(options.file, options.plots))
-    if options.plots is None:
-        next_command("avmsf info", options.file, "--plots plots")
-    return 0
+        return _describe_field(options)
+    steps = [command("avmsf info", options.file, "--plots plots")] if options.plots is None else []
+    return finish("", describe_shape(options.file, options.plots), *steps)
 
 
-def _describe_field(options: Options) -> None:
+def _describe_field(options: Options) -> int:
     from avmsf.capture import read_capture
     from avmsf.cli.report import describe, field_lines, levels, mode_rows, mode_table, score_table
     from avmsf.evaluation.scores import evaluate
@@ -95,8 +92,7 @@ def _describe_field(options: Options) -> None:
     show("\n".join(lines))
     if options.plots is not None:
         draw_field(field, options.plots, recorded=compared)
-    print_json(values)
-    next_command("avmsf render", options.file, "--position X Y Z -o impact.wav")
+    return finish("", values, command("avmsf render", options.file, "--position X Y Z -o impact.wav"))
 
 
 def _not_trained_on(field: "SoundField", capture: "Capture") -> list[int]:

@@ -14,7 +14,7 @@ import tyro
 from avmsf._utils.text import counted, format_number
 from avmsf.capture.settings import CaptureSettings, settings_of
 from avmsf.cli.options import Common, Flag, Number, Unit
-from avmsf.cli.output import doing, next_command, note, print_json, say, show
+from avmsf.cli.output import command, doing, finish, note, say, show
 from avmsf.cli.paths import Existing, FieldFile, OutputError, PictureFolder, SettingsFile, TruthTable, arg
 from avmsf.errors import AvmsfError, CaptureError, LocationError
 
@@ -120,11 +120,11 @@ def run(options: Options) -> int:
         if summary is not None:
             show(_summary_line(summary, options.probability))
     results = {"impacts": found, "summary": summary, "failures": failures}
-    print_json({"field": str(options.field), "quality": verdict, **results})
     located = [each["position"] is not None for each in found]
-    if any(located) and field.has_posterior and not field.origin.report.get(EDITS):
-        next_command("avmsf suggest", options.field)
-    return UNLOCATED if failures or not all(located) else 0
+    suggests = any(located) and field.has_posterior and not field.origin.report.get(EDITS)
+    steps = [command("avmsf suggest", options.field)] if suggests else []
+    code = UNLOCATED if failures or not all(located) else 0
+    return finish("", {"field": str(options.field), "quality": verdict, **results}, *steps, code=code)
 
 
 def _locator(options: Options, field: "SoundField") -> "Callable[[Path], list[_Answer]]":

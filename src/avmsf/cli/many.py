@@ -20,7 +20,7 @@ from avmsf._utils.caching import source_digest
 from avmsf._utils.files import write_whole
 from avmsf._utils.text import counted, csv_text
 from avmsf.cli.options import Common, option_of
-from avmsf.cli.output import display, next_step, note, print_json, show, show_plainly, table
+from avmsf.cli.output import display, finish, note, show_plainly, table
 from avmsf.cli.paths import Existing, InputError, New, OutputError, arg
 from avmsf.errors import NO_MEMORY, AvmsfError, lacks_memory
 
@@ -129,11 +129,9 @@ def run_many(verb: str, options: Many, *, raising: type[AvmsfError]) -> int:
     title = f"{counted(len(rows), 'input')}, {len(failures)} failed"
     lines = [table(title, heads, [[row[each] for each in heads] for row in rows])]
     lines += [f"failed: {row['name']}: {row['failure']}" for row in failures]
-    show("\n".join([*lines, f"wrote {folder / RESULTS}"]))
-    print_json({"output": str(folder), "results": found})
-    if failures:
-        next_step("the same command tries again what failed; what is done is kept")
-    return 2 if failures else 0
+    text, values = "\n".join([*lines, f"wrote {folder / RESULTS}"]), {"output": str(folder), "results": found}
+    again = ["the same command tries again what failed; what is done is kept"] if failures else []
+    return finish(text, values, *again, code=2 if failures else 0)
 
 
 def _make(verb: str, options: Many) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import tyro
 from avmsf._utils.text import counted
 from avmsf.capture.settings import settings_of
 from avmsf.cli.options import Common, Flag, Int, expect_capture
-from avmsf.cli.output import doing, next_command, print_json, say, show
+from avmsf.cli.output import command, doing, finish, say, show
 from avmsf.cli.paths import CaptureFolder, PlotsFolder
 from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import PRESETS, PipelineConfig, Preset, TimeZero
@@ -83,18 +83,15 @@ def run(options: Options) -> int:
         drawn = f"{counted(poles, 'pole')} of {capture.name}, of them {counted(len(modes), 'mode')}"
         save_picture(draw_modes(extraction.bank, level, is_mode=quality.is_mode, title=drawn), picture)
         say(f"wrote {picture}")
-    print_json(
-        {
-            "capture": capture.name,
-            "recordings": len(impacts),
-            "sample_rate": impacts.sample_rate,
-            "seconds": impacts.duration,
-            "method": config.extraction,
-            "alignment": None if aligned is None else asdict(aligned),
-            "frequency_shift": shifts,
-            "modes": modes,
-            "supporting_poles": supporting,
-        }
-    )
-    next_command("avmsf fit", options.capture, "-o field.safetensors")
-    return 0
+    values = {
+        "capture": capture.name,
+        "recordings": len(impacts),
+        "sample_rate": impacts.sample_rate,
+        "seconds": impacts.duration,
+        "method": config.extraction,
+        "alignment": None if aligned is None else asdict(aligned),
+        "frequency_shift": shifts,
+        "modes": modes,
+        "supporting_poles": supporting,
+    }
+    return finish("", values, command("avmsf fit", options.capture, "-o field.safetensors"))

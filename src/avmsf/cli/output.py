@@ -44,14 +44,9 @@ def decimals(value: float | int | None, places: int) -> str:
     return "–" if value is None else f"{value:.{places}f}"
 
 
-def next_step(text: str) -> None:
-    """Print what is useful next, unless --quiet is given: the last lines of a verb."""
-    say(f"next: {text}")
-
-
-def next_command(command: str, path: Path | None = None, options: str = "") -> None:
-    """Print a command that is useful next, unless --quiet is given."""
-    next_step(" ".join([command, *([] if path is None else [shlex.quote(str(path))]), *([options] if options else [])]))
+def command(words: str, path: Path, options: str = "") -> str:
+    """Return a command on a path."""
+    return f"{words} {shlex.quote(str(path))} {options}".rstrip()
 
 
 def show(text: str) -> None:
@@ -70,10 +65,17 @@ def print_json(values: Mapping[str, Any]) -> None:
         print(printable(json_text(values, indent=2, default=str)), flush=True)
 
 
-def print_result(text: str, values: Mapping[str, Any]) -> None:
-    """Print a verb's result: as text, and with --json as values too."""
-    show(text)
+def finish(text: str, values: Mapping[str, Any], *steps: str, code: int = 0) -> int:
+    """Print a verb's result, as text if there is any and with --json as values, and return its exit code.
+
+    Last come the `steps` that are useful next, unless --quiet is given.
+    """
+    if text:
+        show(text)
     print_json(values)
+    for step in steps:
+        say(f"next: {step}")
+    return code
 
 
 def show_plainly() -> None:

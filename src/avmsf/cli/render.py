@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from avmsf.cli.options import Common, Flag, Number, Unit
-from avmsf.cli.output import doing, next_command, note, print_result
+from avmsf.cli.output import command, doing, finish, note
 from avmsf.cli.paths import ContactTable, FieldFile, New, OutputError, PositionList, expect_free, expect_writable
 from avmsf.errors import PositionWarning
 from avmsf.modal.config import MAX_CONTACT_SECONDS, PulseShape
@@ -131,9 +131,8 @@ def run(options: Options) -> int:
         f"peak {round(peak_dbfs, 1) + 0.0:.1f} dBFS"
     )
     values = {"files": list(map(str, paths)), "sample_rate": field.sample_rate, "seconds": seconds}
-    print_result(text, {**values, "peak": peak, "peak_dbfs": peak_dbfs})
-    next_command("avmsf export", options.field, "--to web -o page.html")
-    return 0
+    values |= {"peak": peak, "peak_dbfs": peak_dbfs}
+    return finish(text, values, command("avmsf export", options.field, "--to web -o page.html"))
 
 
 def _samples(seconds: float, rate: float) -> int:

@@ -9,7 +9,7 @@ import tyro
 
 from avmsf._utils.text import counted
 from avmsf.cli.options import Configured, Flag, Int, Name, Number, with_settings
-from avmsf.cli.output import display, next_command, print_json, print_result, show, table
+from avmsf.cli.output import command, display, finish, table
 from avmsf.cli.paths import CacheFolder, Existing, OutputFolder, arg
 from avmsf.errors import SimulationError
 from avmsf.fem.material import MATERIALS
@@ -99,9 +99,8 @@ def run(options: Options) -> int:
     text = f"wrote {what}{options.output}"
     if not written:
         text = f"{options.output}: simulated before with these settings; nothing was written"
-    print_result(text, {"output": str(options.output), "objects": [str(folder / name) for name in recipes]})
-    next_command("avmsf check", folder / next(iter(recipes)))
-    return 0
+    values = {"output": str(options.output), "objects": [str(folder / name) for name in recipes]}
+    return finish(text, values, command("avmsf check", folder / next(iter(recipes))))
 
 
 def _list() -> int:
@@ -113,8 +112,6 @@ def _list() -> int:
         for name, recipe in objects.items()
     ]
     columns = ("set", "object", "shape", "material", "seed", "rotational symmetry")
-    show(table("objects", columns, rows, words=4))
-    show(f"shapes for --kind: {', '.join(KINDS)}\nmaterials: {', '.join(MATERIALS)}")
-    names = [name for objects in SETS.values() for name in objects]
-    print_json({"objects": names, "shapes": list(KINDS), "materials": list(MATERIALS)})
-    return 0
+    listed = f"shapes for --kind: {', '.join(KINDS)}\nmaterials: {', '.join(MATERIALS)}"
+    values = {"objects": [row[1] for row in rows], "shapes": list(KINDS), "materials": list(MATERIALS)}
+    return finish(f"{table('objects', columns, rows, words=4)}\n{listed}", values)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from avmsf._utils.text import counted, csv_text, format_number
 from avmsf.cli.options import Common, Flag, expect_capture
-from avmsf.cli.output import doing, next_step, print_json, say, show, table
+from avmsf.cli.output import doing, finish, say, show, table
 from avmsf.cli.paths import FieldFile, OtherCapture, PictureFolder
 from avmsf.errors import FitError
 
@@ -97,11 +97,10 @@ def run(options: Options) -> int:
     show("\n".join(lines))
     if options.output is not None:
         _write(options.output, field, found, [list(columns), *rows])
-    next_step("record these, then avmsf fit CAPTURE -o NEW.safetensors")
     suggestions = [dict(zip(columns, row, strict=True)) for row in rows]
     results = {"error_before": found.before, "unreachable": found.unreachable, "suggestions": suggestions}
-    print_json({"capture": field.origin.capture, **results})
-    return 0
+    values = {"capture": field.origin.capture, **results}
+    return finish("", values, "record these, then avmsf fit CAPTURE -o NEW.safetensors")
 
 
 def _write(folder: Path, field: "SoundField", found: "Suggestions", rows: Sequence[Sequence[Any]]) -> None:

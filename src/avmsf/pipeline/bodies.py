@@ -59,7 +59,7 @@ def candidate_bodies(
     held_at, seen = settings.held_at, surface if isinstance(surface, Surface) else surface.as_seen()
     extent = seen.vertices.amax(0) - seen.vertices.amin(0)
     if impacts is not None:
-        expect_placed(impacts.contacts, surface_points(seen), names=impacts.names)
+        expect_placed(impacts.contacts, surface_points(seen), names=impacts.names, elastic=True)
     expect_held(held_at, seen)
     wall = config.wall
     try:

@@ -13,6 +13,7 @@ from avmsf._utils.caching import once
 from avmsf._utils.files import write_whole
 from avmsf._utils.progress import ProgressListener
 from avmsf.capture import Capture
+from avmsf.capture.placement import expect_placed
 from avmsf.errors import FitError, SceneError
 from avmsf.features.feature_field import FeatureField, load_features, read_report
 from avmsf.field.config import AUTO, NETWORK
@@ -26,7 +27,7 @@ from avmsf.pipeline.config import DESCRIPTORS, PRESETS, SURFACE, PipelineConfig
 from avmsf.pipeline.scene import CLOUD, FEATURES, SceneStages
 from avmsf.pipeline.stages import Kept, Pipeline, Stage, StageFolder
 from avmsf.pipeline.views import VIEWS
-from avmsf.pipeline.visual_checks import expect_contacts_in_views, expect_mesh_in_views, expect_on_object
+from avmsf.pipeline.visual_checks import WITHOUT_SHAPE, expect_contacts_in_views, expect_mesh_in_views
 from avmsf.reconstruction import ObjectShape
 from avmsf.symmetry.find import find_symmetries
 from avmsf.symmetry.symmetries import Symmetries
@@ -98,9 +99,11 @@ def shape_of(
 
     Raises SceneError for views, and CaptureError for contacts, that do not fit each other.
     """
+    log, found, impacts, seed = pipeline.listener.note, capture.surface, capture.impacts, config.fit.seed
+    if features is None and found is not None:
+        expect_placed(impacts.contacts, surface_points(found), names=impacts.names, advice=WITHOUT_SHAPE)
     if isinstance(pipeline, SceneStages):
         return _shape_of_views(capture, config, pipeline, features, report)
-    log, found, impacts, seed = pipeline.listener.note, capture.surface, capture.impacts, config.fit.seed
     if config.scene != PRESETS["default"].scene and is_mesh(found):
         log("the object's shape is its mesh: settings of views, Gaussians and features are not used")
     if features is None and config.gain_model == NETWORK:
@@ -111,9 +114,8 @@ def shape_of(
         log("without visual features: the network reads positions alone")
     if features is not None:
         points = features
-        expect_on_object(impacts.contacts, features.points, names=impacts.names)
+        expect_placed(impacts.contacts, features.points, names=impacts.names)
     elif found is not None:
-        expect_on_object(impacts.contacts, surface_points(found), names=impacts.names)
         points = FeatureField.from_mesh(found, seed=seed)
     else:
         lacks = " and no elastic mode shapes" if config.gain_model == AUTO else ""
@@ -160,7 +162,7 @@ def _shape_of_views(
         expect_contacts_in_views(impacts.contacts, views, settings)
     if scene.splats is not None:
         points = read_splats(scene[CLOUD].path).centers
-        expect_on_object(impacts.contacts, points, names=impacts.names, what="Gaussians")
+        expect_placed(impacts.contacts, points, names=impacts.names, what="Gaussians")
     features = given
     if features is None:
         features, report = load_features(scene.features.path), read_report(scene.features.path)
@@ -182,7 +184,7 @@ def _shape_of_views(
     # Structure from motion knows nothing of the frame that the contacts are in.
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
     if scene.splats is None or given is not None:
-        expect_on_object(impacts.contacts, features.points, names=impacts.names, strict=found_frame)
+        expect_placed(impacts.contacts, features.points, names=impacts.names, strict=found_frame)
 
     bare, symmetries = FeatureField.from_points(features.points), partial(reported_symmetries, report)
     return FitShape(bare, features, symmetries, surface, digest, report)

@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,17 +14,16 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
-from avmsf._utils.text import counted, listed, read_toml
-from avmsf.capture.checks import find_surface
+from avmsf._utils.text import counted, listed
+from avmsf.capture.checks import find_surface, readable_impacts, units_by, units_words
 from avmsf.capture.filenames import find_surface_file, pictures_in, unused_files
 from avmsf.capture.folder import Capture
 from avmsf.capture.placement import FACTORS, WRONG_ROWS, check_placement, expect_placed
-from avmsf.capture.proposals import Proposal, contacts_of
-from avmsf.capture.settings import SETTINGS, CaptureSettings, settings_of, unit_named
-from avmsf.capture.table import read_rows
-from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, FitError, SceneError
+from avmsf.capture.proposals import contacts_of
+from avmsf.capture.settings import CaptureSettings, settings_of
+from avmsf.errors import AvmsfError, AvmsfWarning, CaptureError, CaptureWarning, SceneError
 from avmsf.gaussians.ply import read_splats
-from avmsf.mesh.surface import Surface, surface_points
+from avmsf.mesh.surface import Surface
 from avmsf.photographs.cameras import View
 from avmsf.photographs.folder import mask_paths, read_camera_file, read_views
 from avmsf.photographs.segmentation import find_foreground
@@ -39,6 +37,7 @@ LONGEST = 256
 """Pixels of the longer side of photographs that are compared."""
 MASK_PIXELS = 2.0
 """Pixels of a photograph by which its mask's edge may be wrong."""
+WITHOUT_SHAPE = "; or fit a field of the positions alone by --without-shape"
 SAME_SHAPE = 0.3
 """Difference of boxes below which a change of unit explains a greater one: units differ by 3.28 times and more."""
 
@@ -115,22 +114,12 @@ def inputs(folder: Path, settings: CaptureSettings | None = None) -> VisualInput
 
 
 def expect_shape(capture: Capture) -> None:
-    """Raise where a capture's folder was meant to show the object and a field would know the positions alone.
-
-    FitError for a surface in another frame than the contacts, SceneError for files that nothing reads.
-    """
-    advice = "; or fit a field of the positions alone by --without-shape"
-    if capture.surface is not None:
-        try:
-            expect_placed(capture.impacts.contacts, surface_points(capture.surface), names=capture.impacts.names)
-        except FitError as error:
-            raise FitError(f"{error}{advice}", **error.attributes) from error
-        return
+    """Raise SceneError where nothing reads what in a capture's folder was meant to show the object."""
     folder = capture.folder
-    visual = None if folder is None else inputs(folder, capture.settings)
+    visual = None if folder is None or capture.surface is not None else inputs(folder, capture.settings)
     if visual is not None and not visual.reconstructs and visual.unused:
         raise SceneError(
-            f"{folder}: expected the object's shape, got none; {'; '.join(visual.unused[:3])}{advice}",
+            f"{folder}: expected the object's shape, got none; {'; '.join(visual.unused[:3])}{WITHOUT_SHAPE}",
             file=folder,
             name="shape",
             value=visual.unused,
@@ -142,14 +131,11 @@ def misplaced(folder: Path, visual: VisualInputs) -> list[AvmsfWarning | AvmsfEr
 
     It opens some of the photographs, at a low resolution.
     """
-    try:
-        settings, rows = settings_of(folder), read_rows(folder)[0]
-        contacts = contacts_of(rows, settings)
-    except CaptureError:
+    settings = settings_of(folder)
+    impacts = readable_impacts(folder, settings)
+    if not impacts:
         return []
-    if not len(contacts):
-        return []
-    names = [row.cells["file"] for row in rows] if len(rows) == len(contacts) else []
+    contacts, names = contacts_of(impacts), [each.file for each in impacts]
     found = list[AvmsfWarning | AvmsfError]()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CaptureWarning)
@@ -163,7 +149,7 @@ def misplaced(folder: Path, visual: VisualInputs) -> list[AvmsfWarning | AvmsfEr
                 expect_contacts_in_views(contacts, views, settings)
             if visual.gaussians is not None:
                 cloud = without_far(scaled(read_splats(folder / visual.gaussians), settings.views_meters))
-                expect_on_object(contacts, cloud.centers, names=names, what="Gaussians")
+                expect_placed(contacts, cloud.centers, names=names, what="Gaussians")
         except (CaptureError, SceneError) as error:
             found.append(error)
     warned = [each.message for each in caught if isinstance(each.message, CaptureWarning)]
@@ -230,8 +216,8 @@ def _has_alpha(photograph: Path) -> bool:
 def expect_mesh_in_views(surface: Surface, views: Sequence[View], settings: CaptureSettings) -> None:
     """Raise CaptureError where a mesh and the cameras of photographs are in different units.
 
-    Nothing made of the photographs would lie on the mesh then. The error's `value` is the factor on the mesh by which
-    it appears as large as the masks; `settings` are those that both were read by. Views without masks say nothing.
+    Nothing made of the photographs would lie on the mesh then. The error's `value` is the units that mend it;
+    `settings` are those that both were read by. Views without masks say nothing.
     """
     chosen, points = _with_masks(views), surface.vertices.double()
     if not chosen or not len(surface.faces):
@@ -240,12 +226,13 @@ def expect_mesh_in_views(surface: Surface, views: Sequence[View], settings: Capt
     others = {each: _box_difference(each * points, chosen) for each in FACTORS if each != 1}
     factor = min(others, key=others.__getitem__)
     if others[factor] < min(SAME_SHAPE, 0.5 * found):
-        changed = _mending("surface_unit", factor, settings, "scale the cameras or the mesh")
+        size = factor * float((points.amax(0) - points.amin(0)).norm())
+        units = units_by(settings, size, {"unit": factor, "surface_unit": factor, "views_unit": 1.0})
         raise CaptureError(
             f"expected the mesh and the cameras in one unit; the mesh appears as large as the photographs' masks when "
-            f"multiplied by {factor:.4g}; {changed}",
+            f"multiplied by {factor:.4g}; {units_words(units) or 'scale the cameras or the mesh'}",
             name="surface_unit",
-            value=factor,
+            value=units,
         )
 
 
@@ -272,7 +259,8 @@ def expect_contacts_in_views(
 
     Masks of one object have a common volume, the hull, and contacts on it lie inside its mask in every view. Where most
     do not in the median view, a unit is the mistake if nearly all do once it is undone; of several the largest, for
-    contacts that are shrunk enough lie inside whatever they were. Views without masks say nothing.
+    contacts that are shrunk enough lie inside whatever they were. The error's `value` is the units that mend it. Views
+    without masks say nothing.
     """
     chosen = _with_masks(views)
     if not chosen:
@@ -280,8 +268,9 @@ def expect_contacts_in_views(
     if 2 * _share_inside(contacts, chosen) > 1:
         return
     factor = max((each for each in FACTORS if _share_inside(each * contacts, chosen) >= 1 - WRONG_ROWS), default=1.0)
-    changed = _mending("unit", factor, settings, "scale the contacts or the cameras")
-    reason = f"and inside when multiplied by {factor:.4g}; {changed}"
+    size = factor * float((contacts.amax(0) - contacts.amin(0)).norm())
+    units = {} if factor == 1 else units_by(settings, size, {"unit": factor, "views_unit": 1.0})
+    reason = f"and inside when multiplied by {factor:.4g}; {units_words(units) or 'scale the contacts or the cameras'}"
     if factor == 1:
         hull = carve([view.foreground for view in chosen], [view.camera for view in chosen])
         reason = "and the masks have no common volume: check the poses of the cameras"
@@ -293,30 +282,8 @@ def expect_contacts_in_views(
     raise CaptureError(
         f"expected contacts on the object in the photographs, got most outside of its outlines, {reason}",
         name="unit" if factor != 1 else "frame",
-        value=factor,
+        value=units,
     )
-
-
-def expect_on_object(
-    contacts: Float[Tensor, "contacts 3"],
-    points: Float[Tensor, "points 3"],
-    *,
-    names: Sequence[str],
-    what: str = "surface",
-    strict: bool = False,
-) -> None:
-    """Warn with `CaptureWarning` of contacts off `what` the object's points are, with the mistake that may explain it.
-
-    Raises `CaptureError` for contacts in another frame, for one farther off than the object is large, and, if `strict`,
-    for any off it. The `value` of both is the largest distance, meters.
-    """
-    placement = check_placement(contacts, points)
-    words, distance = placement.describe(names, what=what), float(placement.distances.max())
-    apart = placement.fault in ("frame", "unit") or distance > placement.diagonal
-    if words and (apart or (strict and placement.off)):
-        raise CaptureError(words, name="contacts", value=distance)
-    if words:
-        warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)
 
 
 def _with_masks(views: Sequence[View]) -> Sequence[View]:
@@ -335,38 +302,3 @@ def _share_inside(contacts: Float[Tensor, "contacts 3"], views: Sequence[View]) 
         column, row = pixels[view.camera.contains(pixels)].long().T.numpy()
         found.append(float(mask[row, column].sum()) / len(contacts))
     return float(np.median(found))
-
-
-def propose_units(folder: Path, wrong: Sequence[AvmsfWarning | AvmsfError]) -> tuple[Proposal, ...]:
-    """Return the units that mend what `misplaced` found, unless the folder's `capture.toml` has chosen one of them."""
-    path = folder / SETTINGS
-    for each in wrong:
-        units = _fitting_units(each.name, each.value, settings_of(folder))
-        if units and not (path.is_file() and units.keys() & read_toml(path).keys()):
-            reason = f"Multiplied by {each.value:.4g}, the {_SCALED[str(each.name)]} fit the object in the photographs."
-            return tuple(Proposal(key, unit, reason) for key, unit in units.items())
-    return ()
-
-
-_SCALED = {"unit": "contacts", "surface_unit": "mesh's coordinates"}
-"""What the factor is on that an error of a unit has as its value, by the error's name."""
-
-
-def _fitting_units(name: str | None, factor: Any, settings: CaptureSettings) -> dict[str, str]:
-    """Return the settings that mend an error of a unit, whose name is this and whose value this factor."""
-    if name == "unit":
-        unit = unit_named(factor * settings.meters)
-        return {} if unit is None else {"unit": unit}
-    if name != "surface_unit":
-        return {}
-    views, contacts = unit_named(settings.views_meters / factor), unit_named(settings.meters * factor)
-    if views is not None:
-        return {"views_unit": views}
-    mesh = unit_named(settings.surface_meters * factor)
-    return {} if contacts is None or mesh is None else {"unit": contacts, "surface_unit": mesh}
-
-
-def _mending(name: str, factor: float, settings: CaptureSettings, otherwise: str) -> str:
-    """Return what to write in capture.toml against an error of a unit, or what to do where no unit mends it."""
-    lines = [f'{key} = "{unit}"' for key, unit in _fitting_units(name, factor, settings).items()]
-    return f"write {' and '.join(lines)} in capture.toml" if lines else otherwise

@@ -226,7 +226,8 @@ class MixtureEstimator(GainEstimator):
             if self.bodies is None:
                 advice = self.missing or "give its mesh"
                 raise FitError.expected("the object's shape", name=Elastic.kind, advice=advice)
-            expect_placed(data.train.contacts, self.bodies.bodies[0].elastic.points, names=data.train.names)
+            points = self.bodies.bodies[0].elastic.points
+            expect_placed(data.train.contacts, points, names=data.train.names, elastic=True)
         except FitError as error:
             if self.name == Elastic.kind:
                 raise
