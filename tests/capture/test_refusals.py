@@ -92,7 +92,7 @@ TABLES = [
 """Headers and rows, and the row, name and value of the error."""
 
 SETTINGS = [
-    ("second = 2.0", "second", "seconds"),
+    ("second = 2.0", "second", "second"),
     ('seconds = "3"', "seconds", "3"),
     ("seconds = true", "seconds", True),
     ("response_channel = 1.5", "response_channel", 1.5),

@@ -142,20 +142,20 @@ class RecordError(AvmsfError, ValueError):
 
 
 def record_of(
-    kind: type[_Record], values: Any, name: str, *, added: Mapping[str, Any] = MappingProxyType({})
+    kind: type[_Record], values: Any, name: str = "", *, added: Mapping[str, Any] = MappingProxyType({})
 ) -> _Record:
     """Return a dataclass's record from a dict of exactly its fields, each of its type.
 
     `name` is what errors call the record; `added` are the values of fields that may be missing. Raises RecordError for
     other fields that are missing, for fields that are unknown or of another type, and for what is not a dict.
     """
-    hints = get_type_hints(kind)
+    hints, owner = get_type_hints(kind), f"{name}." if name else ""
     values = {each: value for each, value in added.items() if each in hints} | like(values, {}, name)
-    if values.keys() != hints.keys():
-        differing = sorted(values.keys() ^ hints.keys())
-        got = f"{', '.join(differing)}, missing or unknown"
-        raise RecordError.expected("its own keys", values.get(differing[0]), got=got, name=f"{name}.{differing[0]}")
-    return kind(**{each: typed(value, hints[each], f"{name}.{each}") for each, value in values.items()})
+    for each in sorted(values.keys() ^ hints.keys()):
+        if each in hints:
+            raise RecordError.expected(words_of(hints[each]), name=f"{owner}{each}")
+        raise RecordError.unknown(each, hints, name=f"{owner}{each}")
+    return kind(**{each: typed(value, hints[each], f"{owner}{each}") for each, value in values.items()})
 
 
 def without_defaults(values: Mapping[str, Any], added: Mapping[str, Any]) -> dict[str, Any]:
@@ -185,8 +185,21 @@ def typed(value: Any, hint: Any, name: str) -> Any:
     """Return a JSON value as a type. Raises RecordError where it is of another."""
     found = as_type(value, hint)
     if found is OTHER:
-        raise RecordError.expected(getattr(hint, "__name__", str(hint)), value, got=repr(value), name=name)
+        raise RecordError.expected(words_of(hint), value, got=repr(value), name=name)
     return found
+
+
+def words_of(hint: Any) -> str:
+    """Return in plain words what is of a type."""
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return f"one of {', '.join(map(str, parts))}"
+    if kind is tuple:
+        return f"[{', '.join('...' if each is Ellipsis else words_of(each) for each in parts)}]"
+    if kind in (Union, UnionType):
+        return " or ".join(words_of(each) for each in parts if each is not type(None))
+    words = {str: "text", int: "a whole number", float: "a number", bool: "true or false", dict: "an object"}
+    return words[hint] if hint in words else getattr(hint, "__name__", str(hint))
 
 
 def like(value: Any, example: Any, name: str) -> Any:

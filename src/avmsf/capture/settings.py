@@ -1,13 +1,10 @@
 """What a capture's owner knows about its recordings: the contents of `capture.toml`, every key optional."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from difflib import get_close_matches
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
 
-from avmsf._utils.text import OTHER, as_type, read_toml
+from avmsf._utils.text import RecordError, read_toml, record_of
 from avmsf.errors import CaptureError
 
 SETTINGS, TABLE = "capture.toml", "impacts.csv"
@@ -151,37 +148,13 @@ class CaptureSettings:
         """Read a TOML file of these keys; `CaptureError` names the file, the key and what was expected."""
         path = Path(path)
         try:
-            table = read_toml(path)
+            return record_of(cls, read_toml(path), added=asdict(cls()))
         except FileNotFoundError as error:
             raise CaptureError.expected("a file of capture settings", file=path) from error
+        except (CaptureError, RecordError) as error:
+            raise CaptureError(f"{path}: {error}", file=path, name=error.name, value=error.value) from error
         except (OSError, ValueError) as error:
             raise CaptureError.expected("a TOML file", got=f"one that cannot be read: {error}", file=path) from error
-        return cls.of(table, name=str(path), file=path)
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any], *, name: str, file: Path | None = None) -> "CaptureSettings":
-        """Return settings of these keys' plain values; `CaptureError` gives `name`, the key and what was expected."""
-        known = {field.name: field.type for field in fields(cls)}
-        try:
-            return cls(**{key: _typed(key, value, known) for key, value in values.items()})
-        except CaptureError as error:
-            raise CaptureError(f"{name}: {error}", file=file, name=error.name, value=error.value) from error
-
-
-def _typed(key: str, value: Any, known: Mapping[str, Any]) -> Any:
-    """Return the value as its key's type; whole numbers serve as numbers, and `true` as neither."""
-    if key not in known:
-        similar = next(iter(get_close_matches(key, known, n=1)), None)
-        advice = "" if similar is None else f"did you mean {similar}?"
-        wanted, got = f"keys among {', '.join(known)}", "another one"
-        raise CaptureError.expected(wanted, similar, got=got, name=key, advice=advice)
-    found = as_type(value, known[key])
-    if found is OTHER:
-        kinds = get_args(known[key]) or (known[key],)
-        names = {str: "text", int: "a whole number", float: "a number", bool: "true or false"}
-        expected = " or ".join(name for kind, name in names.items() if kind in kinds) or _POINTS
-        raise CaptureError.expected(expected, value, name=key)
-    return found
 
 
 def unit_named(meters: float) -> str | None:

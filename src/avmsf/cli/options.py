@@ -21,7 +21,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
 
 import tyro
 
-from avmsf._utils.text import OTHER, as_type, flat, read_toml
+from avmsf._utils.text import OTHER, as_type, flat, read_toml, words_of
 from avmsf.capture.issues import Issues
 from avmsf.capture.settings import settings_of
 from avmsf.capture.table import present_impacts, read_impacts
@@ -258,8 +258,7 @@ def _parsed(name: str, value: Any, hint: Any) -> Any:
         found = as_type(candidate, hint)
         if found is not OTHER:
             return found
-    kind = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
-    raise InputError.expected(f"a value of the type {kind}", value, name=name.removeprefix("scene."))
+    raise InputError.expected(words_of(hint), value, name=name.removeprefix("scene."))
 
 
 def _readings(text: str) -> Iterator[Any]:

@@ -125,7 +125,7 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         per_newton=like(origin["per_newton"], True, "origin.per_newton"),
         config=record_of(FitConfig, config, "config", added=ADDED_SETTINGS),
         report=_checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
-        settings=CaptureSettings.of(like(origin["settings"], {}, "origin.settings"), name="origin.settings"),
+        settings=record_of(CaptureSettings, origin["settings"], "origin.settings", added=asdict(CaptureSettings())),
     )
     if (quality := read.report.get("quality")) is not None:
         FieldQuality.of(quality)
