@@ -36,9 +36,6 @@ def test_every_row_is_its_blow(tmp_path):
     assert len(found) == 15
     assert Counter(row["midi_note"] for row in found) == {str(note): 3 for note in range(36, 41)}
     assert len({(row["x"], row["y"], row["z"]) for row in found}) == 5
-    # A sound holds no time of writing, so that equal sounds are equal files.
-    content = (tmp_path / "grid" / "sounds" / "001-1.wav").read_bytes()
-    assert content[content.index(b"PEAK") + 12 :][:4] == bytes(4)
     truths, sounds = [], []
     for row in found:
         sound, rate = soundfile.read(tmp_path / "grid" / row["file"])

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import soundfile
 from jaxtyping import Float64, Shaped
 from scipy.ndimage import uniform_filter1d
@@ -16,7 +17,7 @@ from scipy.special import stdtrit
 from avmsf._utils.files import is_lfs_pointer
 from avmsf._utils.text import listed
 from avmsf.capture.filenames import similar_name
-from avmsf.errors import CaptureError, RecordingLengthError
+from avmsf.errors import ArrayError, CaptureError, RecordingLengthError
 
 LOWEST_RATE = 100.0
 HIGHEST_RATE = 192_000.0
@@ -196,17 +197,26 @@ def decode_recording(source: Path | SoundBytes, name: str) -> Recording:
     return Recording(name, np.ascontiguousarray(channels), rate, subtype)
 
 
-def wav_bytes(samples: Shaped[np.ndarray, "frames *channels"], rate: int) -> bytes:
-    """Return a wav file of samples at `rate`, Hz, int16 or else as float32; the same for the same samples."""
-    memory = io.BytesIO()
-    if samples.dtype == np.int16:
-        soundfile.write(memory, samples, rate, subtype="PCM_16", format="WAV")
-    else:
-        soundfile.write(memory, samples.astype(np.float32), rate, subtype="FLOAT", format="WAV")
-    content = memory.getvalue()
-    # The time of writing is behind the name, the length and the version, four bytes each, of the chunk PEAK.
-    start = content.find(b"PEAK", 0, 256) + 12
-    return content if start < 12 else content[:start] + bytes(4) + content[start + 4 :]
+def wav_bytes(
+    samples: Shaped[np.ndarray, "frames *channels"], rate: int, *, coding: str = "float32", file: Path | None = None
+) -> bytes:
+    """Return a wav file of samples at `rate`, Hz, as float32 or int16; the same for the same samples.
+
+    Raises ArrayError, about `file`, for samples that are not finite, and for what 16 bits would clip.
+    """
+    coded, memory = samples.astype(np.float32), io.BytesIO()
+    wrong, peak = int((~np.isfinite(coded)).sum()), float(np.abs(coded).max(initial=0.0))
+    if wrong:
+        got, advice = f"{wrong} of {coded.size} that are not", "fit the field again, or choose a smaller force or level"
+        raise ArrayError.expected("finite samples", wrong, got=got, file=file, name="finite", advice=advice)
+    if coding == "int16":
+        if round(peak * 2**15) >= 2**15:
+            got, wanted = f"{peak:.3g} ({20 * math.log10(peak):+.1f} dB)", "amplitudes below 1 for 16 bits"
+            advice = "add --normalize peak, lower --level-db, or write float32"
+            raise ArrayError.expected(wanted, peak, got=got, file=file, name="peak", advice=advice)
+        coded = np.rint(coded * 2**15).astype(np.int16)
+    scipy.io.wavfile.write(memory, rate, coded)
+    return memory.getvalue()
 
 
 def check_not_silent(sound: Float64[np.ndarray, " frames"], recording: Recording) -> None:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _LOW_LEVEL_DBFS = -20.0
 """Peak in decibels of full scale below which sounds are noted as quiet."""
-_LARGEST_INT16 = 2**15 - 1
 Coding = Literal["float32", "int16"]
 
 
@@ -163,31 +162,15 @@ def peak_factor(
 ) -> float:
     """Return the one factor on all sounds by which the loudest peaks at a level against full scale, dB."""
     peak = float(sounds.abs().max())
-    full = 1.0 if coding == "float32" else _LARGEST_INT16 / 2**15
+    full = 1.0 if coding == "float32" else (2**15 - 1) / 2**15
     return 10 ** (level_db / 20) * (full / peak if peak > 0 else 1.0)
 
 
 def write_sound(
     path: Path, sound: "Float[Tensor, ' samples']", *, sample_rate: float, coding: Coding = "float32"
 ) -> None:
-    """Write a mono wav file. Raises `OutputError` for samples that are not finite and for what would clip."""
-    import numpy as np
-
+    """Write a mono wav file. Raises ArrayError as `wav_bytes`."""
     from avmsf._utils.files import write_whole
     from avmsf.capture.audio import wav_bytes
 
-    samples = sound.numpy().astype(np.float32)
-    if wrong := int((~np.isfinite(samples)).sum()):
-        got, advice = (
-            f"{wrong} of {len(samples)} that are not",
-            "fit the field again, or choose a smaller force or level",
-        )
-        raise OutputError.expected("finite samples", wrong, got=got, file=path, name="finite", advice=advice)
-    peak = float(np.abs(samples).max(initial=0.0))
-    if coding == "int16" and round(peak * 2**15) > _LARGEST_INT16:
-        got = f"{peak:.3g} ({20 * math.log10(peak):+.1f} dB)"
-        wanted, advice = "amplitudes below 1 for 16 bits", "add --normalize peak, lower --level-db, or write float32"
-        raise OutputError.expected(wanted, peak, got=got, file=path, name="peak", advice=advice)
-    # Rounded here: libsndfile rounds down.
-    coded = samples if coding == "float32" else np.rint(samples * 2**15).astype(np.int16)
-    write_whole(path, wav_bytes(coded, round(sample_rate)))
+    write_whole(path, wav_bytes(sound.numpy(), round(sample_rate), coding=coding, file=path))

@@ -102,7 +102,7 @@ def write_grid(
             sound = scale * sounds[place]
             loudest = float(sound.abs().max())
             name = f"{SOUNDS}/{place + 1:03d}-{number}.wav"
-            files[name] = _wav(sound, rate)
+            files[name] = wav_bytes(sound.numpy(), rate)
             level = f"{20 * math.log10(loudest):.2f}" if loudest > 0 else "-inf"
             how = (f"{layer.force:g}", f"{layer.contact_time:g}", note, *velocities)
             records.append((name, *where, *how, f"{samples / rate:.6g}", level, row))
@@ -152,13 +152,6 @@ def _chosen(field: SampledField, range_db: float) -> tuple[Int64[Tensor, " chose
     audible = energy_db >= energy_db.max() - range_db
     left = f"{counted(int((~audible).sum()), 'contact')} left out, {range_db:g} dB or more below the loudest"
     return torch.nonzero(audible).flatten(), [] if audible.all() else [left]
-
-
-def _wav(sound: Float32[Tensor, " samples"], rate: int) -> bytes:
-    if not bool(sound.isfinite().all()):
-        advice = "fit the field again, or export smaller forces"
-        raise ExportError.expected("finite numbers", got="NaN or infinity", name="samples", advice=advice)
-    return wav_bytes(sound.numpy(), rate)
 
 
 def _curves(amplitude: Float64[np.ndarray, " layers"], edges: Int[np.ndarray, " edges"]) -> list[str]:
