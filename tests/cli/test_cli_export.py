@@ -265,3 +265,22 @@ def test_a_captures_mesh_is_as_large_as_the_field(size, field_file, tmp_path, ca
 def test_one_contact_of_an_object_is_exported_with_its_surface(tmp_path: Path) -> None:
     output = export(saved(elastic(), tmp_path), "gltf", tmp_path / "one.glb", "--position", 0.05, 0.02, 0.002)
     np.testing.assert_allclose(sorted(shown_in(output).extents), sorted(SIDES), rtol=0.05)
+
+
+@pytest.mark.parametrize("given", [("--contacts", 1), ("--position", 0.05, 0.03, 0.002)])
+def test_longer_wavs_have_noise_to_their_end(given: tuple[Any, ...], field_file: Path, tmp_path: Path) -> None:
+    folder = export(field_file, "wavs", tmp_path / "w", *given, "--seconds", 0.4)
+    scale = json.loads((folder / "manifest.json").read_text())["scale"]
+    (row,) = table_of(folder / "samples.csv")
+    place = [[float(row[axis]) for axis in "xyz"]]
+    expected = scale * load(field_file).render(place, forces=1.0, samples=3200)[0]
+    np.testing.assert_allclose(soundfile.read(folder / row["file"])[0], expected.numpy(), atol=1e-5)
+
+
+def test_what_only_render_adds_is_said(field_file: Path, tmp_path: Path, capsys: Streams) -> None:
+    field = load(field_file)
+    heard = replace(field.residual, recordings=torch.zeros(len(field.gain_field.contacts), SAMPLES))
+    save(replace(field, residual=heard), tmp_path / "heard.safetensors")
+    for words, said in (((), True), (("--no-noise",), False)):
+        export(tmp_path / "heard.safetensors", "wavs", tmp_path / f"{said}", "--contacts", 1, *words)
+        assert ("in no export" in capsys.readouterr().err) == said

@@ -48,6 +48,13 @@ def sounding(
     return SoundField(BANK, gains, phases, residual, 8000.0, SAMPLES, origin)
 
 
+def test_without_a_body_normals_oppose_the_impacts_whose_gains_are_written():
+    made = sounding("directional")
+    table = SampledField.of(made, limit=40)
+    against = made.complex_gains(table.points, directions=-table.normals)
+    torch.testing.assert_close(against, made.complex_gains(table.points), rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize(
     ("phase", "scaled", "pulse", "background_force"),

@@ -121,6 +121,11 @@ def test_a_impact_is_what_python_renders(page: "Page", table: SampledField, impa
     assert error(heard(page, [impact]), expected) < 1e-6
 
 
+def test_a_rate_that_browsers_do_not_read_is_resampled(any_page: "Page") -> None:
+    found = any_page.evaluate("async () => Array.from(await resample(Float32Array.of(0, 1, 0, -1), 400, 800))")
+    assert found == [0, 0.5, 1, 0.5, 0, -0.5, -1, -1]
+
+
 def test_a_harder_impact_has_the_same_background(any_page: "Page", tables: dict[str, SampledField]) -> None:
     """Of forces relative to the average impact's, which is of 9 N, and in the unit of its sound over its force."""
     steady = replace(tables["shared"], background_force=9.0)

@@ -154,6 +154,8 @@ def run(options: Options) -> int:
         if users and options.to not in users and getattr(options, each.name) != each.default:
             note(f"{option_of(each.name)} is not used by --to {options.to}, only by {', '.join(users)}")
     field = load(options.inputs[0])
+    if field.residual.recordings is not None and not options.no_noise:
+        note("what the nearest recordings have in addition to their modes is in no export, unlike in avmsf render")
     source, settings = _for_format(field, options)
     written = write(
         source, options.output, to=options.to, contacts=options.contacts, noise=not options.no_noise,
@@ -197,12 +199,14 @@ def _for_format(field: "SoundField", options: Options) -> "tuple[SoundField | Sa
     from avmsf.cli.contacts import contacts_on
     from avmsf.editing.modal_edit import EDITS
     from avmsf.export.sampled_field import SampledField
+    from avmsf.export.samples import samples_in
     from avmsf.mesh.surface import Surface
 
     source: SoundField | SampledField = field
     if options.contacts_given:
         contacts = contacts_on(field, options.position, options.contact_table, unit=options.unit)
-        source = SampledField.of(field, contacts.places, directions=contacts.directions)
+        samples = samples_in(options.seconds, field.sample_rate) if options.to == "wavs" else None
+        source = SampledField.of(field, contacts.places, directions=contacts.directions, samples=samples)
     settings: dict[str, Any] = {}
     match options.to:
         case "web":

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from avmsf._utils.arrays import fibonacci_sphere
 from avmsf.errors import ExportError
+from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import points_on_object
 from avmsf.field.sound_field import SoundField
 from avmsf.mesh.neighborhoods import read_neighborhoods
@@ -50,7 +51,7 @@ class SampledField:
     gains: Complex64[Tensor, "points modes"]
     """Amplitudes of the sines, and of the cosines times i, in the unit of the training sounds."""
     noise: Float32[Tensor, " samples"]
-    """Residual noise: the realization that `SoundField.render` adds without forces."""
+    """Residual noise: the realization that `SoundField.render` adds without forces to sounds of this length."""
     sample_rate: float
     """Samples per second of the training sounds, Hz."""
     per_newton: bool = False
@@ -73,13 +74,16 @@ class SampledField:
         *,
         directions: Float[Tensor, "points 3"] | None = None,
         limit: int | None = None,
+        samples: int | None = None,
     ) -> "SampledField":
         """Return the field at `points` (object frame, meters), by default at its own that lie on the object.
 
         More than `limit` points are reduced to evenly spread ones. `normals` are outward normals; by default those of
-        the field's body, or without a body estimated from its points. `directions` are those of the impacts at given
-        points, as in `SoundField.render`; one of length zero is against the normal. Raises `ExportError` for no
-        points, points that are not finite, and a field without a mode below half the sample rate.
+        the field's body, or without a body the opposites of the directions that the gains are of, or where these know
+        none estimated from its points. `directions` are those of the impacts at given points, as in
+        `SoundField.render`; one of length zero is against the normal. `samples` is the length of the noise, by default
+        that of the training sounds. Raises `ExportError` for no points, points that are not finite, and a field without
+        a mode below half the sample rate.
         """
         places = points_on_object(sound_field.gain_field) if points is None else points
         _check_points(places, normals, limit)
@@ -89,7 +93,10 @@ class SampledField:
             normals, directions = (None if each is None else each[rows] for each in (normals, directions))
         if normals is None:
             normals = sound_field.gain_field.normals(places)
-        own = sound_field.gain_field.points.detach()
+        own, fitted = sound_field.gain_field.points.detach(), sound_field.gain_field.fitted
+        if normals is None and isinstance(fitted, MixtureGains) and fitted.directional:
+            # Without a body impacts go as the nearest recorded one, whatever lies around them.
+            normals = -fitted.sites(places.double() / sound_field.gain_field.length).directions
         if normals is None:
             # Of all its points: a few do not tell how the surface lies.
             some = own[:: max(1, len(own) // _POINTS_OF_NORMALS)]
@@ -108,7 +115,7 @@ class SampledField:
             sound_field.bank.frequency[audible],
             known.dampings(sound_field.bank.damping)[..., audible],
             (known.mean * turn)[:, audible].to(torch.complex64),
-            sound_field.noise().float(),
+            sound_field.noise(samples).float(),
             sound_field.sample_rate,
             sound_field.origin.per_newton,
             sound_field.residual.force,
@@ -119,7 +126,7 @@ class SampledField:
 
     @property
     def samples(self) -> int:
-        """Length of the training sounds."""
+        """Length of the noise: that of the training sounds, unless another was asked for."""
         return len(self.noise)
 
     @property
@@ -187,7 +194,7 @@ class SampledField:
     ) -> Float32[Tensor, "contacts samples"]:
         """Return the sounds of impacts at the points of some rows, as `SoundField.render` does.
 
-        `samples` is the length, by default that of the training sounds, after whose end there is no noise.
+        `samples` is the length, by default that of the noise, after whose end there is none.
         """
         length = self.samples if samples is None else samples
         added = torch.nn.functional.pad(self.noise, (0, max(0, length - self.samples)))[:length]

@@ -80,7 +80,7 @@ def write_grid(
     _check(field, layers, seconds, range_db)
     rate = round(field.sample_rate)
     rows, remarks = _chosen(field, range_db)
-    samples = field.samples if seconds is None else max(1, round(seconds * rate))
+    samples = samples_in(seconds, rate) or field.samples
     rendered = []
     for layer in layers:
         pulse = ForcePulse(layer.contact_time, layer.shape)
@@ -118,6 +118,11 @@ def write_grid(
         named = ", ".join(f"{layer.force:g} ({layer.contact_time:g} s)" for layer in ordered)
         remarks.append(f"layers are sorted from soft to loud: force (contact time) {named}")
     return Written(write_folder(Path(folder), files, manifest, overwrite=overwrite), tuple(remarks))
+
+
+def samples_in(seconds: float | None, sample_rate: float) -> int | None:
+    """Return how many samples, 1 or more, last so long; None for None, and for what no sound lasts."""
+    return max(1, round(seconds * sample_rate)) if seconds is not None and 0 < seconds < math.inf else None
 
 
 def _on_background(field: SampledField, sounds: Float32[Tensor, "rows samples"]) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 from avmsf.errors import ExportError
 from avmsf.export import write_demo, write_faust, write_gltf, write_grid, write_universal, write_webpage
 from avmsf.export.sampled_field import SampledField
+from avmsf.export.samples import samples_in
 from avmsf.export.writing import FORMATS, Format, Written
 from avmsf.field.gains.model import points_on_object
 from avmsf.field.sound_field import SoundField
@@ -65,7 +66,8 @@ def write(
     if isinstance(field, SampledField):
         sampled = field
     else:
-        sampled = SampledField.of(field, limit=FORMATS[kind].points if contacts is None else contacts)
+        limit = FORMATS[kind].points if contacts is None else contacts
+        sampled = SampledField.of(field, limit=limit, samples=samples_in(options.get("seconds"), field.sample_rate))
         held = len(points_on_object(field.gain_field))
         if contacts is None and len(sampled) < held:
             remarks = (f"written: {len(sampled)} of the field's {held} contacts; `contacts` sets the number",)
