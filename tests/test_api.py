@@ -19,6 +19,7 @@ from avmsf.cli import main
 from avmsf.errors import (
     ArrayError,
     AvmsfError,
+    AvmsfWarning,
     CaptureError,
     EditError,
     EvaluationError,
@@ -156,6 +157,30 @@ def test_a_recording_is_located_by_its_path_or_its_samples(tmp_path):
     assert all(float((place - expected).norm()) < 0.03 for place in places)  # meters
 
 
+def test_a_result_may_be_changed_in_place():
+    sound = capture().impacts.sounds[3]
+    found = avmsf.locate(field(), sound, progress=False)
+    kept = found.position.clone()
+    place = found.position
+    place *= 1000
+    assert torch.equal(found.position, kept)
+    found.points.mul_(1000)
+    assert torch.equal(avmsf.locate(field(), sound, progress=False).position, kept)
+
+
+def test_levels_by_force_and_as_recorded_are_not_compared_without_a_word():
+    with warns(AvmsfWarning, name="test"):
+        avmsf.evaluate(field(), replace(capture().impacts, forces=None))
+
+
+def test_numbers_of_numpy_and_devices_of_torch_serve_as_settings():
+    one, other = (avmsf.split(capture(), seed=each)[0].impacts.names for each in (3, np.int64(3)))
+    assert one == other
+    settings = {"config": PipelineConfig(modes=2), "seed": np.int64(3), "device": torch.device("cpu")}
+    made = avmsf.fit(capture(), "smooth", **settings, progress=False)
+    assert (made.origin.report["pipeline"]["device"], made.origin.config.seed) == ("cpu", 3)
+
+
 def test_evaluation_aligns_recordings_as_the_fit_did(tmp_path):
     train, test = avmsf.split(avmsf.Capture("plate", strikes(12, starts=delays(12))))
     made = avmsf.fit(train, config=PipelineConfig(modes=5), progress=False)
@@ -174,8 +199,16 @@ def test_impacts_and_surfaces_are_made_of_arrays(tmp_path):
     made = Impacts.of(given.contacts.tolist(), given.sounds.numpy(), RATE, forces=given.forces.tolist())
     assert torch.equal(made.sounds, given.sounds)
     assert made.names[0] == "001"
+    assert impacts_of(names=range(len(given))).names[0] == "0"
+    mask = given.contacts[:, 0] > float(given.contacts[:, 0].median())
+    for rows in (mask, mask.numpy(), mask.tolist()):
+        assert given.take(rows).names == given.take(mask.nonzero().flatten()).names
     surface = avmsf.Surface.of([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.array([[0, 1, 2]]))
-    surface.write(tmp_path / "a.ply")
+    for name in ("a.obj", "a.glb", "a.ply"):
+        surface.write(tmp_path / name)
+        assert len(avmsf.Surface.read(tmp_path / name).faces) == len(surface.faces)
+    with raises(CaptureError, name="kind"):
+        surface.write(tmp_path / "a.stl")
     assert torch.equal(avmsf.Surface.read(tmp_path / "a.ply").vertices, surface.vertices)
 
 
@@ -206,6 +239,7 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         (lambda: avmsf.split(capture(), "a"), EvaluationError, {}),
         (lambda: avmsf.split(np.zeros((3, 3))), EvaluationError, {"name": "recordings", "value": "ndarray"}),
         (lambda: avmsf.Capture(capture().impacts, "plate"), CaptureError, {"name": "impacts", "value": "str"}),
+        (lambda: avmsf.Capture("a", capture().impacts, "a.ply"), CaptureError, {"name": "surface", "value": "str"}),
         *(
             (lambda where=where: field().render(where), ArrayError, {"name": "positions", "row": row})
             for where, row in (
@@ -240,6 +274,11 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         (lambda: avmsf.Surface.of(CORNERS, [[0, 1, 1.5]]), ArrayError, {"name": "faces", "row": 0}),
         # Before anything is computed.
         (lambda: avmsf.fit(far(), progress=False), CaptureError, {"name": "contacts"}),
+        (lambda: avmsf.fit(ALONE, device="mps", progress=False), FitError, {"name": "device"}),
+        (
+            lambda: avmsf.fit(avmsf.Capture("plate", impacts_of(sample_rate=250_000)), progress=False),
+            *(FitError, {"name": "sample_rate", "value": 250_000.0}),
+        ),
         (posterior_of_a_network, FitError, {}),
         (lambda: avmsf.suggest(field(), 1, candidates=[0.02, 0.03]), ArrayError, {"name": "candidates"}),
         (lambda: avmsf.suggest(field(), 2.5), AvmsfError, {"name": "count", "value": 2.5}),

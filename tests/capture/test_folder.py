@@ -91,6 +91,10 @@ def test_a_written_capture_is_aligned_held_and_measured_as_the_one_it_was_read_f
         torch.testing.assert_close(
             getattr(again.impacts, name), getattr(read.impacts, name), rtol=0, atol=0, equal_nan=True
         )
+    peaks = read_capture(tmp_path / "cup", CaptureSettings(time_zero="peak"))
+    peaks.write(tmp_path / "peaks")
+    assert read_capture(tmp_path / "peaks").settings.from_peaks
+    assert torch.equal(read_capture(tmp_path / "peaks").impacts.sounds, peaks.impacts.sounds)
     assert again.settings.held_at == read.settings.held_at
     assert [*again.settings.unit_ratios(0.2).values()] == [*read.settings.unit_ratios(0.2).values()] == [1.0]
 

@@ -55,6 +55,7 @@ def trace(field, guide, **arguments):
     return made, seen
 
 
+@torch.no_grad()
 def test_a_small_change_is_found_by_descent():
     made, seen = trace(ringing_field(), towards(pitch=1.004, damping=1.5), config=replace(QUICK, steps=50))
     wanted = ringing_field(pitch=1.004, damping=1.5).bank

@@ -48,6 +48,14 @@ def sounding(
     return SoundField(BANK, gains, phases, residual, 8000.0, SAMPLES, origin)
 
 
+def test_points_may_be_arrays_and_lists():
+    made = sounding("positional")
+    places = made.gain_field.points[:3]
+    found = [SampledField.of(made, each).gains for each in (places, places.numpy(), places.tolist())]
+    assert torch.equal(found[0], found[1])
+    torch.testing.assert_close(found[0], found[2])
+
+
 def test_without_a_body_normals_oppose_the_impacts_whose_gains_are_written():
     made = sounding("directional")
     table = SampledField.of(made, limit=40)

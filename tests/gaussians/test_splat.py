@@ -1,6 +1,9 @@
 """Fits of Gaussians to photographs, and the similarity of images."""
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -76,6 +79,22 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(tmp_path: Path, background:
     for others, settings in ((views, replace(config, seed=5)), (views[1:], config)):
         with raises(SceneError, file=place, value=["view, initial point or setting"]):
             splat(others, settings, checkpoint=place)
+
+
+def test_a_fit_does_not_depend_on_the_mode_of_gradients() -> None:
+    with torch.no_grad():
+        assert len(splat(ball_views(4), replace(QUICK, steps=1))) > 0
+
+
+@pytest.mark.slow
+def test_kernels_leave_torchs_number_of_threads_alone() -> None:
+    code = "import torch; torch.set_num_threads(1); from factories.ball_views import ball_views; "
+    code += "from avmsf.gaussians import SplatConfig, splat; splat(ball_views(4), SplatConfig(steps=1)); "
+    code += "print(torch.get_num_threads())"
+    paths = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, sys.path)])
+    environment = {name: each for name, each in os.environ.items() if name != "NUMBA_NUM_THREADS"}
+    said = subprocess.check_output([sys.executable, "-c", code], text=True, env=environment | {"PYTHONPATH": paths})
+    assert said.strip() == "1"
 
 
 def test_a_background_of_whole_numbers_is_a_color() -> None:

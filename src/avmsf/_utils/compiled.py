@@ -61,8 +61,14 @@ def _has_space() -> bool:
 def lane_count() -> int:
     """Return how many threads a kernel runs on: as many as numba is given, `NUMBA_NUM_THREADS`, up to `MAX_LANES`."""
     import numba
+    import torch
 
-    return min(numba.get_num_threads(), MAX_LANES)
+    threads = torch.get_num_threads()
+    count = numba.get_num_threads()
+    # Its first call starts OpenMP with all cores, and torch may share that.
+    if torch.get_num_threads() != threads:
+        torch.set_num_threads(threads)
+    return min(count, MAX_LANES)
 
 
 def run_lanes(kernel: Callable[..., Any], lanes: int, *arguments: Any) -> None:

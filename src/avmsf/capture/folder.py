@@ -42,10 +42,10 @@ class Capture:
     """Folder that it was read from, which may hold photographs, a video or Gaussians."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.impacts, Impacts):
-            raise CaptureError.expected(
-                "Impacts, as in Capture(name, impacts, surface)", type(self.impacts).__name__, name="impacts"
-            )
+        wanted = "Impacts and perhaps a Surface, as in Capture(name, impacts, surface)"
+        for name, kind in (("impacts", Impacts), ("surface", Surface | None)):
+            if not isinstance(value := getattr(self, name), kind):
+                raise CaptureError.expected(wanted, type(value).__name__, name=name)
 
     def __repr__(self) -> str:
         surface = "no surface" if self.surface is None else repr(self.surface)
@@ -190,6 +190,8 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     # Starts that a hammer's channel told are not found anew without it.
     found = read_by.force_channel is None and impacts.before is not None
     sounds, final = list(impacts.sounds), onsets_within is None and not found
+    # A field of sounds that start at their peaks locates recordings from their peaks on.
+    peaks = final and read_by.from_peaks and not bool(impacts.sounds.abs().argmax(1).any())
     if not final and impacts.before is not None and impacts.after is not None:
         whole = torch.cat([impacts.before, impacts.sounds, impacts.after], dim=1)
         sounds = [each[~each.isnan()] for each in whole]
@@ -207,7 +209,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
         f"seconds = {seconds!r}\n"
         f"playback_speed = {speed!r}\n"
         f'normalize = "{"none" if impacts.forces is None else "done"}"\n'
-        + ("align = false\n" if final else "")
+        + ('time_zero = "peak"\n' if peaks else "align = false\n" if final else "")
         + ('surface_unit = "m"\n' if read_by.unit_stated else "")
         + (f"held = {json.dumps(read_by.held_at)}\n" if read_by.held else "")
     )

@@ -70,7 +70,7 @@ class Impacts:
         count = len(places)
         if not count:
             raise ArrayError("contacts: expected one or more, got 0", name="contacts", value=0)
-        named = tuple(f"{row:03d}" for row in range(1, count + 1)) if names is None else tuple(names)
+        named = tuple(f"{row:03d}" for row in range(1, count + 1)) if names is None else tuple(map(str, names))
         if len(named) != count:
             raise ArrayError.expected(f"{count}, one for each contact", len(named), name="names")
         return cls(
@@ -101,9 +101,10 @@ class Impacts:
         known = (self.contacts, self.sounds, self.directions, self.forces, self.before, self.after)
         return content_digest(self.names, self.sample_rate, *known)
 
-    def take(self, rows: Sequence[int]) -> "Impacts":
-        """Return the given rows alone, in the given order."""
-        index = torch.as_tensor(list(rows), dtype=torch.long)
+    def take(self, rows: ArrayLike) -> "Impacts":
+        """Return the given rows alone, in the given order; of a mask, one truth value each, those that are true."""
+        index = torch.from_numpy(np.array(list(rows)))
+        index = index.nonzero().flatten() if index.dtype == torch.bool else index.long()
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         taken: dict[str, Any] = {name: value[index] for name, value in values.items() if isinstance(value, Tensor)}
         return replace(self, names=tuple(self.names[row] for row in index.tolist()), **taken)

@@ -131,6 +131,7 @@ class PreviewScore:
     """Of its weights: scores by others are not mixed."""
 
 
+@torch.enable_grad()
 def edit_towards(
     field: SoundField,
     guide: Guide,

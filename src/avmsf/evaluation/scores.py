@@ -14,7 +14,7 @@ from avmsf._utils.arrays import ArrayLike, as_floats
 from avmsf._utils.text import counted
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
-from avmsf.errors import EvaluationError, PositionWarning
+from avmsf.errors import AvmsfWarning, EvaluationError, PositionWarning
 from avmsf.evaluation.cdpam import Cdpam
 from avmsf.evaluation.metrics import PerContact, validate
 from avmsf.evaluation.modal_metrics import ModalRenderer, compare_modes
@@ -89,6 +89,10 @@ def evaluate(
     made = expect_renderer(renderer)
     lengths = {}
     if isinstance(made, SoundField):
+        if made.origin.per_newton != (impacts.forces is not None):
+            wanted, got = ("divided", "as recorded") if made.origin.per_newton else ("as recorded", "divided")
+            message = f"expected recordings {wanted} by their forces, as the field's, got ones {got}: levels differ"
+            warnings.warn(AvmsfWarning(f"test: {message}", name="test"), stacklevel=2)
         impacts = made.aligned(impacts)
         lengths = {"samples": impacts.sounds.shape[1]}
     if made.sample_rate != impacts.sample_rate:

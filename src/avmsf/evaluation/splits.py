@@ -244,7 +244,7 @@ def split(
         wanted = "a fraction of the contacts between 0 and 1, or their whole number"
         raise EvaluationError.expected(wanted, train_size, name="train_size")
     if seed is not None:
-        start = random.Random(seed).randrange(len(impacts))
+        start = random.Random(int(seed)).randrange(len(impacts))
     distinct = DistinctContacts.of(impacts)
     if isinstance(train_size, float):
         count = distinct.count_of(train_size)

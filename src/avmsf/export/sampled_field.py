@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from avmsf._utils.arrays import fibonacci_sphere
+from avmsf._utils.arrays import ArrayLike, as_floats, fibonacci_sphere
 from avmsf.errors import ExportError
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import points_on_object
@@ -69,10 +69,10 @@ class SampledField:
     def of(
         cls,
         sound_field: SoundField,
-        points: Float[Tensor, "points 3"] | None = None,
-        normals: Float[Tensor, "normals 3"] | None = None,
+        points: ArrayLike | None = None,
+        normals: ArrayLike | None = None,
         *,
-        directions: Float[Tensor, "points 3"] | None = None,
+        directions: ArrayLike | None = None,
         limit: int | None = None,
         samples: int | None = None,
     ) -> "SampledField":
@@ -85,7 +85,9 @@ class SampledField:
         that of the training sounds. Raises `ExportError` for no points, points that are not finite, and a field without
         a mode below half the sample rate.
         """
-        places = points_on_object(sound_field.gain_field) if points is None else points
+        normals = None if normals is None else as_floats(normals, "normals")
+        directions = None if directions is None else as_floats(directions, "directions")
+        places = points_on_object(sound_field.gain_field) if points is None else as_floats(points, "points")
         _check_points(places, normals, limit)
         if limit is not None and len(places) > limit:
             rows = spread_rows(places, limit)

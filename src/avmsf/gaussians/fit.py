@@ -51,6 +51,7 @@ class SplatProgress:
     """The Gaussians as they are; they change with the next step, so copy what is to be kept."""
 
 
+@torch.enable_grad()
 def splat(
     views: Sequence[View],
     config: SplatConfig | None = None,

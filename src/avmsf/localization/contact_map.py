@@ -112,7 +112,7 @@ class ContactPosterior:
     def position(self) -> Float32[Tensor, " 3"]:
         """The most probable position, object frame, meters."""
         self._check_located("position")
-        return self.points[self.most_probable]
+        return self.points[self.most_probable].clone()
 
     def region(self, level: float = LEVEL) -> Bool[Tensor, " points"]:
         """Return the smallest set of points that contains the contact with a probability of `level` or more."""
@@ -177,7 +177,7 @@ class ContactPosterior:
             row = int(own[torch.argmax(self.probability[own])])
             members = torch.zeros(len(self.points), dtype=torch.bool)
             members[own] = True
-            found.append(Peak(row, self.points[row], float(self.probability[own].sum()), members))
+            found.append(Peak(row, self.points[row].clone(), float(self.probability[own].sum()), members))
         found.sort(key=lambda peak: (-peak.probability, peak.row))
         return tuple(peak for peak in found if peak.probability >= least or peak.points[self.most_probable])
 

@@ -124,7 +124,8 @@ class Locator:
         if scaled is not None:
             notes = _force_notes(scaled, free, exponent, length.unit, per_newton=self.field.origin.per_newton)
         return ContactPosterior(
-            self.points,
+            # A locator is kept: who converts a result's unit in place must not change the next one's.
+            self.points.clone(),
             length.distance(values, noise),
             probability,
             explained,

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -69,14 +69,22 @@ class Surface:
         joined = (np.concatenate(vertices) * meters).astype(np.float32)
         return cls(torch.from_numpy(joined), torch.from_numpy(np.concatenate(faces)))
 
-    def write(self, path: str | Path, *, kind: SurfaceKind = "ply") -> None:
-        """Write it in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB."""
+    def write(self, path: str | Path, *, kind: SurfaceKind | None = None) -> None:
+        """Write it in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB.
+
+        Without a `kind` by the name's ending, as PLY where it has none. Raises CaptureError for another ending.
+        """
         import trimesh
 
+        path = Path(path)
+        kind = kind or cast("SurfaceKind", path.suffix.lower()[1:] or "ply")
+        if kind not in get_args(SurfaceKind):
+            wanted = f"a name that ends in .{', .'.join(get_args(SurfaceKind))}, or kind="
+            raise CaptureError.expected(wanted, kind, file=path, name="kind")
         vertices, faces = self.vertices.numpy(), self.faces.numpy()
         cloud = not len(faces)
         shape = trimesh.PointCloud(vertices) if cloud else trimesh.Trimesh(vertices, faces, process=False)  # type: ignore[no-untyped-call]
-        shape.export(Path(path), file_type=kind)
+        shape.export(path, file_type=kind)
 
     def digest(self) -> str:
         """Return a digest of the vertices and triangles."""

@@ -1,5 +1,6 @@
 """From a capture to a field in one call: its shape, from a mesh or from views, its modes, and its gains."""
 
+import operator
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -11,9 +12,11 @@ from typing import Any
 import torch
 
 from avmsf._utils.caching import once
+from avmsf._utils.device import TRAINABLE, usable_device
 from avmsf._utils.progress import ProgressDisplay, ProgressListener
 from avmsf._utils.text import counted
 from avmsf.capture import Capture, CaptureSettings, Impacts, read_capture
+from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE
 from avmsf.capture.checks import find_surface
 from avmsf.capture.settings import settings_of
 from avmsf.errors import AvmsfError, FitError, SceneError
@@ -76,7 +79,7 @@ def fit(
     config: PipelineConfig | None = None,
     cache: str | Path | None = None,
     seed: int | None = None,
-    device: str | None = None,
+    device: str | torch.device | None = None,
     progress: bool = True,
 ) -> SoundField:
     """Fit a sound field to the recordings of a capture, as `avmsf fit` does.
@@ -166,6 +169,9 @@ def fit_in_stages(
     listener = ProgressListener() if listener is None else listener
     train = capture.impacts if train is None else train
     _expect_start(capture, config)
+    if not LOWEST_RATE <= train.sample_rate <= HIGHEST_RATE:
+        wanted, advice = f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", "give another rate: all frequencies scale with it"
+        raise FitError.expected(wanted, train.sample_rate, name="sample_rate", advice=advice)
     with stages.lock("avmsf fit"):
         if len(train) < _FEW:
             listener.note(
@@ -357,13 +363,17 @@ def modes_words(poles: int, supporting: int) -> str:
 
 
 def _configured(
-    config: PipelineConfig, gain_model: GainModelName | None, seed: int | None, device: str | None
+    config: PipelineConfig, gain_model: GainModelName | None, seed: int | None, device: str | torch.device | None
 ) -> PipelineConfig:
     if gain_model is not None:
         config = replace(config, gain_model=gain_model)
     if seed is not None:
+        seed = operator.index(seed) if hasattr(seed, "__index__") else seed
         config = replace(config, fit=replace(config.fit, seed=seed), scene=config.scene.with_seed(seed))
-    return config if device is None else replace(config, device=device)
+    device = config.device if device is None else device
+    if device is None:
+        return config
+    return replace(config, device=str(usable_device(device, raising=FitError, kinds=TRAINABLE)))
 
 
 @contextmanager

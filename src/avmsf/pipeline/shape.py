@@ -233,7 +233,7 @@ def keep_surface(pipeline: Pipeline, make: Callable[[], Surface | ObjectShape], 
     def write(path: Path) -> None:
         shape = make()
         surface = shape if isinstance(shape, Surface) else shape.as_seen()
-        write_whole(path, surface.write, raising=SceneError)
+        write_whole(path, partial(surface.write, kind="ply"), raising=SceneError)
 
     return pipeline.add(Stage(SURFACE, write, recipe=lambda: {"of": digest}))
 
