@@ -64,6 +64,8 @@ WRONG = {
     "farthest plates --objects c": ("object", "c"),
     "predefined plates": ("--test", None),
     "farthest plates --workers 0": ("workers", 0),
+    "shots plates --counts 0 3": ("counts", [0, 3]),
+    "shots plates --starts 0": ("starts", 0),
     "farthest plates --cdpam-contacts -1": ("cdpam_contacts", -1),
     "non-symmetric plates": ("subset", "non-symmetric"),
     "edit plates --objects a,b --methods unedited --output results": ("edit", (0, 0)),

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,14 @@ from avmsf.evaluation.results import ResultsFolder
 from avmsf.evaluation.scores import score
 from avmsf.evaluation.simple_methods import MeanWaveform
 from avmsf.evaluation.splits import (
-    Choosing,
-    Closest,
-    Farthest,
-    FewerViews,
-    LeaveOneOut,
-    Predefined,
-    Shots,
+    Case,
     align_split,
+    closest,
+    farthest,
+    fewer_views,
+    leave_one_out,
+    predefined,
+    shots,
     split,
 )
 from avmsf.features.encoder import Encoder, ImageDescriptors
@@ -67,8 +68,8 @@ def grid(*, apart: float = 0.0, times: int = 3) -> Impacts:
 @pytest.mark.parametrize("name", [name for name, each in PROTOCOLS.items() if each.scoring != "edits"])
 def test_training_and_test_contacts_never_mix(name: str, repeated: tuple[int, ...]) -> None:
     impacts = struck(repeated=repeated)
-    choosing = Predefined(("03", "05", "19")) if name == "predefined" else PROTOCOLS[name].choosing
-    cases = choosing.cases(impacts)
+    settings = {"test": ("03", "05", "19")} if name == "predefined" else {}
+    cases = replace(PROTOCOLS[name], settings=settings).split(impacts)
     assert len({case.key for case in cases}) == len(cases) > 0
     for case in cases:
         assert case.train
@@ -80,9 +81,11 @@ def test_training_and_test_contacts_never_mix(name: str, repeated: tuple[int, ..
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.002])
-@pytest.mark.parametrize("choosing", [Farthest(), Closest(), LeaveOneOut(), Shots(), Shots((3, 2), starts=2)], ids=repr)
-def test_recordings_of_one_contact_stay_on_one_side(choosing: Choosing, apart: float) -> None:
-    cases = choosing.cases(grid(apart=apart))
+@pytest.mark.parametrize("cases_of", [farthest, closest, leave_one_out, shots, partial(shots, counts=(3, 2), starts=2)])
+def test_recordings_of_one_contact_stay_on_one_side(
+    cases_of: Callable[[Impacts], tuple[Case, ...]], apart: float
+) -> None:
+    cases = cases_of(grid(apart=apart))
     for case in cases:
         assert {row % COUNT for row in case.train}.isdisjoint(row % COUNT for row in case.test)
         contacts = len({row % COUNT for row in case.train})
@@ -90,7 +93,7 @@ def test_recordings_of_one_contact_stay_on_one_side(choosing: Choosing, apart: f
         if case.label.split()[0].isdecimal():
             assert contacts == int(case.label.split()[0])
     # The contacts are those that are chosen where each is struck once.
-    once = [case.train for case in choosing.cases(grid(times=1))]
+    once = [case.train for case in cases_of(grid(times=1))]
     assert [tuple(row for row in case.train if row < COUNT) for case in cases] == once
 
 
@@ -110,7 +113,7 @@ def test_a_split_trains_on_farthest_points_and_tests_on_the_rest() -> None:
 
 def test_farthest_is_the_split_that_all_other_commands_make() -> None:
     impacts = struck(repeated=(0, 5, 5, 11))
-    (case,) = Farthest().cases(impacts)
+    (case,) = farthest(impacts)
     assert [impacts.take(rows).names for rows in (case.train, case.test)] == [
         each.names for each in split(impacts, 0.2)
     ]
@@ -118,7 +121,7 @@ def test_farthest_is_the_split_that_all_other_commands_make() -> None:
 
 def test_closest_takes_the_ball_around_the_first_contact() -> None:
     impacts = struck()
-    (case,) = Closest(0.3).cases(impacts)
+    (case,) = closest(impacts, 0.3)
     distance = (impacts.contacts - impacts.contacts[0]).norm(dim=1)
     assert case.train[0] == 0
     assert len(case.train) == 6
@@ -126,7 +129,7 @@ def test_closest_takes_the_ball_around_the_first_contact() -> None:
 
 
 def test_leave_one_out_tests_every_impact_once() -> None:
-    cases = LeaveOneOut().cases(struck(6, repeated=(2,)))
+    cases = leave_one_out(struck(6, repeated=(2,)))
     assert sorted(row for case in cases for row in case.test) == list(range(7))
     assert cases[2].test == (2, 6)
     assert all(len(case.train) + len(case.test) == 7 for case in cases)
@@ -135,27 +138,27 @@ def test_leave_one_out_tests_every_impact_once() -> None:
 
 def test_a_predefined_split_tests_the_named_recordings_and_trains_on_all_at_other_contacts() -> None:
     impacts = struck(6, repeated=(2, 4))
-    (case,) = Predefined(("02", "05")).cases(impacts)
+    (case,) = predefined(impacts, ("02", "05"))
     assert [impacts.names[row] for row in case.test] == ["02", "05"]
     # 06 is at the contact of 02.
     assert {impacts.names[row] for row in case.train} == {"00", "01", "03", "04", "07"}
 
 
 def test_shots_are_nested_and_scored_at_the_same_contacts() -> None:
-    cases = Shots().cases(struck())
+    cases = shots(struck())
     assert [case.label for case in cases] == ["16 shots", "8 shots", "4 shots", "2 shots", "1 shot"]
     assert [len(case.train) for case in cases] == [16, 8, 4, 2, 1]
     for more, fewer in pairwise(cases):
         assert more.train[: len(fewer.train)] == fewer.train
     assert {case.test for case in cases} == {tuple(sorted(set(range(COUNT)) - set(cases[0].train)))}
-    assert [case.label for case in Shots().cases(struck(5))] == ["4 shots", "2 shots", "1 shot"]
-    assert [case.label for case in Shots((2, 2)).cases(struck(5))] == ["2 shots"]
-    assert len(Shots((1,), starts=12).cases(struck(6))) == 6
+    assert [case.label for case in shots(struck(5))] == ["4 shots", "2 shots", "1 shot"]
+    assert [case.label for case in shots(struck(5), (2, 2))] == ["2 shots"]
+    assert len(shots(struck(6), (1,), starts=12)) == 6
 
 
 def test_shots_from_several_starts_have_test_contacts_of_their_own() -> None:
     impacts = struck()
-    cases = Shots((6, 3), starts=2).cases(impacts)
+    cases = shots(impacts, (6, 3), starts=2)
     assert len({case.key for case in cases}) == 4
     for first, own in ((0, cases[:2]), (10, cases[2:])):
         assert {case.fold for case in own} == {f"from {impacts.names[first]}"}
@@ -164,11 +167,9 @@ def test_shots_from_several_starts_have_test_contacts_of_their_own() -> None:
 
 
 def test_fewer_views_change_nothing_but_the_views() -> None:
-    every, few = FewerViews().cases(struck())
+    every, few = fewer_views(struck())
     assert (every.views, few.views) == (None, 12)
-    assert (
-        replace(few, label="farthest", views=None) == replace(every, label="farthest") == Farthest().cases(struck())[0]
-    )
+    assert replace(few, label="farthest", views=None) == replace(every, label="farthest") == farthest(struck())[0]
 
 
 LONELY = replace(struck(3), contacts=torch.zeros(3, 3, dtype=torch.float64))
@@ -178,14 +179,12 @@ REFUSED: dict[str, tuple[Callable[[], Any], str, Any]] = {
     "a part of two contacts": (lambda: split(struck(10).take([0, 1, 0, 1, 0, 1]), 0.2), "count", 2),
     "more than all": (lambda: split(struck(10), 1.5), "train_size", 1.5),
     "a start that is not there": (lambda: split(struck(10), 0.2, start=10), "start", 10),
-    "no predefined test": (lambda: Predefined().cases(struck(6)), "count", 6),
-    "an unknown test": (lambda: Predefined(("02", "99")).cases(struck(6)), "test", "99"),
-    "no shot": (lambda: Shots((0, 3)), "counts", [0, 3]),
-    "no start": (lambda: Shots(starts=0), "starts", 0),
-    "farthest of one contact": (lambda: Farthest().cases(LONELY), "count", 2),
-    "closest of one contact": (lambda: Closest().cases(LONELY), "count", 2),
-    "one contact left out": (lambda: LeaveOneOut().cases(LONELY), "count", 0),
-    "shots of one contact": (lambda: Shots().cases(LONELY), "count", 1),
+    "no predefined test": (lambda: predefined(struck(6)), "count", 6),
+    "an unknown test": (lambda: predefined(struck(6), ("02", "99")), "test", "99"),
+    "farthest of one contact": (lambda: farthest(LONELY), "count", 2),
+    "closest of one contact": (lambda: closest(LONELY), "count", 2),
+    "one contact left out": (lambda: leave_one_out(LONELY), "count", 0),
+    "shots of one contact": (lambda: shots(LONELY), "count", 1),
 }
 
 

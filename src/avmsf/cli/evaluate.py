@@ -98,6 +98,10 @@ class Options(Configured):
         if self.protocol == "predefined" and not self.test:
             wanted, advice = "names of the recordings to test on", "such as --test 009.wav,010.wav"
             raise EvaluationError.expected(wanted, name="--test", advice=advice)
+        if self.protocol == "shots" and min(self.counts, default=0) < 1:
+            raise EvaluationError.expected("numbers of contacts of 1 or more", list(self.counts), name="counts")
+        if self.protocol == "shots" and self.starts < 1:
+            raise EvaluationError.expected("1 start or more", self.starts, name="starts")
         _ = self.all_settings
         detect_dataset(self.data)
 
@@ -190,16 +194,16 @@ def _words(folder: Path, summary: Mapping[str, Any], parts: "Sequence[Section]",
 
 def _protocol_of(options: Options) -> "Protocol":
     """Return the protocol with its own options, and print which of those that were given it does not use."""
-    from avmsf.evaluation.splits import Predefined, Shots
-
     protocol, usual = protocol_named(options.protocol), Options(options.protocol, options.data)
-    for owner, names in {"predefined": ("test",), "shots": ("counts", "starts")}.items():
-        unused = [f"--{name}" for name in names if getattr(options, name) != getattr(usual, name)]
+    own: dict[str, dict[str, Any]] = {
+        "predefined": {"test": words_of(options.test)},
+        "shots": {"counts": options.counts, "starts": options.starts},
+    }
+    for owner, settings in own.items():
+        unused = [f"--{name}" for name in settings if getattr(options, name) != getattr(usual, name)]
         if unused and owner != protocol.name:
             note(f"{', '.join(unused)}: not used by {protocol.name}, only by {owner}")
-    if protocol.name == "shots":
-        return replace(protocol, cases=Shots(options.counts, options.starts))
-    return replace(protocol, cases=Predefined(words_of(options.test))) if protocol.name == "predefined" else protocol
+    return replace(protocol, settings=own.get(protocol.name, {}))
 
 
 def _note_start(methods: "Sequence[Method]", time_zero: TimeZero | None) -> None:

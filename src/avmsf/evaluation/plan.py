@@ -63,7 +63,7 @@ class Evaluation:
             "version": version("avmsf"),
             "source": source_digest(f"{__package__}.runner"),
             "protocol": self.protocol.name,
-            "choosing": repr(self.protocol.choosing),
+            "choosing": {"cases": self.protocol.cases, **self.protocol.settings},
             "dataset": self.title,
             "seed": self.inputs.seed,
             "time_zero": self.time_zero,

@@ -17,7 +17,8 @@ from avmsf.modal.config import ExtractionMethod
 from avmsf.pipeline.config import BodyConfig, Geometry, LiftConfig
 
 if TYPE_CHECKING:
-    from avmsf.evaluation.splits import Choosing
+    from avmsf.capture.impacts import Impacts
+    from avmsf.evaluation.splits import Case
 
 BASELINE = "knn3"
 """The method that all others are compared with."""
@@ -219,8 +220,8 @@ class Protocol:
     """What the command line calls it."""
     title: str
     """What it does, in a sentence."""
-    cases: "str | Choosing" = "splits:Farthest"
-    """How each object's contacts are split, or the import path of a class of it."""
+    cases: str = "splits:farthest"
+    """Import path of the function (impacts, **settings) that splits an object's contacts."""
     methods: tuple[str, ...] = _TABLE
     """Names of the methods that take part unless others are asked for; the baseline is among them."""
     subset: Literal["ablation", "non-symmetric"] | None = None
@@ -228,40 +229,41 @@ class Protocol:
     the ablation where it has none of them."""
     scoring: Literal["sounds", "contacts", "edits"] = "sounds"
     """What methods are evaluated by: the sounds of the test recordings, their contacts as located, or edited sounds."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Of the function `cases`."""
 
-    @property
-    def choosing(self) -> "Choosing":
-        """How each object's contacts are split."""
-        chosen: Choosing = resolve(self.cases)() if isinstance(self.cases, str) else self.cases
-        return chosen
+    def split(self, impacts: "Impacts") -> "tuple[Case, ...]":
+        """Return the cases of an object. Raises EvaluationError for too few contacts."""
+        found: tuple[Case, ...] = resolve(self.cases)(impacts, **self.settings)
+        return found
 
 
 PROTOCOLS: dict[str, Protocol] = {
     each.name: each
     for each in (
         Protocol("farthest", "Train on 20 % of the contacts, chosen by farthest-point sampling; test on the others."),
-        Protocol("leave-one-out", "Test on every contact once, after training on all others.", "splits:LeaveOneOut"),
+        Protocol("leave-one-out", "Test on every contact once, after training on all others.", "splits:leave_one_out"),
         Protocol(
             "closest",
             "Train on 20 % of the contacts, in one region; test on the others.",
-            "splits:Closest",
+            "splits:closest",
             subset="ablation",
         ),
         Protocol(
             "predefined",
             "Test on the recordings that are named; train on those at other contacts.",
-            "splits:Predefined",
+            "splits:predefined",
         ),
         Protocol(
             "shots",
             "Train on nested subsets of contacts by farthest-point sampling; test on those left by the largest.",
-            "splits:Shots",
+            "splits:shots",
             subset="ablation",
         ),
         Protocol(
             "views",
             "Visual features from all views and from 12; train and test as in `farthest`.",
-            "splits:FewerViews",
+            "splits:fewer_views",
             (BASELINE, "field"),
             subset="ablation",
         ),
@@ -290,7 +292,7 @@ PROTOCOLS: dict[str, Protocol] = {
             "edit",
             "Change the material of objects, towards prompts or recordings; distance of edited modes and sounds from "
             "objects of the new material. Takes six objects or more, of two known materials or more.",
-            "splits:Edited",
+            "splits:edited",
             ("unedited", "edit-independent", "edit-hierarchical"),
             scoring="edits",
         ),

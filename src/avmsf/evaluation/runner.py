@@ -272,7 +272,7 @@ def run_object(
         record = results.read(identifier) or ObjectRecord(identifier)
         try:
             data = ObjectData(evaluation, identifier)
-            cases = evaluation.protocol.choosing.cases(data.impacts)
+            cases = evaluation.protocol.split(data.impacts)
             if evaluation.edits is not None:
                 cases = evaluation.edits.cases(identifier, *cases)
         except (AvmsfError, OSError, ValueError) as error:  # A damaged object must not cost the others their hours.

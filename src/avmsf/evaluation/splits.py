@@ -5,9 +5,9 @@ test at a training contact would be too easy.
 """
 
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar, cast
+from typing import TypeVar, cast
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -48,128 +48,80 @@ class Case:
         return f"{self.label}: {self.fold}" if self.fold else self.label
 
 
-class Choosing(Protocol):
-    """A choice of training contacts, with all recordings there."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the cases of an object. Raises EvaluationError for too few contacts."""
-
-
-@dataclass(frozen=True)
-class Farthest:
-    """Training contacts by farthest-point sampling, from the first one on (paper, section 4.1), as in `split`."""
-
-    fraction: float = 0.2
-    """Fraction of the contacts to train on, at least 2 contacts."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the one case."""
-        distinct = DistinctContacts.of(impacts)
-        return (distinct.case("farthest", farthest_points(distinct.contacts, distinct.count_of(self.fraction))),)
+def farthest(impacts: Impacts, fraction: float = 0.2) -> tuple[Case, ...]:
+    """Return the case of a fraction of the contacts, two at least, by farthest-point sampling (paper, section 4.1)."""
+    distinct = DistinctContacts.of(impacts)
+    return (distinct.case("farthest", farthest_points(distinct.contacts, distinct.count_of(fraction))),)
 
 
-@dataclass(frozen=True)
-class Closest:
-    """Training contacts in one region: the first contact and those nearest to it (paper, supplement)."""
-
-    fraction: float = 0.2
-    """Fraction of the contacts to train on, at least 2 contacts."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the one case."""
-        distinct = DistinctContacts.of(impacts)
-        count = distinct.count_of(self.fraction)
-        return (distinct.case("closest", nearest_points(distinct.contacts, distinct.contacts[:1], count=count)[0]),)
+def closest(impacts: Impacts, fraction: float = 0.2) -> tuple[Case, ...]:
+    """Return the case of training contacts in one region: the first and those nearest to it (paper, supplement)."""
+    distinct = DistinctContacts.of(impacts)
+    count = distinct.count_of(fraction)
+    return (distinct.case("closest", nearest_points(distinct.contacts, distinct.contacts[:1], count=count)[0]),)
 
 
-@dataclass(frozen=True)
-class Predefined:
-    """Test recordings by their names; all others are for training, but for those at contacts of the test recordings."""
+def predefined(impacts: Impacts, test: Sequence[str] = ()) -> tuple[Case, ...]:
+    """Return the case of these test recordings; all at other contacts are for training.
 
-    test: tuple[str, ...] = ()
-    """Names of test recordings."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the one case. Raises EvaluationError for a name that no recording has."""
-        unknown = sorted(set(self.test) - set(impacts.names))
-        if unknown:
-            wanted = f"names of {counted(len(impacts), 'recording')}, {impacts.names[0]} to {impacts.names[-1]}"
-            raise EvaluationError.expected(wanted, unknown[0], name="test")
-        distinct = DistinctContacts.of(impacts)
-        tested = {row for row, name in enumerate(impacts.names) if name in self.test}
-        chosen = [contact for contact, rows in enumerate(distinct.rows) if tested.isdisjoint(rows)]
-        distinct.check_count(len(chosen))
-        return (replace(distinct.case("predefined", chosen), test=tuple(sorted(tested))),)
+    Raises EvaluationError for a name that no recording has.
+    """
+    unknown = sorted(set(test) - set(impacts.names))
+    if unknown:
+        wanted = f"names of {counted(len(impacts), 'recording')}, {impacts.names[0]} to {impacts.names[-1]}"
+        raise EvaluationError.expected(wanted, unknown[0], name="test")
+    distinct = DistinctContacts.of(impacts)
+    tested = {row for row, name in enumerate(impacts.names) if name in test}
+    chosen = [contact for contact, rows in enumerate(distinct.rows) if tested.isdisjoint(rows)]
+    distinct.check_count(len(chosen))
+    return (replace(distinct.case("predefined", chosen), test=tuple(sorted(tested))),)
 
 
-@dataclass(frozen=True)
-class Edited:
-    """All recordings are for training, and some of their contacts are rendered after an edit."""
+def edited(impacts: Impacts) -> tuple[Case, ...]:
+    """Return the case of all recordings, of which the first eight contacts are rendered after an edit.
 
-    contacts: int = 8
-    """Number of rendered contacts, the first ones."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the one case, of which an edit's goals make one each (`avmsf.evaluation.editing.Edits.cases`)."""
-        every = tuple(range(len(impacts)))
-        return (Case("edit", every, every[: self.contacts]),)
+    An edit's goals make one each of it (`avmsf.evaluation.editing.Edits.cases`).
+    """
+    every = tuple(range(len(impacts)))
+    return (Case("edit", every, every[:8]),)
 
 
-@dataclass(frozen=True)
-class LeaveOneOut:
-    """Every contact is tested once, after training on all others."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each contact, named by its first recording."""
-        distinct = DistinctContacts.of(impacts)
-        every = range(distinct.check_count(len(distinct.rows) - 1) + 1)
-        return tuple(
-            distinct.case("leave-one-out", [other for other in every if other != left], impacts.names[rows[0]])
-            for left, rows in enumerate(distinct.rows)
-        )
+def leave_one_out(impacts: Impacts) -> tuple[Case, ...]:
+    """Return a case for each contact, named by its first recording, which trains on all others."""
+    distinct = DistinctContacts.of(impacts)
+    every = range(distinct.check_count(len(distinct.rows) - 1) + 1)
+    return tuple(
+        distinct.case("leave-one-out", [other for other in every if other != left], impacts.names[rows[0]])
+        for left, rows in enumerate(distinct.rows)
+    )
 
 
-@dataclass(frozen=True)
-class Shots:
-    """Nested subsets of training contacts by farthest-point sampling, all with the same test contacts."""
+def shots(impacts: Impacts, counts: Sequence[int] = (16, 8, 4, 2, 1), starts: int = 1) -> tuple[Case, ...]:
+    """Return a case for each number of training contacts, nested subsets by farthest-point sampling, and each start.
 
-    counts: tuple[int, ...] = (16, 8, 4, 2, 1)
-    """Numbers of training contacts; those that would leave no test contact are omitted."""
-    starts: int = 1
-    """Number of first contacts, evenly spaced in the table, each with subsets and test contacts of its own."""
-
-    def __post_init__(self) -> None:
-        if not self.counts or min(self.counts) < 1:
-            raise EvaluationError.expected("numbers of contacts of 1 or more", list(self.counts), name="counts")
-        if self.starts < 1:
-            raise EvaluationError.expected("1 start or more", self.starts, name="starts")
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return a case for each number and start; the test contacts are those left by the largest number."""
-        distinct = DistinctContacts.of(impacts)
-        total = len(distinct.rows)
-        given, starts = dict.fromkeys(self.counts), min(self.starts, total)
-        counts = [count for count in given if count < total] or [distinct.check_count(min(given))]
-        cases = []
-        for first in (round(number * total / starts) for number in range(starts)):
-            order = farthest_points(distinct.contacts, max(counts), start=first).tolist()
-            test = distinct.case("", order).test
-            fold = f"from {impacts.names[distinct.rows[first][0]]}" if self.starts > 1 else ""
-            cases += [
-                Case(f"{count} shots" if count > 1 else "1 shot", distinct.case("", order[:count]).train, test, fold)
-                for count in counts
-            ]
-        return tuple(cases)
+    The test contacts are those left by the largest number; numbers that would leave none are omitted. Starts are first
+    contacts, evenly spaced in the table, each with subsets and test contacts of its own.
+    """
+    distinct = DistinctContacts.of(impacts)
+    total = len(distinct.rows)
+    given, several = dict.fromkeys(counts), min(starts, total)
+    used = [count for count in given if count < total] or [distinct.check_count(min(given))]
+    cases = []
+    for first in (round(number * total / several) for number in range(several)):
+        order = farthest_points(distinct.contacts, max(used), start=first).tolist()
+        test = distinct.case("", order).test
+        fold = f"from {impacts.names[distinct.rows[first][0]]}" if starts > 1 else ""
+        cases += [
+            Case(f"{count} shots" if count > 1 else "1 shot", distinct.case("", order[:count]).train, test, fold)
+            for count in used
+        ]
+    return tuple(cases)
 
 
-@dataclass(frozen=True)
-class FewerViews:
-    """The training contacts of `Farthest`, with all views of the object and with 12."""
-
-    def cases(self, impacts: Impacts) -> tuple[Case, ...]:
-        """Return the case of `Farthest` twice."""
-        (case,) = Farthest().cases(impacts)
-        return tuple(replace(case, label=f"{views or 'all'} views", views=views) for views in (None, 12))
+def fewer_views(impacts: Impacts) -> tuple[Case, ...]:
+    """Return the case of `farthest` twice, with all views of the object and with 12."""
+    (case,) = farthest(impacts)
+    return tuple(replace(case, label=f"{views or 'all'} views", views=views) for views in (None, 12))
 
 
 @dataclass(frozen=True, eq=False)
