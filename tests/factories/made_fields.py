@@ -33,7 +33,7 @@ class StandIn(GainModel):
     """Gains of a formula, which no file brings back."""
 
     kind: ClassVar[str] = "formula"
-    skeleton = restore = None  # type: ignore[assignment]
+    restore = None  # type: ignore[assignment]
 
     def record(self) -> dict[str, Any]:
         return {}

@@ -5,7 +5,7 @@ What enters:
 - `arrays`: lists, arrays and tensors that users give, as tensors of a known shape; seeds; one-line representations.
 - `text`: text, JSON and TOML bounded in size and depth, and records whose fields have the types of an example.
 - `headers`, `tensor_files`: safetensors files. A `FileKind` names the entry of a header, its formats and its errors;
-  `read_tensors`, `write_tensors` and `expect_tensors` (against tensors on the device `meta`) do the rest. The header
+  `read_tensors`, `write_tensors` and `TensorReader` (which checks types and sizes) do the rest. The header
   alone is read without torch, so that commands refuse a wrong file at once.
 
 What is written:

@@ -1,6 +1,7 @@
 """Tensors in safetensors files with one text."""
 
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +36,40 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], text: str, kind: Fi
     write_whole(path, save(copies, {kind.key: text}), raising=kind.error)
 
 
-def expect_tensors(tensors: Mapping[str, Tensor], skeleton: Mapping[str, Tensor], path: Path, kind: FileKind) -> None:
-    """Raise the kind's error unless these are tensors of a skeleton's names, shapes and types, of finite numbers.
+class TensorReader:
+    """Hands out the tensors of a file, each once, by their types and sizes. Raises the kind's error."""
 
-    The skeleton's are on the device `meta`, where they take no memory.
-    """
-    missing, unexpected = sorted(skeleton.keys() - tensors.keys()), sorted(tensors.keys() - skeleton.keys())
+    def __init__(self, tensors: Mapping[str, Tensor], path: Path, kind: FileKind) -> None:
+        self._left, self._path, self._kind, self._prefix = dict(tensors), path, kind, ""
 
-    def error(wanted: str, got: str, name: str, value: Any) -> AvmsfError:
-        return kind.error.expected(wanted, value, got=got, file=path, name=name, advice=kind.advice)
+    def within(self, prefix: str) -> "TensorReader":
+        """Return what hands out the tensors whose names begin with a prefix, by the rest of their names."""
+        found = copy(self)
+        found._prefix += prefix
+        return found
 
-    if missing or unexpected:
-        got = f"missing {', '.join(missing) or 'none'}; unexpected {', '.join(unexpected) or 'none'}"
-        raise error(f"{len(skeleton)} tensors", got, (missing or unexpected)[0], [missing, unexpected])
-    for name, tensor in tensors.items():
+    def __call__(self, name: str, *size: int, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Return a tensor, which must be there, of this type and size and of finite numbers."""
+        name = self._prefix + name
+        if name not in self._left:
+            raise self._error(f"the tensor {name}", "none", name, [[name], []])
+        tensor = self._left.pop(name)
         wanted, found = (
-            f"{str(each.dtype).removeprefix('torch.')}{list(each.shape)}" for each in (skeleton[name], tensor)
+            f"{str(kind).removeprefix('torch.')}{list(shape)}"
+            for kind, shape in ((dtype, size), (tensor.dtype, tensor.shape))
         )
         if wanted != found:
-            raise error(f"{name} as {wanted}", found, name, found)
+            raise self._error(f"{name} as {wanted}", found, name, found)
         if not bool(torch.isfinite(tensor).all()):
             low, high = (float(each) for each in tensor.aminmax())
-            raise error(f"{name} to be finite", f"{low:.3g} to {high:.3g}", name, (low, high))
+            raise self._error(f"{name} to be finite", f"{low:.3g} to {high:.3g}", name, (low, high))
+        return tensor
+
+    def expect_end(self) -> None:
+        """Raise the kind's error where there are tensors that nothing asked for."""
+        if names := sorted(self._left):
+            raise self._error("no other tensors", ", ".join(names), names[0], [[], names])
+
+    def _error(self, wanted: str, got: str, name: str, value: Any) -> AvmsfError:
+        kind = self._kind
+        return kind.error.expected(wanted, value, got=got, file=self._path, name=name, advice=kind.advice)

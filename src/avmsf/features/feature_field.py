@@ -17,7 +17,7 @@ from torch import Tensor
 from avmsf._utils.arrays import Seed, short_repr
 from avmsf._utils.caching import content_digest
 from avmsf._utils.headers import FEATURES_KEY, FileKind
-from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
+from avmsf._utils.tensor_files import TensorReader, read_tensors, write_tensors
 from avmsf.errors import FitError, SceneError
 from avmsf.mesh.points import cluster, lattice, nearest_points
 from avmsf.mesh.surface import Surface, sample_surface
@@ -163,7 +163,7 @@ def save_features(features: FeatureField, path: str | Path, *, report: dict[str,
         "sizes": {"points": features.features.shape[0], "dim": features.features.shape[1]},
         "report": report or {},
     }
-    expect_tensors(tensors, _skeleton(record), path, _KIND)
+    _restored(record, tensors, path)
     write_tensors(path, tensors, _KIND.to_text(record, path, name="report"), _KIND)
 
 
@@ -173,8 +173,7 @@ def load_features(path: str | Path) -> FeatureField:
     Raises SceneError for a file that is missing, truncated, of another kind or of another format, and where its tensors
     are not those of its header.
     """
-    record, tensors = _read(Path(path))
-    return FeatureField(tensors["points"], tensors["features"], record["encoder"])
+    return _read(Path(path))[1]
 
 
 def read_report(path: str | Path) -> dict[str, Any]:
@@ -182,12 +181,11 @@ def read_report(path: str | Path) -> dict[str, Any]:
     return _read(Path(path))[0]["report"]
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the header's record and the tensors, both checked."""
+def _read(path: Path) -> tuple[dict[str, Any], FeatureField]:
+    """Return the header's record and the features, both checked."""
     text, tensors = read_tensors(path, _KIND)
     record = _KIND.parse(text, path, _check_record)
-    expect_tensors(tensors, _skeleton(record), path, _KIND)
-    return record, tensors
+    return record, _restored(record, tensors, path)
 
 
 def _check_record(record: dict[str, Any]) -> None:
@@ -197,7 +195,10 @@ def _check_record(record: dict[str, Any]) -> None:
         raise ValueError(f"sizes {record['sizes']}, encoder {record['encoder']!r}")
 
 
-def _skeleton(record: dict[str, Any]) -> dict[str, Tensor]:
-    points, dim = (record["sizes"][name] for name in ("points", "dim"))
-    sizes = {"points": (points, 3), "features": (points, dim)}
-    return {name: torch.empty(size, dtype=torch.float32, device="meta") for name, size in sizes.items()}
+def _restored(record: dict[str, Any], tensors: dict[str, Tensor], path: Path) -> FeatureField:
+    (count, dim), read = (record["sizes"][name] for name in ("points", "dim")), TensorReader(tensors, path, _KIND)
+    points, features = (
+        read(name, count, size, dtype=torch.float32) for name, size in (("points", 3), ("features", dim))
+    )
+    read.expect_end()
+    return FeatureField(points, features, record["encoder"])

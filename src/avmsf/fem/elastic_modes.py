@@ -28,7 +28,7 @@ from torch import Tensor
 
 from avmsf._utils.caching import keep_if_possible
 from avmsf._utils.headers import FileKind
-from avmsf._utils.tensor_files import read_tensors, write_tensors
+from avmsf._utils.tensor_files import TensorReader, read_tensors, write_tensors
 from avmsf._utils.text import count_of, parse_json
 from avmsf.errors import SimulationError
 from avmsf.fem.eigen import PENDULUM, factorize, lowest_vibrations, orthonormal, rigid_motions
@@ -275,33 +275,19 @@ def mode_tensors(modes: ElasticModes) -> dict[str, Tensor]:
     return named | {"shapes": modes.shapes.float()}
 
 
-def mode_skeleton(sizes: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return tensors on the device `meta`, of the shapes and dtypes that belong to sizes.
+def restored_modes(sizes: Mapping[str, Any], read: TensorReader) -> ElasticModes:
+    """Return the modes, of the nominal material and no mass, of these sizes.
 
-    Raises ValueError, TypeError or KeyError for what are no sizes.
+    Raises ValueError, TypeError or KeyError for what are no sizes, and ValueError for values that no modes have.
     """
-    nodes, triangles, shapes = (count_of(sizes[name], name) for name in ("nodes", "triangles", "shapes"))
-    return {
-        "frequency": torch.empty(shapes, dtype=torch.float64, device="meta"),
-        "nodes": torch.empty(nodes, 3, dtype=torch.float64, device="meta"),
-        "triangles": torch.empty(triangles, 6, dtype=torch.int64, device="meta"),
-        "shapes": torch.empty(nodes, shapes, 3, dtype=torch.float32, device="meta"),
-    }
-
-
-def restored_modes(tensors: Mapping[str, Tensor], prefix: str) -> ElasticModes:
-    """Return the modes, of the nominal material and no mass, of tensors whose names begin with `prefix`.
-
-    Raises ValueError for values that no modes have.
-    """
-    frequency, nodes, rows, shapes = (
-        tensors[f"{prefix}{name}"] for name in ("frequency", "nodes", "triangles", "shapes")
-    )
+    places, faces, modes = (count_of(sizes[name], name) for name in ("nodes", "triangles", "shapes"))
+    frequency, nodes = read("frequency", modes), read("nodes", places, 3)
+    rows, shapes = read("triangles", faces, 6, dtype=torch.int64), read("shapes", places, modes, 3, dtype=torch.float32)
     if not bool((frequency > 0).all()):
-        raise ValueError(f"expected {prefix}frequency above 0, got {float(frequency.min()):g}")
-    if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < len(nodes):
+        raise ValueError(f"expected frequencies above 0, got {float(frequency.min()):g}")
+    if not 0 <= int(rows.min()) <= int(rows.max()) < places:
         raise ValueError(
-            f"expected corners of triangles from 0 to {len(nodes) - 1}, got {int(rows.min())} to {int(rows.max())}"
+            f"expected corners of triangles from 0 to {places - 1}, got {int(rows.min())} to {int(rows.max())}"
         )
     return ElasticModes(frequency, nodes, rows, shapes.double(), NOMINAL, mass=0.0)
 

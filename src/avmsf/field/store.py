@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
+from avmsf._utils.tensor_files import TensorReader, read_tensors, write_tensors
 from avmsf._utils.text import RecordError, count_of, like, record_of, without_defaults
 from avmsf.capture.audio import HIGHEST_RATE, LOWEST_RATE, MAX_PEAK, MAX_SAMPLES
 from avmsf.capture.settings import CaptureSettings
@@ -55,8 +55,7 @@ def save(field: SoundField, path: str | Path) -> None:
     """
     path, tensors = Path(path), _tensors(field)
     text = FIELD.to_text(_record(field), path, name="origin.report")
-    with _reporting_damage(path):
-        _checked(json.loads(text), tensors, path)
+    _read(json.loads(text), tensors, path)
     write_tensors(path, tensors, text, FIELD)
 
 
@@ -75,21 +74,7 @@ def load(path: str | Path) -> SoundField:
     """
     path = Path(path)
     text, tensors = read_tensors(path, FIELD)
-    record = FIELD.parse(text, path)
-    with _reporting_damage(path):
-        origin = _checked(record, tensors, path)
-        gains = _KINDS[record["gains"]["kind"]].restore(record["gains"], _named(_GAINS, tensors))
-    kept = record["alignment"]
-    return SoundField(
-        ModalBank(tensors["bank.frequency"], tensors["bank.damping"]),
-        gains,
-        tensors["phase"],
-        Residual(tensors["residual.magnitude"], tensors.get("residual.recordings"), record.get("background_force")),
-        float(record["sample_rate"]),
-        record["samples"],
-        origin,
-        kept and Alignment.restore(_named(_ALIGNMENT, tensors), kept["names"], kept["keys"]),
-    )
+    return _read(FIELD.parse(text, path), tensors, path)
 
 
 @contextmanager
@@ -104,19 +89,43 @@ def _reporting_damage(path: Path) -> Iterator[None]:
         raise FIELD.damaged(path, error) from error
 
 
-def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Path) -> Origin:
-    """Return the origin of the field that has this record and tensors, all of which is checked."""
-    rate, samples = like(record["sample_rate"], 1.0, "sample_rate"), count_of(record["samples"], "samples")
-    # Those of the recordings that a field is fitted to.
-    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
-        raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
-    if samples > MAX_SAMPLES:
-        raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
-    # Not in files of versions before 0.9, whose noise grows with the force.
-    force = record.get("background_force")
-    if force is not None and not 0.0 < like(force, 1.0, "background_force") < math.inf:
-        raise RecordError.expected("a force above 0, or null", force, name="background_force")
-    skeleton = _skeleton(record)
+def _read(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Path) -> SoundField:
+    """Return the field that has this record and tensors, all of which is checked."""
+    with _reporting_damage(path):
+        rate, samples = like(record["sample_rate"], 1.0, "sample_rate"), count_of(record["samples"], "samples")
+        # Those of the recordings that a field is fitted to.
+        if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+            raise RecordError.expected(f"{LOWEST_RATE:g} to {HIGHEST_RATE:g} Hz", rate, name="sample_rate")
+        if samples > MAX_SAMPLES:
+            raise RecordError.expected(f"at most {MAX_SAMPLES:,}", samples, got=f"{samples:,}", name="samples")
+        sizes, gains = (dict(like(record[name], {}, name)) for name in ("sizes", "gains"))
+        modes = count_of(sizes["modes"], "sizes.modes")
+        if gains["modes"] != modes:
+            raise RecordError.expected(f"{modes}, the number of frequencies", gains["modes"], name="gains.modes")
+        origin, read = _origin(record, modes), TensorReader(tensors, path, FIELD)
+        bank = ModalBank(read("bank.frequency", modes), read("bank.damping", modes))
+        phase, residual = read("phase", modes), _residual(record, read)
+        for name, highest in _MAX.items():
+            low, high = (float(each) for each in tensors[name].aminmax())
+            if low < 0.0 or (low == 0.0 and name in _POSITIVE) or high > highest:
+                wanted = f"{name} {'above' if name in _POSITIVE else 'of at least'} 0, and up to {highest:g}"
+                got = f"{low:.3g} to {high:.3g}"
+                raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=FIELD.advice)
+        kind = like(gains["kind"], "", "gains.kind")
+        if kind not in _KINDS:
+            raise RecordError.expected(", ".join(_KINDS), kind, name="gains.kind")
+        model, alignment = _KINDS[kind].restore(gains, read.within(_GAINS)), None
+        if (kept := record["alignment"]) is not None:
+            names, keys = (like(kept[name], [], f"alignment.{name}") for name in ("names", "keys"))
+            if len(names) != len(keys) or not all(isinstance(each, str) for each in (*names, *keys)):
+                raise RecordError.expected(f"{len(names)} as in alignment.names", len(keys), name="alignment.keys")
+            poles = count_of(kept["modes"], "alignment.modes", least=0)
+            alignment = Alignment.restore(read.within(_ALIGNMENT), names, keys, poles)
+        read.expect_end()
+        return SoundField(bank, model, phase, residual, float(rate), samples, origin, alignment)
+
+
+def _origin(record: Mapping[str, Any], modes: int) -> Origin:
     origin, config = dict(like(record["origin"], {}, "origin")), like(record["config"], {}, "config")
     config = {name: value for name, value in config.items() if name not in REMOVED_SETTINGS}
     read = Origin(
@@ -124,21 +133,28 @@ def _checked(record: Mapping[str, Any], tensors: Mapping[str, Tensor], path: Pat
         trained_on=tuple(like(name, "", "origin.trained_on") for name in origin["trained_on"]),
         per_newton=like(origin["per_newton"], True, "origin.per_newton"),
         config=record_of(FitConfig, config, "config", added=ADDED_SETTINGS),
-        report=_checked_report(like(origin["report"], {}, "origin.report"), len(skeleton["phase"])),
+        report=_checked_report(like(origin["report"], {}, "origin.report"), modes),
         settings=record_of(CaptureSettings, origin["settings"], "origin.settings", added=asdict(CaptureSettings())),
     )
     if (quality := read.report.get("quality")) is not None:
         FieldQuality.of(quality)
     _ = ProbableBody.of(read.report)
-    expect_tensors(tensors, skeleton, path, FIELD)
-    for name, highest in _MAX.items():
-        low, high = (float(each) for each in tensors[name].aminmax()) if tensors[name].numel() else (1.0, 1.0)
-        positive = name in _POSITIVE
-        if low < 0.0 or (low == 0.0 and positive) or high > highest:
-            wanted = f"{name} {'above' if positive else 'of at least'} 0, and up to {highest:g}"
-            got = f"{low:.3g} to {high:.3g}"
-            raise FieldFileError.expected(wanted, (low, high), got=got, file=path, name=name, advice=FIELD.advice)
     return read
+
+
+def _residual(record: Mapping[str, Any], read: TensorReader) -> Residual:
+    # Not in files of versions before 0.9, whose noise grows with the force.
+    force, sizes, recordings = record.get("background_force"), record["sizes"], None
+    if force is not None and not 0.0 < like(force, 1.0, "background_force") < math.inf:
+        raise RecordError.expected("a force above 0, or null", force, name="background_force")
+    magnitude = read("residual.magnitude", count_of(sizes["bins"], "sizes.bins"), dtype=torch.float32)
+    if sizes["recordings"] is not None:
+        contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
+        if record["gains"].get("contacts") != contacts:
+            wanted = f"{record['gains'].get('contacts')} contacts as in gains"
+            raise RecordError.expected(wanted, contacts, name="sizes.recordings")
+        recordings = read("residual.recordings", contacts, length, dtype=torch.float32)
+    return Residual(magnitude, recordings, force)
 
 
 def _checked_report(report: dict[str, Any], modes: int) -> dict[str, Any]:
@@ -165,34 +181,6 @@ def _edit_of(entry: Any, name: str, modes: int) -> dict[str, Any]:
                 if not 0.0 < like(factor, 1.0, f"{name}.{key}") < math.inf:
                     raise RecordError.expected("a number above 0", factor, name=f"{name}.{key}")
     return {**known, "edit": kind}
-
-
-def _skeleton(record: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return tensors as a field of this record has them, which take no memory."""
-    sizes, gains = (dict(like(record[name], {}, name)) for name in ("sizes", "gains"))
-    modes, bins = (count_of(sizes[name], f"sizes.{name}") for name in ("modes", "bins"))
-    kind = like(gains["kind"], "", "gains.kind")
-    if kind not in _KINDS:
-        raise RecordError.expected(", ".join(_KINDS), kind, name="gains.kind")
-    bank = torch.empty(modes, dtype=torch.float64, device="meta")
-    skeleton = {"bank.frequency": bank, "bank.damping": bank, "phase": bank}
-    skeleton["residual.magnitude"] = torch.empty(bins, dtype=torch.float32, device="meta")
-    if sizes["recordings"] is not None:
-        contacts, length = (count_of(each, "sizes.recordings") for each in sizes["recordings"])
-        if gains.get("contacts") != contacts:
-            wanted = f"{gains.get('contacts')} contacts as in gains"
-            raise RecordError.expected(wanted, contacts, name="sizes.recordings")
-        skeleton["residual.recordings"] = torch.empty(contacts, length, dtype=torch.float32, device="meta")
-    skeleton |= {_GAINS + name: each for name, each in _KINDS[kind].skeleton(gains).items()}
-    if (alignment := record["alignment"]) is not None:
-        names, keys = (like(alignment[name], [], f"alignment.{name}") for name in ("names", "keys"))
-        if len(names) != len(keys) or not all(isinstance(each, str) for each in (*names, *keys)):
-            raise RecordError.expected(f"{len(names)} as in alignment.names", len(keys), name="alignment.keys")
-        aligned = Alignment.skeleton(len(names), count_of(alignment["modes"], "alignment.modes", least=0))
-        skeleton |= {_ALIGNMENT + name: each for name, each in aligned.items()}
-    if gains["modes"] != modes:
-        raise RecordError.expected(f"{modes}, the number of frequencies", gains["modes"], name="gains.modes")
-    return skeleton
 
 
 def _record(field: SoundField) -> dict[str, Any]:
@@ -222,8 +210,3 @@ def _tensors(field: SoundField) -> dict[str, Tensor]:
     if field.alignment is not None:
         named |= {_ALIGNMENT + name: tensor for name, tensor in field.alignment.tensors().items()}
     return named | {_GAINS + name: tensor for name, tensor in field.gain_field.tensors().items()}
-
-
-def _named(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors whose names begin with a prefix, without it."""
-    return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}

@@ -14,7 +14,7 @@ from jaxtyping import Complex128, Float64
 from torch import Tensor
 
 from avmsf._utils.headers import FileKind
-from avmsf._utils.tensor_files import expect_tensors, read_tensors, write_tensors
+from avmsf._utils.tensor_files import TensorReader, read_tensors, write_tensors
 from avmsf.errors import SimulationError
 
 TRUTH = "truth.safetensors"
@@ -83,7 +83,7 @@ def write_truth(truth: Truth, path: str | Path) -> None:
     tensors |= {"gains": truth.gains.real.contiguous(), "quadrature": truth.gains.imag.contiguous()}
     tensors |= {name: each for name in _OPTIONAL if (each := getattr(truth, name)) is not None}
     record = {"names": list(truth.names), "recipe": truth.recipe}
-    _expect(tensors, record, path)
+    _restored(tensors, record, path)
     write_tensors(path, tensors, _KIND.to_text(record, path, name="recipe"), _KIND)
 
 
@@ -97,10 +97,7 @@ def read_truth(path: str | Path) -> Truth:
     path = path / TRUTH if path.is_dir() else path
     text, tensors = read_tensors(path, _KIND)
     record = _KIND.parse(text, path, _check_record)
-    _expect(tensors, record, path)
-    recipe = {_RENAMED.get(name, name): value for name, value in record["recipe"].items()}
-    gains = torch.complex(tensors.pop("gains"), tensors.pop("quadrature"))
-    return Truth(gains=gains, names=tuple(record["names"]), recipe=recipe, **tensors)
+    return _restored(tensors, record, path)
 
 
 def _check_record(record: dict[str, Any]) -> None:
@@ -110,17 +107,14 @@ def _check_record(record: dict[str, Any]) -> None:
         raise ValueError("names or settings of another type")
 
 
-def _expect(tensors: dict[str, Tensor], record: dict[str, Any], path: Path) -> None:
-    """Raise SimulationError unless the tensors fit together and to the record's names, and are finite."""
+def _restored(tensors: dict[str, Tensor], record: dict[str, Any], path: Path) -> Truth:
+    """Return the truth. Raises SimulationError unless the tensors fit together and to the names, and are finite."""
     contacts, modes = len(record["names"]), tensors["frequency"].numel() if "frequency" in tensors else 0
-    # The real and the imaginary part of the gains are two.
-    sizes: dict[str, tuple[int, ...]] = {
-        "frequency": (modes,), "damping": (modes,), "gains": (contacts, modes), "quadrature": (contacts, modes),
-        "contacts": (contacts, 3), "starts": (contacts,), "shifts": (contacts, modes),
-    }  # fmt: skip
-    skeleton = {
-        name: torch.empty(size, dtype=torch.float64, device="meta")
-        for name, size in sizes.items()
-        if name in tensors or name not in _OPTIONAL
-    }
-    expect_tensors(tensors, skeleton, path, _KIND)
+    read = TensorReader(tensors, path, _KIND)
+    frequency, damping = read("frequency", modes), read("damping", modes)
+    gains = torch.complex(read("gains", contacts, modes), read("quadrature", contacts, modes))
+    sizes = {"contacts": (contacts, 3), "starts": (contacts,), "shifts": (contacts, modes)}
+    known = {name: read(name, *size) for name, size in sizes.items() if name in tensors}
+    read.expect_end()
+    recipe = {_RENAMED.get(name, name): value for name, value in record["recipe"].items()}
+    return Truth(frequency, damping, gains, tuple(record["names"]), recipe, **known)

@@ -6,14 +6,15 @@ from functools import cache
 import pytest
 import torch
 
+from avmsf._utils.tensor_files import TensorReader
 from avmsf._utils.text import RecordError
 from avmsf.capture.impacts import Impacts, rows_by_place
 from avmsf.features.feature_field import FeatureField
 from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.elastic_modes import HeldModes, elastic_modes
 from avmsf.fem.material import NOMINAL, STEEL
-from avmsf.fem.supports import EndPatch, Place, Support, patches_about
-from avmsf.field.config import FitConfig
+from avmsf.fem.supports import Patch, Place, Support, patches_about
+from avmsf.field.config import FIELD, FitConfig
 from avmsf.field.fit import fit
 from avmsf.field.gains.attention import held_out
 from avmsf.field.gains.data import GainData, gain_data, orientation_signs
@@ -168,7 +169,7 @@ def test_of_scaled_gains_the_factors_multiply_and_nothing_nests(tmp_path):
         with pytest.raises(ValueError):
             ScaledGains(inner, FACTORS, length)
     with raises(RecordError, name="fitted_kind", value="scaled"):
-        ScaledGains.skeleton(twice.record() | {"fitted_kind": "scaled"})
+        ScaledGains.restore(twice.record() | {"fitted_kind": "scaled"}, TensorReader({}, tmp_path, FIELD))
 
 
 HEIGHT = 0.05
@@ -276,12 +277,12 @@ def test_a_plate_is_held_where_its_user_says_and_it_shows_where_it_was_free(held
     assert not held or found["frequency_factor"] == pytest.approx(1.0, abs=0.1)
 
 
-LEFT, RIGHT = EndPatch("left", (-1.0, 0.0, 0.0)), EndPatch("right", (1.0, 0.0, 0.0))
+LEFT, RIGHT = Patch("left", (-1.0, 0.0, 0.0)), Patch("right", (1.0, 0.0, 0.0))
 AT = {LEFT: "its end at (0, 80, 2) mm", RIGHT: "its end at (240, 80, 2) mm"}
 
 
 @pytest.mark.parametrize(("sides", "stiffness"), [((), 0.0), ((LEFT,), 2e5), ((LEFT,), 1e10), ((LEFT, RIGHT), 2e6)])
-def test_the_support_of_a_plate_is_found(sides: tuple[EndPatch, ...], stiffness: float):
+def test_the_support_of_a_plate_is_found(sides: tuple[Patch, ...], stiffness: float):
     solid = block(SIDES, (13, 8, 1))
     uneven = 1.0 + 0.5 * solid.points[solid.cells].mean(1)[:, 0]
     support = Support(sides, stiffness) if sides else None

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from avmsf._utils.tensor_files import TensorReader
 from avmsf._utils.text import RecordError, count_of, like, record_of, without_defaults
 from avmsf.capture.impacts import rows_by_place
 from avmsf.features.feature_field import FeatureField
@@ -135,15 +136,12 @@ class AttentionGains(TrainableGains, GainModel):
         return dict(self.state_dict())
 
     @classmethod
-    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return tensors like those of a network of these sizes, which take no memory."""
-        return dict(cls._empty(record).state_dict())
-
-    @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "AttentionGains":
+    def restore(cls, record: Mapping[str, Any], read: TensorReader) -> "AttentionGains":
         """Return the network, ready for use."""
         network = cls._empty(record)
-        network.load_state_dict(dict(tensors), assign=True)
+        wanted = sorted(network.state_dict().items())
+        tensors = {name: read(name, *each.shape, dtype=each.dtype) for name, each in wanted}
+        network.load_state_dict(tensors, assign=True)
         return network.eval().requires_grad_(False)
 
     @classmethod

@@ -12,9 +12,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
+from avmsf._utils.tensor_files import TensorReader
 from avmsf._utils.text import RecordError, count_of, like
 from avmsf.capture.impacts import places_of
-from avmsf.fem.elastic_modes import ElasticModes, mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.fem.elastic_modes import ElasticModes, mode_sizes, mode_tensors, restored_modes
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.kernels import POSITIONAL, Family, KernelFamily, Sites, Visual
 from avmsf.field.gains.mixture import NOISE_SHARES, KernelMixture, Predictions, Statistic, mean_magnitude
@@ -244,80 +245,26 @@ class MixtureGains(GainModel):
         return named
 
     @classmethod
-    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return tensors like those of a model of these sizes."""
-        points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
-        families, bodies = (like(record[name], [], name) for name in ("families", "bodies"))
-        kept = [count_of(each, "kernels") for each in like(record["kernels"], [], "kernels")]
-        known = (*POSITIONAL, *_OF_OBJECT)
-        if not set(families) <= set(known) or len(families) != len(kept):
-            raise RecordError.expected(f"{len(kept)} of {', '.join(known)}", families, name="families")
-        for kind, name in _OF_OBJECT.items():
-            given = len(like(record[name], [], name))
-            if given != families.count(kind) or (kind != Elastic.kind and given > 1):
-                raise RecordError.expected(f"{families.count(kind)} as in families", given, name=name)
-        like(record["directional"], True, "directional")
-        if not 0.0 <= like(record.get("spread_share", 0.0), 0.0, "spread_share") <= 1.0:
-            raise RecordError.expected("0 to 1", record["spread_share"], name="spread_share")
-        single, double, integer = torch.float32, torch.float64, torch.int64
-        sizes: dict[str, tuple[torch.dtype, *tuple[int, ...]]] = {
-            "points": (single, points, 3),
-            "contacts": (double, contacts, 3),
-            "directions": (double, contacts, 3),
-            "object_size": (double, len(families)),
-            "values": (double, contacts, modes, 2),
-            "measured": (double, contacts, modes, 2),
-            "noise_floor": (double, 2 * modes),
-            "kernels": (integer, sum(kept)),
-            "weights": (double, sum(kept), len(NOISE_SHARES), 2 * modes),
-        }
-        for dim in record["features"]:
-            sizes["features"] = (single, points, count_of(dim, "features"))
-        for row, (characters, order) in enumerate(group for family in record["symmetries"] for group in family):
-            sizes[f"groups.{row}.motions"] = (double, count_of(order, "motions"), 3, 4)
-            sizes[f"groups.{row}.characters"] = (double, count_of(characters, "characters"), order)
-        found = {name: torch.empty(*size, dtype=dtype, device="meta") for name, (dtype, *size) in sizes.items()}
-        for row, body in enumerate(bodies):
-            found |= {f"bodies.{row}.{name}": each for name, each in mode_skeleton(body).items()}
-        return found
-
-    @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "MixtureGains":
+    def restore(cls, record: Mapping[str, Any], read: TensorReader) -> "MixtureGains":
         """Return the model."""
-        training = Sites(tensors["contacts"], tensors["directions"])
-        # Values that no fit leaves would fail only when gains are asked for.
-        for name in ("object_size", "weights", "noise_floor"):
-            least, positive = float(tensors[name].min()), name == "object_size"
-            if least < 0 or (positive and least == 0):
-                wanted = f"values {'above 0' if positive else 'of 0 or more'}"
-                raise RecordError.expected(wanted, least, got=f"{least:g}", name=name)
-        bodies = iter([restored_modes(tensors, f"bodies.{row}.") for row in range(len(record["bodies"]))])
-
-        def family_of(kind: str, size: float) -> KernelFamily:
-            if kind == Elastic.kind:
-                return Elastic(training, size, next(bodies))
-            if kind == Symmetric.kind:
-                rows = range(len(record["symmetries"][0]))
-                groups = [Group(tensors[f"groups.{row}.motions"], tensors[f"groups.{row}.characters"]) for row in rows]
-                return Symmetric(training, size, groups, directional=record["directional"])
-            if kind == Visual.kind:
-                return Visual(training, size, tensors["points"], tensors["features"])
-            return POSITIONAL[kind](training, size)
-
-        kept = torch.split(tensors["kernels"], record["kernels"])
-        families, kernels = [], []
-        for kind, size, rows in zip(record["families"], tensors["object_size"].tolist(), kept, strict=True):
-            family, ends = family_of(kind, size), (int(rows.min()), int(rows.max()))
-            if not 0 <= ends[0] <= ends[1] < len(family):
-                raise RecordError.expected(f"0 to {len(family) - 1}", ends, name=f"kept {kind} kernels")
-            families.append(family.take(rows))
-            # Of all of them, as in the fit: of some the rounding differs.
-            kernels.append(family.kernels()[rows])
-        values, measured = (torch.view_as_complex(tensors[name].contiguous()) for name in ("values", "measured"))
-        mixture = KernelMixture(torch.cat(kernels), series_of(values), tensors["noise_floor"], tensors["weights"])
+        points, contacts, modes = (count_of(record[name], name) for name in ("points", "contacts", "modes"))
         # Files of earlier versions have none: their fields were chosen with each hypothesis's mean alone.
-        share = record.get("spread_share", 0.0)
-        return cls(tensors["points"], training, tuple(families), mixture, record["directional"], share, measured)
+        directional, share = like(record["directional"], True, "directional"), record.get("spread_share", 0.0)
+        if not 0.0 <= like(share, 0.0, "spread_share") <= 1.0:
+            raise RecordError.expected("0 to 1", share, name="spread_share")
+        training = Sites(read("contacts", contacts, 3), read("directions", contacts, 3))
+        places = read("points", points, 3, dtype=torch.float32)
+        families, kernels = _restored_families(record, read, training, places)
+        floor, weights = read("noise_floor", 2 * modes), read("weights", len(kernels), len(NOISE_SHARES), 2 * modes)
+        # Values that no fit leaves would fail only when gains are asked for.
+        for name, each in (("noise_floor", floor), ("weights", weights)):
+            if (least := float(each.min())) < 0:
+                raise RecordError.expected("values of 0 or more", least, got=f"{least:g}", name=name)
+        values, measured = (
+            torch.view_as_complex(read(name, contacts, modes, 2).contiguous()) for name in ("values", "measured")
+        )
+        mixture = KernelMixture(kernels, series_of(values), floor, weights)
+        return cls(places, training, families, mixture, directional, share, measured)
 
     def _of(self, kind: type[Family]) -> list[Family]:
         """Return the families of a kind."""
@@ -350,3 +297,47 @@ class MixtureGains(GainModel):
 
 def _parts(series: Float64[Tensor, "contacts series"]) -> Float64[Tensor, "contacts modes 2"]:
     return torch.view_as_real(complex_of(series))
+
+
+def _restored_families(
+    record: Mapping[str, Any], read: TensorReader, training: Sites, points: Float32[Tensor, "points 3"]
+) -> tuple[tuple[KernelFamily, ...], Float64[Tensor, "kernels contacts contacts"]]:
+    """Return the families of a record, each with its kept kernels, and these among the training impacts."""
+    kinds, bodies = (like(record[name], [], name) for name in ("families", "bodies"))
+    counts = [count_of(each, "kernels") for each in like(record["kernels"], [], "kernels")]
+    known = (*POSITIONAL, *_OF_OBJECT)
+    if not set(kinds) <= set(known) or len(kinds) != len(counts):
+        raise RecordError.expected(f"{len(counts)} of {', '.join(known)}", kinds, name="families")
+    for kind, name in _OF_OBJECT.items():
+        given = len(like(record[name], [], name))
+        if given != kinds.count(kind) or (kind != Elastic.kind and given > 1):
+            raise RecordError.expected(f"{kinds.count(kind)} as in families", given, name=name)
+    modes = iter([restored_modes(each, read.within(f"bodies.{row}.")) for row, each in enumerate(bodies)])
+
+    def family_of(kind: str, size: float) -> KernelFamily:
+        if kind == Elastic.kind:
+            return Elastic(training, size, next(modes))
+        if kind == Symmetric.kind:
+            groups = []
+            for row, (characters, order) in enumerate(record["symmetries"][0]):
+                sizes, part = (count_of(characters, "characters"), count_of(order, "motions")), f"groups.{row}."
+                groups.append(Group(read(f"{part}motions", sizes[1], 3, 4), read(f"{part}characters", *sizes)))
+            return Symmetric(training, size, groups, directional=record["directional"])
+        if kind == Visual.kind:
+            dim = count_of(record["features"][0], "features")
+            return Visual(training, size, points, read("features", len(points), dim, dtype=torch.float32))
+        return POSITIONAL[kind](training, size)
+
+    sizes = read("object_size", len(kinds))
+    if (least := float(sizes.min())) <= 0:
+        raise RecordError.expected("values above 0", least, got=f"{least:g}", name="object_size")
+    families, kernels = [], []
+    kept = torch.split(read("kernels", sum(counts), dtype=torch.int64), counts)
+    for kind, size, rows in zip(kinds, sizes.tolist(), kept, strict=True):
+        family, ends = family_of(kind, size), (int(rows.min()), int(rows.max()))
+        if not 0 <= ends[0] <= ends[1] < len(family):
+            raise RecordError.expected(f"0 to {len(family) - 1}", ends, name=f"kept {kind} kernels")
+        families.append(family.take(rows))
+        # Of all of them, as in the fit: of some the rounding differs.
+        kernels.append(family.kernels()[rows])
+    return tuple(families), torch.cat(kernels)

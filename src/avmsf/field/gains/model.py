@@ -13,6 +13,7 @@ from jaxtyping import Complex, Complex128, Float, Float32, Float64, Inexact
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from avmsf._utils.tensor_files import TensorReader
 from avmsf.capture.placement import TOLERANCE
 from avmsf.errors import PositionError
 from avmsf.fem.elastic_modes import ElasticModes
@@ -137,16 +138,11 @@ class GainModel(ABC):
 
     @classmethod
     @abstractmethod
-    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return tensors on the device `meta`, of the names, shapes and dtypes that belong to a record.
+    def restore(cls, record: Mapping[str, Any], read: TensorReader) -> "GainModel":
+        """Return the model of a record and its tensors.
 
-        Raises RecordError, ValueError, TypeError or KeyError for a record that belongs to no such model.
+        Raises RecordError, ValueError, TypeError or KeyError for a record of no such model, and as the reader does.
         """
-
-    @classmethod
-    @abstractmethod
-    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "GainModel":
-        """Return the model of a record and the tensors that belong to it."""
 
 
 def expect_near(

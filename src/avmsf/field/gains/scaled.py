@@ -11,8 +11,9 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
+from avmsf._utils.tensor_files import TensorReader
 from avmsf._utils.text import RecordError, count_of, like
-from avmsf.fem.elastic_modes import ElasticModes, mode_sizes, mode_skeleton, mode_tensors, restored_modes
+from avmsf.fem.elastic_modes import ElasticModes, mode_sizes, mode_tensors, restored_modes
 from avmsf.field.gains.attention import AttentionGains
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -55,15 +56,10 @@ class BodyGains(GainModel):
         return {"points": self.points, **_named(_BODY, mode_tensors(self.modes))}
 
     @classmethod
-    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return tensors like those of a body of these sizes."""
-        points = torch.empty(count_of(record["points"], "points"), 3, dtype=torch.float32, device="meta")
-        return {"points": points, **_named(_BODY, mode_skeleton({**record, "shapes": record["modes"]}))}
-
-    @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "BodyGains":
+    def restore(cls, record: Mapping[str, Any], read: TensorReader) -> "BodyGains":
         """Return the gains."""
-        return cls(tensors["points"], restored_modes(tensors, _BODY))
+        points = read("points", count_of(record["points"], "points"), 3, dtype=torch.float32)
+        return cls(points, restored_modes({**record, "shapes": record["modes"]}, read.within(_BODY)))
 
 
 FITTED: dict[str, type[GainModel]] = {each.kind: each for each in (AttentionGains, MixtureGains, BodyGains)}
@@ -136,22 +132,16 @@ class ScaledGains(GainModel):
         return {"mode_factors": self.scale, **_named(_FITTED, self.field.tensors())}
 
     @classmethod
-    def skeleton(cls, record: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return tensors like those of gains of these sizes."""
-        if not 0.0 < like(record["size_factor"], 1.0, "size_factor") < math.inf:
-            raise RecordError.expected("a number above 0", record["size_factor"], name="size_factor")
+    def restore(cls, record: Mapping[str, Any], read: TensorReader) -> "ScaledGains":
+        """Return the gains."""
+        length = float(like(record["size_factor"], 1.0, "size_factor"))
+        if not 0.0 < length < math.inf:
+            raise RecordError.expected("a number above 0", length, name="size_factor")
         kind = like(record["fitted_kind"], "", "fitted_kind")
         if kind not in FITTED:
             raise RecordError.expected(", ".join(FITTED), kind, name="fitted_kind")
-        scale = torch.empty(count_of(record["modes"], "modes"), dtype=torch.float64, device="meta")
-        return {"mode_factors": scale, **_named(_FITTED, FITTED[kind].skeleton(record))}
-
-    @classmethod
-    def restore(cls, record: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> "ScaledGains":
-        """Return the gains."""
-        inner = {name.removeprefix(_FITTED): each for name, each in tensors.items() if name.startswith(_FITTED)}
-        fitted = FITTED[record["fitted_kind"]].restore(record, inner)
-        return cls(fitted, tensors["mode_factors"], float(record["size_factor"]))
+        scale = read("mode_factors", count_of(record["modes"], "modes"))
+        return cls(FITTED[kind].restore(record, read.within(_FITTED)), scale, length)
 
     def _scaled(self, known: Gains) -> Gains:
         mean = (known.mean * self.scale).to(known.mean.dtype)

@@ -22,7 +22,7 @@ several starting recordings, each of which the others are first aligned with, th
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,7 @@ from jaxtyping import Complex128
 from torch import Tensor
 
 from avmsf._utils.arrays import short_repr
+from avmsf._utils.tensor_files import TensorReader
 from avmsf.capture.impacts import Impacts
 from avmsf.modal.extraction.finders import HighResolution
 from avmsf.modal.extraction.phase_likelihood import (
@@ -144,22 +145,14 @@ class Alignment:
         }
 
     @classmethod
-    def skeleton(cls, recordings: int, modes: int) -> dict[str, Tensor]:
-        """Return tensors on the device `meta`, of the names, shapes and types that `tensors` has for these sizes."""
-        # Stated one by one, since the first computation on this device takes a second.
-        sizes = {"delays": (recordings,), "agrees": (recordings,), "numbers": (4,), "doubled": (modes, 2)}
-        sizes |= dict.fromkeys(("frequency", "damping", "power", "spread"), (modes,))
-        types = {"agrees": torch.bool}
-        return {n: torch.empty(size, dtype=types.get(n, torch.float64), device="meta") for n, size in sizes.items()}
-
-    @classmethod
-    def restore(cls, tensors: Mapping[str, Tensor], names: Sequence[str], keys: Sequence[str]) -> "Alignment":
+    def restore(cls, read: TensorReader, names: Sequence[str], keys: Sequence[str], modes: int) -> "Alignment":
         """Return the alignment that `tensors` are of."""
-        before, after, jitter, start = tensors["numbers"].tolist()
-        bank = ModalBank(tensors["frequency"], tensors["damping"])
-        doubled = torch.view_as_complex(tensors["doubled"].contiguous())
-        known = tuple(names), tensors["delays"], tensors["agrees"].double(), before, after, tuple(keys)
-        return cls(*known, bank, doubled, tensors["power"], tensors["spread"], jitter, start)
+        delays, agrees = read("delays", len(names)), read("agrees", len(names), dtype=torch.bool).double()
+        before, after, jitter, start = read("numbers", 4).tolist()
+        bank, doubled = ModalBank(read("frequency", modes), read("damping", modes)), read("doubled", modes, 2)
+        known = tuple(names), delays, agrees, before, after, tuple(keys), bank
+        turned = torch.view_as_complex(doubled.contiguous())
+        return cls(*known, turned, read("power", modes), read("spread", modes), jitter, start)
 
 
 def align(impacts: Impacts) -> Alignment | None:

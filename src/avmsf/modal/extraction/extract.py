@@ -18,7 +18,7 @@ from torch import Tensor
 from avmsf._utils.arrays import short_repr
 from avmsf._utils.caching import content_digest, keep_if_possible, source_digest
 from avmsf._utils.headers import FileKind
-from avmsf._utils.tensor_files import read_tensors, write_tensors
+from avmsf._utils.tensor_files import TensorReader, read_tensors, write_tensors
 from avmsf.capture.folder import Capture
 from avmsf.capture.impacts import Impacts
 from avmsf.errors import ExtractionError, FieldFileError
@@ -189,11 +189,13 @@ def _read(path: Path, digest: str, train: Impacts) -> Extraction | None:
         found, read = read_tensors(path, _KIND)
         if found != digest:
             return None
-        kept = {name.removeprefix(_ALIGNMENT): each for name, each in read.items() if name.startswith(_ALIGNMENT)}
         bank, shifts = ModalBank(read["frequency"], read["damping"]), None
         if "poles" in read or "shift" in read:
             shifts = FrequencyShifts(bank, torch.view_as_complex(read["poles"].contiguous()), float(read["shift"]))
-        alignment = Alignment.restore(kept, train.names, recording_keys(train)) if kept else None
+        alignment, modes = None, read.get(f"{_ALIGNMENT}frequency")
+        if modes is not None:
+            kept = TensorReader(read, path, _KIND).within(_ALIGNMENT)
+            alignment = Alignment.restore(kept, train.names, recording_keys(train), len(modes))
         gains = torch.view_as_complex(read["gains"].contiguous())
         return Extraction(bank, gains, Residual(read["residual"]), alignment, shifts)
     except (FieldFileError, KeyError):
