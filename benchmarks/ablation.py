@@ -10,7 +10,7 @@ import torch
 from avmsf.evaluation.splits import split
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, STEEL
-from avmsf.fem.supports import EndPatch, Support
+from avmsf.fem.supports import Patch, Support
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.estimator import FAMILIES, MixtureEstimator
 from avmsf.field.gains.kernels import Smooth, ThinPlate
@@ -118,9 +118,9 @@ def supports(settings: Settings) -> Iterator[Record]:
     held: rigidly, softly: by springs of 200 kN/m. free: taken for free; auto: the default; try: supports tried, and
     what is found; no body: by positions alone.
     """
-    base = EndPatch("its base", (0.0, 0.0, -1.0))
+    base = Patch("its base", (0.0, 0.0, -1.0))
     cases = (
-        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, EndPatch("a short side", (-1.0, 0.0, 0.0))),
+        ("plate", block((0.24, 0.16, 0.003), (16, 10, 1)), STEEL, Patch("a short side", (-1.0, 0.0, 0.0))),
         ("mug", make_shape("mug", size=0.1, wall=0.003).solid, CERAMIC, base),
         ("steel mug", make_shape("mug", size=0.08, wall=0.0015).solid, STEEL, base),
     )

@@ -17,7 +17,7 @@ from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.meshing import checked, weld
 from avmsf.fem.solid import Solid
-from avmsf.fem.supports import EndPatch, Support, patches_of
+from avmsf.fem.supports import Patch, Support, patches_of
 from avmsf.fem.walls import wall_of
 from avmsf.mesh.surface import Surface
 from avmsf.simulate.shapes import make_shape
@@ -52,7 +52,7 @@ def test_a_beam_on_two_springs_has_the_textbooks_frequencies(ratio: float):
     length, width, height = 0.3, 0.012, 0.003
     solid = block((length, width, height), (30, 2, 1))
     stiffness = ratio * NOMINAL.young * width * height**3 / 12 / length**3
-    ends = tuple(EndPatch(name, (way, 0.0, 0.0)) for name, way in (("left", -1.0), ("right", 1.0)))
+    ends = tuple(Patch(name, (way, 0.0, 0.0)) for name, way in (("left", -1.0), ("right", 1.0)))
     modes = elastic_modes(solid, NOMINAL, count=24, support=Support(ends, stiffness))
     middle = torch.tensor([[0.5 * length, 0.5 * width, 0.0]], dtype=torch.float64)
     line = middle + torch.linspace(-0.5, 0.5, 31, dtype=torch.float64)[:, None] * torch.tensor([length, 0.0, 0.0])
@@ -66,7 +66,7 @@ def test_a_beam_on_two_springs_has_the_textbooks_frequencies(ratio: float):
 def test_a_body_on_a_soft_patch_bounces_as_a_rigid_one():
     solid = block((0.04, 0.03, 0.02), (4, 3, 2))
     stiffness = 100.0
-    lowest = EndPatch("its lowest part", (0.0, 0.0, -1.0))
+    lowest = Patch("its lowest part", (0.0, 0.0, -1.0))
     modes = elastic_modes(solid, NOMINAL, count=6, support=Support((lowest,), stiffness))
     bounce = math.sqrt(stiffness / (NOMINAL.density * 0.04 * 0.03 * 0.02)) / (2 * math.pi)
     assert float((modes.frequency / bounce - 1).abs().min()) < 1e-3
@@ -75,7 +75,7 @@ def test_a_body_on_a_soft_patch_bounces_as_a_rigid_one():
 def test_a_clamped_square_plate_has_leissas_frequencies():
     side, height = 0.2, 0.002
     steel = replace(NOMINAL, poisson=0.3)
-    clamped = Support((EndPatch("a side", (0.0, 1.0, 0.0)),), RIGID)
+    clamped = Support((Patch("a side", (0.0, 1.0, 0.0)),), RIGID)
     modes = elastic_modes(block((side, side, height), (14, 14, 1)), steel, count=5, support=clamped)
     rigidity = steel.young * height**3 / 12 / (1 - 0.3**2)
     unit = math.sqrt(rigidity / (steel.density * height)) / (2 * math.pi * side**2)
@@ -87,7 +87,7 @@ def test_a_clamped_square_plate_has_leissas_frequencies():
 def test_the_basis_of_free_and_attachment_modes_has_the_held_bodys_modes(ratio: float, error: float):
     solid = block((0.2, 0.03, 0.004), (16, 3, 1))
     held = HeldModes(solid, NOMINAL, count=24)
-    ends = tuple(patch for patch in held.patches if isinstance(patch, EndPatch) and abs(patch.direction[0]) > 0.99)
+    ends = tuple(patch for patch in held.patches if patch.is_end and abs(patch.place[0]) > 0.99)
     support = Support(ends, ratio * held.stiffness_scale)
     found, true = held.on(support), elastic_modes(solid, NOMINAL, count=24, support=support)
     assert found.frequency[:16].tolist() == pytest.approx(true.frequency[:16].tolist(), rel=error)
@@ -118,7 +118,7 @@ def test_a_body_that_turns_about_its_support_has_no_mode_at_zero(held: str):
     solid = block((0.1, 0.02, 0.01), (6, 2, 1))
     # Upright on an edge or on a corner.
     turn = {"line": (0.0, -1.0, -1.0), "point": (-1.0, -1.1, -1.2)}[held]
-    patch = EndPatch(held, tuple(float(each) for each in np.array(turn) / np.linalg.norm(turn)))
+    patch = Patch(held, tuple(float(each) for each in np.array(turn) / np.linalg.norm(turn)))
     modes = elastic_modes(solid, NOMINAL, count=4, support=Support((patch,), RIGID))
     assert bool(torch.isfinite(modes.frequency).all())
     assert float(modes.frequency[0]) > 10.0
