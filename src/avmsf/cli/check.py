@@ -122,8 +122,8 @@ def run(options: Options) -> int:
     said = {str(each) for each in warned} & of_units
     lines += [each for each in problems if each not in said]
     if not options.write_settings:
-        for reason, alike in groupby(proposals, lambda each: each.reason):
-            lines.append(f"proposed: {', '.join(each.line for each in alike)} ({options.how}). {reason}")
+        for reason, group in groupby(proposals, lambda each: each.reason):
+            lines.append(f"proposed: {', '.join(each.line for each in group)} ({options.how}). {reason}")
     elif not proposals:
         left = "; settings that the messages above name are yours to choose" if problems else ""
         lines.append(f"the folder's files determine no further setting: nothing was written{left}")
