@@ -214,3 +214,12 @@ def test_a_point_far_from_the_object_does_not_hold_it() -> None:
     expect_held([(0.0, 0.0, 0.05), (0.05, 0.0, 0.06)], surface)
     with raises(CaptureError, name="held", value=pytest.approx(0.95)):
         expect_held([(0.0, 0.0, 0.05), (0.0, 0.0, 1.0)], surface)
+
+
+@pytest.mark.parametrize(("rate", "seconds"), [(48_000, 0.1), (48_000, 0.25), (2048, 0.9), (1000, 1.0)])
+def test_an_offset_of_a_short_sound_is_found_and_none_is_seen_where_none_is(rate: int, seconds: float) -> None:
+    time = np.arange(round(rate * seconds)) / rate
+    noise = 1e-4 * np.random.default_rng(0).standard_normal(len(time))
+    sound = np.exp(-20 / seconds * time) * np.sin(0.3 * np.pi * rate * time) + noise
+    assert constant_offset(sound, sample_rate=rate) == 0.0
+    assert constant_offset(sound + 0.05, sample_rate=rate) == pytest.approx(0.05, abs=2e-4)

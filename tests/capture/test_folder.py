@@ -268,3 +268,12 @@ def test_places_do_not_grow_along_a_row():
     order = torch.randperm(161, generator=torch.Generator().manual_seed(0))
     together = places[:, None] == places
     assert torch.equal((places_of(contacts[order])[:, None] == places_of(contacts[order])), together[order][:, order])
+
+
+def test_a_capture_that_was_sped_up_is_read_back(tmp_path: Path) -> None:
+    sounds = {f"{seed}.wav": ring(before=0.05, seed=seed) for seed in range(4)}
+    read = read_capture(fill(tmp_path / "cup", sounds=sounds, settings="playback_speed = 4.0\nseconds = 0.03"))
+    read.write(tmp_path / "again")
+    again = read_capture(tmp_path / "again").impacts
+    for name in ("sounds", "before", "after"):
+        torch.testing.assert_close(getattr(again, name), getattr(read.impacts, name), rtol=0, atol=0, equal_nan=True)

@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from avmsf.capture import CaptureSettings
-from avmsf.capture.checks import check_surface
+from avmsf.capture.checks import check_surface, find_surface
 from avmsf.capture.placement import FACTORS, check_placement
 from avmsf.capture.table import Impact, parse_row, read_rows
 from avmsf.errors import CaptureError
@@ -211,3 +211,12 @@ def test_an_arbitrary_frame_is_called_one() -> None:
     placement = check_placement(CONTACTS, moved)
     assert placement.fault == "frame"
     assert "different frames" in placement.describe(what="Gaussians")
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_vertices_of_no_triangle_are_no_part_of_the_object(tmp_path: Path, suffix: str) -> None:
+    box = trimesh.creation.box((0.1, 0.06, 0.04))
+    trimesh.Trimesh([*box.vertices, (2.0, 2.0, 2.0)], box.faces, process=False).export(tmp_path / f"surface.{suffix}")
+    surface = find_surface(tmp_path, CaptureSettings())
+    assert surface is not None
+    assert (len(surface.vertices), float(surface.vertices.amax())) == (8, pytest.approx(0.05))

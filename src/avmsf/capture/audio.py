@@ -119,19 +119,20 @@ class Recording:
 
 
 def constant_offset(sound: Float64[np.ndarray, " frames"], *, sample_rate: float) -> float:
-    """Return the mean of the quietest tenth of 10 ms blocks; 0 where a t-test of the blocks finds none.
+    """Return the mean of the quietest tenth of 10 ms blocks, eight at least; 0 where a t-test of the blocks finds none.
 
     A block is as quiet as the 50 ms around it: within 10 ms, vibrations of 20 to 50 Hz vary least where they turn.
+    Short sounds have 16 shorter blocks. 0 below 256 samples, too.
     """
-    size = max(64, round(0.01 * sample_rate))
-    count = len(sound) // size
-    if count < 30 or np.ptp(sound) < MIN_PEAK:
+    size = min(max(64, round(0.01 * sample_rate)), len(sound) // 16)
+    if size < 16 or np.ptp(sound) < MIN_PEAK:
         return 0.0
+    count = len(sound) // size
     middle = float(np.median(sound))
     blocks = (sound[: count * size] - middle).reshape(count, size)
     means, powers = blocks.mean(axis=1), np.square(blocks).mean(axis=1)
     variance = uniform_filter1d(powers, 5) - uniform_filter1d(means, 5) ** 2
-    means = means[np.argsort(variance, kind="stable")[: count // 10]] + middle
+    means = means[np.argsort(variance, kind="stable")[: max(8, count // 10)]] + middle
     offset, error = float(means.mean()), float(means.std(ddof=1)) / math.sqrt(len(means))
     limit = error * float(stdtrit(len(means) - 1, 1.0 - OFFSET_SIGNIFICANCE))
     return offset if abs(offset) > limit else 0.0

@@ -158,6 +158,6 @@ def units_words(units: Mapping[str, str]) -> str:
 
 
 def find_surface(folder: Path, settings: CaptureSettings) -> Surface | None:
-    """Read what `find_surface_file` finds; None where it finds nothing."""
+    """Read what `find_surface_file` finds, without vertices of no triangle; None where it finds nothing."""
     path = find_surface_file(folder, settings)
-    return None if path is None else Surface.read(path, meters=settings.surface_meters)
+    return None if path is None else Surface.read(path, meters=settings.surface_meters).used()

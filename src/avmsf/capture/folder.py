@@ -195,7 +195,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
     if not final and impacts.before is not None and impacts.after is not None:
         whole = torch.cat([impacts.before, impacts.sounds, impacts.after], dim=1)
         sounds = [each[~each.isnan()] for each in whole]
-    rate, speed = _whole_rate(impacts.sample_rate)
+    rate, speed = _whole_rate(impacts.sample_rate, read_by.playback_speed)
     parts = ((REQUIRED, impacts.contacts), (DIRECTION, impacts.directions), ((FORCE,), impacts.forces))
     known = {columns: each.reshape(len(impacts), -1) for columns, each in parts if each is not None}
     # Seventeen digits hold a float64 exactly.
@@ -236,11 +236,11 @@ def _file_names(names: tuple[str, ...]) -> list[str]:
     return [f"{number:03d}.wav" for number in range(1, len(names) + 1)]
 
 
-def _whole_rate(sample_rate: float) -> tuple[int, float]:
-    """Return a whole rate for the files, close to the given one, and the playback speed that brings that back exactly.
+def _whole_rate(sample_rate: float, speed: float) -> tuple[int, float]:
+    """Return a whole rate for the files, close to the given one over the speed, and the speed that brings that back.
 
     A quotient times its divisor misses by one unit in the last place for one divisor in seven, so others are tried.
     """
-    nearest = max(1, round(sample_rate))
+    nearest = max(1, round(sample_rate / speed))
     rate = next(rate for rate in range(nearest, 2 * nearest + 64) if rate * (sample_rate / rate) == sample_rate)
     return rate, sample_rate / rate

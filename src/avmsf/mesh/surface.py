@@ -69,6 +69,11 @@ class Surface:
         joined = (np.concatenate(vertices) * meters).astype(np.float32)
         return cls(torch.from_numpy(joined), torch.from_numpy(np.concatenate(faces)))
 
+    def used(self) -> "Surface":
+        """Return it without vertices of no triangle, such as those of a table that was deleted by its triangles."""
+        rows, corners = torch.unique(self.faces, return_inverse=True)
+        return Surface(self.vertices[rows], corners) if 0 < len(rows) < len(self.vertices) else self
+
     def write(self, path: str | Path, *, kind: SurfaceKind | None = None) -> None:
         """Write it in meters: as a binary PLY, which holds float32 coordinates to the last bit, as OBJ or as GLB.
 
@@ -147,6 +152,5 @@ def contacted_part(surface: Surface, contacts: Float[Tensor, "contacts 3"]) -> t
     left = areas > areas[part]
     if not left.any() or np.mean(parts != part) > _ELSEWHERE:
         return surface, []
-    kept = surface.faces[torch.from_numpy(~left[label])]
-    used, corners = torch.unique(kept, return_inverse=True)
-    return Surface(surface.vertices[used], corners), [float(areas[part]), *map(float, areas[left])]
+    kept = Surface(surface.vertices, surface.faces[torch.from_numpy(~left[label])])
+    return kept.used(), [float(areas[part]), *map(float, areas[left])]

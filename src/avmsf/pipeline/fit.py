@@ -314,7 +314,7 @@ def guess_in_stages(
                 )
                 scene.expect_any()
         else:
-            name, mesh = name or source.resolve().stem, Surface.read(source, meters=settings.surface_meters)
+            name, mesh = name or source.resolve().stem, Surface.read(source, meters=settings.surface_meters).used()
         if scene is not None and scene.source is not None and scene.source.kind in ("photographs", "video"):
             raise SceneError.expected(
                 "a mesh, or photographs with cameras in meters (transforms.json, COLMAP)",
