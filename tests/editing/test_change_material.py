@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from avmsf.editing.material import LAWS, MAX_MISMATCH, change_material, edit, guess_materials, infer_material
-from avmsf.editing.modal_edit import adjust_modes, silenced
+from avmsf.editing.modal_edit import ModalEdit, adjust_modes, silenced
 from avmsf.errors import EditError, SimulationError
 from avmsf.fem.elastic_modes import elastic_modes
 from avmsf.fem.material import CERAMIC, GLASS, NOMINAL, PLASTIC, STEEL, WOOD, Material
@@ -231,3 +231,10 @@ def test_a_body_too_stiff_for_a_material_excludes_it():
     assert infer_material(steel, option="--from")[0] == STEEL
     with raises(EditError, name="--from"):
         infer_material(replace(plate_field(WOOD), origin=origin), option="--from")
+
+
+def test_a_body_excludes_no_material_that_a_guided_edit_has_led_to():
+    body = {"body": "solid body", "wall_thickness": None, "frequency_factor": math.sqrt(RATIO[STEEL] / RATIO[NOMINAL])}
+    origin = Origin("plate", report={"credibility": {"credible": True}, "bodies": [body]})
+    wooden = ModalEdit.none(plate_field(WOOD).bank).of(replace(plate_field(WOOD), origin=origin))
+    assert infer_material(wooden, option="--from")[0] == WOOD

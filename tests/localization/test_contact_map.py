@@ -116,8 +116,9 @@ def test_modes_that_err_alike_tell_no_more_than_one_of_them() -> None:
 def test_levels_and_edits_change_nothing() -> None:
     field = plate_field(20)
     gains = field.gain_field
-    louder = replace(field, gain_field=gains.with_values(1000.0 * gains.values))
-    assert calibrate_tempering(louder) == calibrate_tempering(field)
+    for factor in (1e-14, 1000.0, 1e14):
+        louder = replace(field, gain_field=gains.with_values(factor * gains.values))
+        assert calibrate_tempering(louder) == calibrate_tempering(field)
     edited = replace(field, gain_field=ScaledGains(gains, torch.full((len(field.bank),), 0.1).double(), 2.0))
     assert calibrate_tempering(edited) == calibrate_tempering(field)
 

@@ -260,3 +260,13 @@ NOISE = torch.randn(7200, generator=torch.Generator().manual_seed(0))
 def test_what_cannot_be_located_is_refused(make, attributes):
     with raises(LocationError, **attributes):
         make()
+
+
+def test_a_mode_that_a_field_cannot_predict_does_not_decide_the_force():
+    generator = torch.Generator().manual_seed(1)
+    gains, errors = torch.randn(2, 200, 8, generator=generator, dtype=torch.complex64)
+    variance = torch.full((200, 8), 0.04)
+    gains[:, 0], variance[:, 0] = 1e-4 * gains[:, 0], 1.0
+    known = PredictedGains(gains, variance, torch.linspace(200.0, 2000.0, 8, dtype=torch.float64))
+    sound = (gains[50] + 0.2 * errors[50]).to(torch.complex128).index_fill(0, torch.tensor(0), 0.0)  # at its node
+    assert Likelihood(known, sound, torch.full((8,), 1e-8, dtype=torch.float64)).evidence() > 10.0

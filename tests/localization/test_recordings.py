@@ -234,3 +234,14 @@ def test_settings_count_as_for_one_impact():
         locate_impacts(true_field(), both, settings=settings, locator=locator_of())
     plain = replace(settings, normalize="auto")
     assert len(locate_impacts(true_field(), both, settings=plain, locator=locator_of())) == 2
+
+
+@pytest.mark.parametrize("times", [2, 4])
+def test_impacts_of_a_finer_sampled_session_are_where_they_were(times):
+    sound, _ = overlapping([0.1, 0.25, 0.36], [1.0, 0.8, 1.2], seed=31)
+    finer = scipy.signal.resample_poly(sound.double().numpy(), times, 1)
+    found = locate_impacts(true_field(), finer, sample_rate=times * RATE, locator=locator_of())
+    whole = locate_impacts(true_field(), sound, locator=locator_of())
+    for (seconds, one), (expected, other) in zip(found, whole, strict=True):
+        assert abs(seconds - expected) < 2.5 / RATE
+        assert one.explained_energy == pytest.approx(other.explained_energy, abs=0.03)

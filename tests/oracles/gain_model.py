@@ -48,11 +48,19 @@ def integrated_log_evidence(
     return float(np.log(np.trapezoid(np.exp(normal + log_prior(logs)), logs)))
 
 
-def conditional(kernel: Array, variance: float, values: Array) -> tuple[Array, Array, float]:
-    """Return mean and covariance of the places that follow the known contacts in a joint kernel, and s^2."""
+def conditional(
+    kernel: Array, variance: float, values: Array, places: Array | None = None
+) -> tuple[Array, Array, float]:
+    """Return mean and covariance of the places that follow the known contacts in a joint kernel, and s^2.
+
+    Contacts of one number in `places` are repeated impacts, which tell the scale as one does.
+    """
     count = len(values)
     inverse = np.linalg.inv(kernel[:count, :count] + variance * np.eye(count))
-    across, scale = kernel[count:, :count], values @ inverse @ values / count
+    own = [values[[row]] for row in range(count)] if places is None else [values[places == each] for each in {*places}]
+    within = sum(((each - each.mean()) ** 2).sum() for each in own)
+    quadratic = values @ inverse @ values - (within / variance if within else 0.0)
+    across, scale = kernel[count:, :count], quadratic / len(own)
     return across @ inverse @ values, scale * (kernel[count:, count:] - across @ inverse @ across.T), float(scale)
 
 

@@ -204,7 +204,8 @@ def infer_material(field: SoundField, *, option: str, new: Material | None = Non
     if "guess" in report and last is None:
         guessed = Material(**report["material"])
         return guessed, f"old material: {guessed.name}, for which the field was guessed"
-    body = ProbableBody.of(report)
+    # A guided edit has left the body's material.
+    body = ProbableBody.of(report) if last is None else None
     stiff = "" if body is None else f", and the most probable body has {body.specific_stiffness}"
     guesses = guess_materials(bank, _weight(field), materials=MATERIALS.values() if body is None else body.materials)
     if not guesses or guesses[0][1] > MAX_MISMATCH:

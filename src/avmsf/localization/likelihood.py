@@ -109,7 +109,7 @@ class Likelihood:
         level = (surplus.sum() / (mean_power + unknown).sum()).clamp_min(1e-12)
         self.weights = 1.0 / (self.noise + level * (unknown + RELATIVE_ERRORS[1] ** 2 * mean_power))
         """One over the errors' variance, roughly: with these the shift is found."""
-        self.force_weights = 1.0 / (self.noise + (surplus.sum() / mean_power.sum()).clamp_min(1e-12) * mean_power)
+        self.force_weights = 1.0 / (self.noise + level * (mean_power + unknown))
         """By which energies are summed that give the force at which an impact's errors are taken."""
         self.sound = self.force_weights @ surplus
         """That sum of the sound's energy beyond the noise."""

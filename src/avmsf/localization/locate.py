@@ -154,11 +154,16 @@ def locate_impacts(
         response = whole.response(chosen.response_channel, force_channel=chosen.force_channel)
         check_not_silent(response, whole)
         sound = remove_rumble(response, chosen.highpass, whole)
-    onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     finder = _locator_for(field, locator)
     ratio = len(resampled) / len(sound)
-    starts = [round(onset * ratio) for onset in onsets]
+    if ratio < 1.0:
+        # Sampled finer than it has frequencies, a sound is predicted so well that an onset seems to be before it.
+        starts = detect_onsets(resampled.double().numpy(), sample_rate=ratio * whole.sample_rate)
+        onsets = [round(start / ratio) for start in starts]
+    else:
+        onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
+        starts = [round(onset * ratio) for onset in onsets]
     found = []
     rejected: list[tuple[float, LocationError]] = []
     for number, (onset, start) in enumerate(zip(onsets, starts, strict=True)):

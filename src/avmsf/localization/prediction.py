@@ -175,7 +175,9 @@ def calibrate_tempering(field: SoundField) -> float:
             continue
         loudest = float(measured.abs().max())
         mean, variance, _ = predict(replace(field, gain_field=left), places, factor=factor)
-        known = PredictedGains(mean[:, kept], (variance + about)[:, kept], field.bank.frequency[kept].double())
+        # In a unit in which float32 holds all squares, as in a locator.
+        mean, variance = mean[:, kept] / loudest, (variance + about)[:, kept] / loudest**2
+        known = PredictedGains(mean, variance, field.bank.frequency[kept].double())
         found = Likelihood(known, measured, torch.full(measured.shape, _NOISE * loudest**2, dtype=torch.float64))
         row = int(found.log_likelihood.argmax())
         explained = _explained_energy(known.gains[row].to(measured), measured, weights)

@@ -11,6 +11,8 @@ import pytest
 import torch
 from scipy.interpolate import RBFInterpolator
 
+from avmsf._utils.tensor_files import TensorReader
+from avmsf.field.config import FIELD
 from avmsf.field.gains import kernels
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
@@ -85,7 +87,7 @@ def test_the_family_of_the_page_takes_part_in_fits_and_files(monkeypatch):
     )  # fmt: skip
     share = dict(zip((each.kind for each in given.families), given.shares().mean(1).tolist(), strict=True))
     assert share["periodic"] > 0.9
-    back = MixtureGains.restore(given.record(), given.tensors())
+    back = MixtureGains.restore(given.record(), TensorReader(given.tensors(), Path("page.safetensors"), FIELD))
     asked = draw(5, 3, seed=2)
     assert torch.equal(back.predict(asked).mean, given.predict(asked).mean)
 

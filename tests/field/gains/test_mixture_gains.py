@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from avmsf.field.gains import mixture_gains as module
-from avmsf.field.gains.fitting import fit_mixture
+from avmsf.field.gains.fitting import MeasuredGains, fit_mixture
 from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
@@ -38,7 +38,8 @@ def dense(
 ) -> tuple[torch.Tensor, torch.Tensor, float]:
     """Return one hypothesis's mean and covariance of a series at the asked places, and its noise's variance."""
     noise = float(NOISE_SHARES[share] + given.mixture.floor[series])
-    mean, covariance, scale = oracle.conditional(kernel.numpy(), noise, given.mixture.values[:, series].numpy())
+    values, places = given.mixture.values[:, series].numpy(), given.mixture.places.numpy()
+    mean, covariance, scale = oracle.conditional(kernel.numpy(), noise, values, places)
     return torch.from_numpy(mean), torch.from_numpy(covariance), scale * noise
 
 
@@ -215,3 +216,14 @@ def test_impacts_in_one_place_have_their_mean_there():
     torch.testing.assert_close(found, exact.expand(4, -1), rtol=0, atol=0.05 * float(exact.abs().max()))
     assert bool(gains_at(given).isfinite().all())
     assert bool(deviation_at(given).isfinite().all())
+
+
+def test_repeated_recordings_leave_the_deviation_as_it_is():
+    sites = impacts(10, seed=1)
+    once, rows = measured(sites), torch.arange(10).repeat(4)
+
+    def deviation(sites: Sites, gains: MeasuredGains) -> float:
+        given = fit_mixture(families(sites, elastic=False), gains, sites.points.float(), directional=True)
+        return float(deviation_at(given).median())
+
+    assert deviation(sites.take(rows), once.take(rows)) == pytest.approx(deviation(sites, once), rel=0.25)

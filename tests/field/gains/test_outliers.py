@@ -231,3 +231,11 @@ def test_errors_that_fall_at_most_contacts_are_no_chance():
     new, old, measured = predicted(0.3 + 0 * falls), predicted(0.3 + falls), MeasuredGains(ones, one, one, one)
     assert predicts_better(new, old, measured)
     assert not predicts_better(old, new, measured)
+
+
+def test_a_repeated_recording_does_not_count_as_predicted_by_its_place() -> None:
+    rows = torch.arange(12).repeat(2)
+    sites = _sites(12).take(rows)
+    gains = replace(_gains(_sites(12)), values=torch.view_as_complex(draw(12, MODES, 2, seed=2))).take(rows)
+    ratios = PredictiveRatios(_fit(sites, gains)(torch.arange(24), WIDE_NOISE_SHARES), sites, gains)
+    assert ratios.mean() < 0.3

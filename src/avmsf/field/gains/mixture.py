@@ -12,7 +12,8 @@ has the prior 1/s and is integrated out. With K = U diag(lambda) U', z = U' y an
 
 (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 5), so that one eigendecomposition of a
 kernel serves all noise shares and series. A value at a new place, with k its covariances with the contacts and k0 its
-own variance, is Student t with n degrees of freedom, location k' C^-1 y and squared scale Q/n (k0 - k' C^-1 k).
+own variance, is Student t with n degrees of freedom, location k' C^-1 y and squared scale Q/n (k0 - k' C^-1 k). Where
+places have repeated recordings, Q and n in this scale are those of the places' means (`KernelMixture.scale`).
 
 Where the mean square E of the values is expected beforehand, up to a factor, s^2 has an inverse-gamma prior of shape a
 and scale a E in place of 1/s: with few contacts it decides. It adds to the log evidence, and to the weights of kernels
@@ -135,6 +136,28 @@ class KernelMixture:
         """Eigenvalues and eigenvectors of the kernels."""
         return _eigen(self.kernels)
 
+    @cached_property
+    def places(self) -> Int[Tensor, " contacts"]:
+        """Number of each contact's place: repeated recordings have the same covariances in all kernels."""
+        return torch.unique(self.kernels.mean(0).round(decimals=9), dim=0, return_inverse=True)[1]
+
+    def scale(
+        self,
+        quadratic: Float64[Tensor, " pairs"],
+        variance: Float64[Tensor, " pairs"] | float,
+        series: Int[Tensor, " pairs"],
+        rows: Int[Tensor, " rows"],
+    ) -> Float64[Tensor, " pairs"]:
+        """Return s^2 by the values of some contacts, of which Q and v are given: Q over the number of places.
+
+        What repeated recordings add to Q, their squares about the mean of their place over v, tells the noise alone.
+        It is mostly less than v, and would make s^2 smaller with every repetition.
+        """
+        values, places = self.values[rows], self.places[rows]
+        member = (places[:, None] == torch.unique(places)).double()
+        within = (values - member @ (member.T @ values / member.sum(0)[:, None])).square().sum(0)
+        return (quadratic - within[series] / variance).clamp_min(0.0) / max(member.shape[1], 1)
+
     def standard_error(self) -> Float64[Tensor, " series"]:
         """Return the standard deviation of the noise in each value."""
         return self._summed(self._pairs.weight * self._pairs.scale * self._pairs.variance).sqrt()
@@ -210,7 +233,9 @@ class KernelMixture:
         highest.scatter_reduce_(0, pairs.series, logs, "amax")
         weights = (logs - highest[pairs.series]).exp()
         weights = weights / self._summed(weights)[pairs.series]
-        scale, own = rest / left, torch.diagonal(covariance, dim1=1, dim2=2)
+        others = torch.ones(count, dtype=torch.bool).index_fill(0, rows, False).nonzero().flatten()
+        scale = self.scale(rest, pairs.variance, pairs.series, others)
+        own = torch.diagonal(covariance, dim1=1, dim2=2)
         variance = scale[:, None] * (own - pairs.variance[:, None]).clamp_min(0.0)
         return weights, error, variance, scale * pairs.variance
 
@@ -242,7 +267,8 @@ class KernelMixture:
         inverse = 1.0 / (self.eigen[0][kernel] + variance[:, None])
         projected = (self.eigen[1].mT @ self.values)[kernel, :, series]
         quadratic = (projected.square() * inverse).sum(1)
-        weight, scale = self.weights[kernel, noise, series], quadratic / len(self.values)
+        weight = self.weights[kernel, noise, series]
+        scale = self.scale(quadratic, variance, series, torch.arange(len(self.values)))
         return _Pairs(kernel, series, weight, variance, inverse, projected * inverse, quadratic, scale)
 
     def _summed(self, values: Float64[Tensor, "pairs *rest"]) -> Float64[Tensor, "series *rest"]:

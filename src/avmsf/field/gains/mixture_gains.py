@@ -169,11 +169,12 @@ class MixtureGains(GainModel):
                 row, noise = int(place[mode]) - first, float(self.mixture.noise_variance[shares[mode], mode])
                 known = self.mixture.kernels[rows[mode]] + noise * torch.eye(len(values)).double()
                 root = torch.linalg.cholesky(known)
+                series = torch.tensor([mode, mode + len(best)])
                 half, parts = (
-                    torch.linalg.solve_triangular(root, each, upper=False)
-                    for each in (cross[row].T, values[:, [mode, mode + len(best)]])
+                    torch.linalg.solve_triangular(root, each, upper=False) for each in (cross[row].T, values[:, series])
                 )
-                size = float(parts.square().sum()) / len(values)
+                quadratic, every = parts.square().sum(0), torch.arange(len(values))
+                size = float(self.mixture.scale(quadratic, noise, series, every).sum())
                 yield mode, size * (own[row] - half.T @ half), size * noise
 
     def families_of(self, rows: Int[Tensor, " rows"]) -> Iterator[KernelFamily]:

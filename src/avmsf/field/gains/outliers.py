@@ -87,8 +87,14 @@ class PredictiveRatios:
     """Contacts that are set aside."""
 
     def mean(self) -> float:
-        """Return the mean ratio of the contacts that are not set aside."""
-        return float(self.without(self.aside)[0].nanmean())
+        """Return the mean ratio of the contacts that are not set aside, of each place the first one alone.
+
+        A repeated recording predicts the other ones of its place, whatever a body says.
+        """
+        rows = others(self.sites, self.aside).tolist()
+        places = places_of(self.sites.points[rows]).tolist()
+        first = dict(zip(reversed(places), reversed(rows), strict=True)).values()
+        return float(self.without(frozenset(range(len(self.sites))) - set(first))[0].nanmean())
 
     @cached_property
     def values(self) -> Float64[Tensor, "contacts series"]:
