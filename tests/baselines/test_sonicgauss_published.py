@@ -27,29 +27,12 @@ from factories.raising import raises
 
 pytest.importorskip("diffusers")
 
-TINY = PublishedSizes(
-    EncoderSizes((8, 8, 16), (1, 2, 1), (2, 2, 4), (2, 4), 32),
-    width=32,
-    contact=(16, 16),
-    fusion_heads=4,
-    transformer={
-        "num_layers": 1,
-        "num_single_layers": 1,
-        "attention_head_dim": 16,
-        "num_attention_heads": 2,
-        "in_channels": 8,
-        "axes_dims_rope": (4, 6, 6),
-    },
-    autoencoder={
-        "encoder_hidden_size": 16,
-        "downsampling_ratios": [2, 4],
-        "channel_multiples": [1, 2],
-        "decoder_channels": 8,
-        "decoder_input_channels": 8,
-        "audio_channels": 2,
-        "sampling_rate": 8000,
-    },
-)
+FLUX = {"num_layers": 1, "num_single_layers": 1, "attention_head_dim": 16, "num_attention_heads": 2}
+FLUX |= {"in_channels": 8, "axes_dims_rope": (4, 6, 6)}
+CODER = {"encoder_hidden_size": 16, "downsampling_ratios": [2, 4], "channel_multiples": [1, 2]}
+CODER |= {"decoder_channels": 8, "decoder_input_channels": 8, "audio_channels": 2, "sampling_rate": 8000}
+ENCODER = EncoderSizes((8, 8, 16), (1, 2, 1), (2, 2, 4), (2, 4), 32)
+TINY = PublishedSizes(ENCODER, width=32, contact=(16, 16), fusion_heads=4, transformer=FLUX, autoencoder=CODER)
 
 
 @cache
@@ -151,13 +134,8 @@ def test_hilberts_curve_fills_the_cube_in_steps_of_one():
 
 
 def test_z_order_interleaves_bits_from_x_on():
-    assert z_order(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [3, 5, 1]]), 3).tolist() == [
-        4,
-        2,
-        1,
-        32,
-        0b010100111,
-    ]
+    places = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [3, 5, 1]])
+    assert z_order(places, 3).tolist() == [4, 2, 1, 32, 0b010100111]
 
 
 def test_sparse_convolution_is_the_dense_one_at_occupied_voxels():

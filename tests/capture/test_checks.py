@@ -140,11 +140,8 @@ def test_it_goes_on_past_everything_that_is_broken(tmp_path: Path) -> None:
     rows = (*ROWS, "gone.wav,0,0,0.1", "d.wav,0,0,0.1", "e.wav,0,0,0.2", "f.wav,0,left,0.1", "g.wav,0,0,0.15")
     clipped = np.clip(10 * ring(), -1, 1)
     double = ring(1.0) + np.concatenate([np.zeros(3200), ring(0.6, seed=9)])
-    folder = fill(
-        tmp_path / ".work" / "cup",
-        rows=rows,
-        replace={"b.wav": clipped, "c.wav": double, "d.wav": np.zeros(4000), "f.wav": ring(), "STRAY.WAV": ring()},
-    )
+    others = {"b.wav": clipped, "c.wav": double, "d.wav": np.zeros(4000), "f.wav": ring(), "STRAY.WAV": ring()}
+    folder = fill(tmp_path / ".work" / "cup", rows=rows, replace=others)
     (folder / "e.wav").write_bytes(b"RIFF")
     # None of the capture's.
     for name in (".avmsf/removed/002-ac4f8f352f81.wav", "takes/.trash/001.wav", "._a.wav"):

@@ -23,14 +23,9 @@ def invented(*, names: tuple[str, ...] = ("takes/one.wav", "two.wav"), sample_ra
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(2, 3, generator=generator)
     contacts = torch.randn(2, 3, dtype=torch.float64, generator=generator) / 7
-    impacts = Impacts(
-        contacts=contacts,
-        sounds=torch.from_numpy(np.stack([ring(1.0, seed=1), ring(1.0, seed=2)]).astype(np.float32)),
-        sample_rate=sample_rate,
-        names=names,
-        directions=directions / directions.norm(dim=1, keepdim=True),
-        forces=torch.rand(2, generator=generator) + 1,
-    )
+    directions, forces = directions / directions.norm(dim=1, keepdim=True), torch.rand(2, generator=generator) + 1
+    sounds = torch.from_numpy(np.stack([ring(1.0, seed=1), ring(1.0, seed=2)]).astype(np.float32))
+    impacts = Impacts(contacts, sounds, sample_rate, names, directions=directions, forces=forces)
     # Its corners are the contacts and others, so that the contacts lie on it.
     corners = torch.cat([contacts.float(), torch.randn(4, 3, generator=generator) / 5])
     surface = Surface(corners, torch.tensor([[0, 1, 2], [3, 4, 5]]))
@@ -106,15 +101,6 @@ def test_names_that_cannot_be_files_become_numbers(tmp_path: Path, names: tuple[
     assert sorted(os.listdir(tmp_path)) == ["cup"]
 
 
-def test_writing_never_overwrites(tmp_path: Path) -> None:
-    (tmp_path / "cup").mkdir()
-    write_capture(invented(), tmp_path / "cup")
-    before = sorted(path.name for path in (tmp_path / "cup").iterdir())
-    with raises(CaptureError, file="cup"):
-        write_capture(invented(), tmp_path / "cup")
-    assert sorted(path.name for path in (tmp_path / "cup").iterdir()) == before
-
-
 CONTACTS = torch.tensor([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]], dtype=torch.float64)
 
 
@@ -160,11 +146,8 @@ def test_a_name_is_found_composed_or_decomposed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("surface_unit", ["mm", "cm"])
 def test_units_scale_contacts_and_surface(tmp_path: Path, surface_unit: str) -> None:
     size = {"mm": 100, "cm": 10}[surface_unit]
-    folder = fill(
-        tmp_path,
-        rows=("a.wav,100,0,0", "b.wav,0,200,0", "c.wav,0,0,300"),
-        settings=f'unit = "mm"\nname = "cup"\nsurface_unit = "{surface_unit}"',
-    )
+    settings = f'unit = "mm"\nname = "cup"\nsurface_unit = "{surface_unit}"'
+    folder = fill(tmp_path, rows=("a.wav,100,0,0", "b.wav,0,200,0", "c.wav,0,0,300"), settings=settings)
     trimesh.creation.box((2 * size, 4 * size, 6 * size)).export(folder / "surface.stl")
     capture = read_capture(folder)
     assert capture.name == "cup"

@@ -17,6 +17,7 @@ from avmsf.errors import CaptureError
 from avmsf.mesh import Surface
 from avmsf.mesh.surface import contacted_part, surface_points
 from factories.looked_at import surface_of
+from factories.made_sheet import sheet_over
 from factories.raising import raises
 
 Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
@@ -171,12 +172,7 @@ def test_the_aircrafts_contacts_lie_on_it_and_its_mistakes_are_named(shared: Pat
 
 
 def test_first_impacts_near_the_middle_of_a_plate_are_no_other_unit() -> None:
-    plate = surface_points(
-        Surface(
-            torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]]),
-            torch.tensor([[0, 1, 2], [0, 2, 3]]),
-        )
-    )
+    plate = surface_points(sheet_over(np.array([-0.5, 0.5]), np.array([-0.5, 0.5])))
     first = torch.tensor([[0.02, 0.0, 0.0], [-0.02, 0.01, 0.0]])
     assert check_placement(first, plate).fault != "unit"
     patch = 0.1 * (torch.rand(8, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * torch.tensor([1.0, 1.0, 0.0])

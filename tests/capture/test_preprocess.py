@@ -74,12 +74,8 @@ def test_peak_normalization_takes_the_blow_s_strength_out() -> None:
 def test_forces_of_the_table_serve_where_there_is_no_channel(tmp_path: Path) -> None:
     sound = ring(noise=0)
     rows = tuple(f"{row},{force}" for row, force in zip(ROWS, (0.5, 2, 8), strict=True))
-    folder = fill(
-        tmp_path,
-        header="file,x,y,z,force_newtons",
-        rows=rows,
-        replace={"a.wav": 0.5 * sound, "b.wav": 2 * sound, "c.wav": 8 * sound},
-    )
+    sounds = {"a.wav": 0.5 * sound, "b.wav": 2 * sound, "c.wav": 8 * sound}
+    folder = fill(tmp_path, header="file,x,y,z,force_newtons", rows=rows, replace=sounds)
     impacts = read_capture(folder, CaptureSettings(seconds=0.3)).impacts
     assert impacts.forces.tolist() == [0.5, 2, 8]
     # Float32 files of powers of two times one sound divide exactly.
@@ -132,12 +128,8 @@ def test_deconvolution_stays_close_in_noise_and_regularization_holds_it_down() -
     assert error_in_band(found, impulse, below=1000) < 0.02
     # Over all frequencies, the pulse's zeros among them: .10, where division without regularization gives .59. Ten
     # times less or a hundred times more are both worse than the default.
-    whole = [
-        error_in_band(
-            prepare(recording(force, sound), replace(settings, regularization=value)).sound, impulse, below=4e3
-        )
-        for value in (1e-12, 1e-5, settings.regularization, 1e-2)
-    ]
+    others = (replace(settings, regularization=value) for value in (1e-12, 1e-5, settings.regularization, 1e-2))
+    whole = [error_in_band(prepare(recording(force, sound), each).sound, impulse, below=4e3) for each in others]
     assert whole[2] == min(whole) < 0.12
     assert whole[0] > 0.5
 

@@ -115,11 +115,8 @@ def test_the_aircraft_s_hammer_is_found(shared: Path) -> None:
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    proposals = [
-        Proposal("force_channel", 1, "Because\nof # it all. " * 30),
-        Proposal("highpass", 20.0, "é"),
-        Proposal("unit", "mm", ""),
-    ]
+    given = ("force_channel", 1, "Because\nof # it all. " * 30), ("highpass", 20.0, "é"), ("unit", "mm", "")
+    proposals = [Proposal(*each) for each in given]
     path = write_settings(tmp_path, proposals)
     expected = replace(CaptureSettings(), force_channel=1, highpass=20.0, unit="mm")
     assert CaptureSettings.read(path) == expected

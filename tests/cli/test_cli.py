@@ -31,10 +31,9 @@ from factories.made_fields import directional, sounding
 from factories.plate_capture import PLATE, TINY, fill_plate
 from factories.plate_field import CONTACT_TIME, HIGHEST, RATE, plate_impacts
 from factories.raising import raises
-from factories.verbs import results_of, run_verb, sets
+from factories.verbs import Streams, results_of, run_verb, sets
 from oracles.plate import plate_modes
 
-Streams = pytest.CaptureFixture[str]
 AT = ("--position", "0.05", "0.06", "0")
 SMOOTH = ("--gain-model", "smooth", *TINY)
 

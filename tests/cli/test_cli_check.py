@@ -16,19 +16,18 @@ from avmsf.capture.filenames import expect_views, pictures_in
 from avmsf.cli import main
 from avmsf.errors import SceneError
 from avmsf.gaussians.ply import write_splats
-from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.mesh.surface import Surface, surface_points
 from avmsf.photographs.folder import read_camera_file, write_frames
 from avmsf.pipeline.visual_checks import VisualInputs, inputs, misplaced
 from factories.capture_folder import fill
+from factories.clouds import random_cloud
+from factories.delayed_plate import delays, strikes
 from factories.plate_capture import fill_plate
 from factories.raising import raises
 from factories.small_scene import slab, slab_views
-from factories.verbs import results_of
+from factories.verbs import Streams, results_of
 from factories.views_folder import frames, write_image, write_transforms
 from factories.views_folder import ring as camera_ring
-
-Streams = pytest.CaptureFixture[str]
 
 
 def test_no_settings_are_written_into_a_dataset(tmp_path: Path) -> None:
@@ -37,31 +36,23 @@ def test_no_settings_are_written_into_a_dataset(tmp_path: Path) -> None:
     assert main(["check", str(tmp_path), "--write-settings"]) == 2
 
 
-def fill_five(folder: Path, *, own_phases: int | None = None) -> Path:
-    """Write recordings of five modes with the impact after .1 s and some samples; one may have phases of its own."""
-    generator = np.random.default_rng(1)
-    starts = 800 + np.array([0, 2, -1, 1, -2, 0, 1, -1])
-    phases, sounds = np.array([0.2, 1.1, -0.6, 2.0, 0.9]), {}
-    for number, start in enumerate(starts):
-        time = (np.arange(6000) - start) / 8000
-        gains = generator.normal(size=5)
-        used = phases + (generator.uniform(0.6, 1.4, 5) * [1, -1, 1, -1, 1] if number == own_phases else 0.0)
-        angles = 2 * np.pi * np.array([410.0, 733.0, 1190.0, 1805.0, 2620.0]) * time[:, None] + used
-        sound = 0.05 * np.where(time >= 0, (np.exp(-15 * np.maximum(time, 0)[:, None]) * np.sin(angles)) @ gains, 0)
-        sounds[f"{number}.wav"] = sound + 1e-4 * generator.normal(size=6000)
-    return fill(folder, sounds=sounds, rate=8000)
+def fill_delayed(folder: Path, *, own_phases: int | None = None) -> Path:
+    """Write recordings of impacts that are parts of samples off; one may have phases of its own."""
+    made = strikes(8, starts=delays(8))
+    files = torch.cat([made.before, made.sounds, made.after], dim=1).numpy()
+    sounds = {f"{row}.wav": np.gradient(file) if row == own_phases else file for row, file in enumerate(files)}
+    return fill(folder, sounds=sounds)
 
 
 def test_check_and_modes_report_one_alignment(tmp_path: Path, capsys: Streams) -> None:
-    found, other = (results_of(capsys, verb, fill_five(tmp_path))[0]["alignment"] for verb in ("check", "modes"))
+    found, other = (results_of(capsys, verb, fill_delayed(tmp_path))[0]["alignment"] for verb in ("check", "modes"))
     assert found == other
     assert found["coherence_after"] > 0.99 > found["coherence_before"]
     assert found["not_aligned"] == []
 
 
 def test_what_is_wrong_with_the_alignment_is_a_problem(tmp_path: Path, capsys: Streams) -> None:
-    folder = fill_five(tmp_path / "phases", own_phases=3)
-    report, err = results_of(capsys, "check", folder)
+    report, err = results_of(capsys, "check", fill_delayed(tmp_path, own_phases=3))
     assert report["alignment"]["not_aligned"] == ["3.wav"]
     assert "no problem found" not in err
 
@@ -247,7 +238,7 @@ def test_gaussians_are_opened_and_another_frame_is_told(tmp_path: Path, case: st
     centers = surface_points(slab(), count=2000)
     if case == "y down":
         centers = centers * torch.tensor([1.0, -1.0, -1.0])
-    cloud = starting_cloud(StartPoints(centers, torch.rand(len(centers), 3)), degree=0, scale=1.0, opacity=0.9)
+    cloud = random_cloud(centers)
     if case == "nan":
         cloud.centers[7, 1] = math.nan
     write_splats(cloud, folder / "splats.ply")

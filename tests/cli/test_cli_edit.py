@@ -30,9 +30,8 @@ from avmsf.modal.modes import ModalBank
 from factories.made_clap import save_clap
 from factories.made_fields import FIELDS, mixture, places, sounding
 from factories.raising import raises
-from factories.verbs import results_of, run_verb, sets
+from factories.verbs import Streams, results_of, run_verb, sets
 
-Streams = pytest.CaptureFixture[str]
 RATE = 8000.0
 PLACES = places(5, seed=3)
 FREQUENCY = torch.tensor([390.0, 850.0, 1300.0, 1360.0, 2300.0], dtype=torch.float64)
@@ -218,12 +217,9 @@ def test_the_loudest_place_is_that_of_both_parts_of_the_gains() -> None:
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     """Let every model of sound answer all prompts with a ring 2 % higher; return what is asked of it, in order."""
     answer, asked = adjust_modes(ceramic(), pitch=1.02).render(PLACES[:1])[0], list[object]()
+    facts = {"name": "echo", "sample_rate": RATE, "channels": 1, "device": torch.device("cpu"), "dtype": torch.float32}
     echo = SimpleNamespace(
-        name="echo",
-        sample_rate=RATE,
-        channels=1,
-        device=torch.device("cpu"),
-        dtype=torch.float32,
+        **facts,
         describe=lambda: {"model": "echo"},
         encode=lambda waveforms: waveforms,
         decode=lambda latents, *, samples: latents[..., :samples],

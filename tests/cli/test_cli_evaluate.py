@@ -18,9 +18,8 @@ from avmsf.modal.extraction.stft import ShortTime
 from factories.plate_field import RATE
 from factories.plate_set import fill_plates
 from factories.raising import raises
-from factories.verbs import results_of, run_verb, sets
+from factories.verbs import Streams, results_of, run_verb, sets
 
-Streams = pytest.CaptureFixture[str]
 CHEAP = ("--methods", "knn3,nearest", "white-noise", "--no-cdpam")
 
 
@@ -157,15 +156,8 @@ def test_settings_and_the_device_reach_the_evaluation(plates, tmp_path, monkeypa
         raise KeyboardInterrupt
 
     monkeypatch.setattr("avmsf.evaluation.runner.run_objects", stop)
-    words = [
-        "farthest",
-        str(plates),
-        *CHEAP,
-        "--output",
-        str(tmp_path / "results"),
-        *sets("body.wall=0 geometry=gaussians"),
-    ]
-    assert main(["evaluate", *words, "--device", "cpu"]) == 130
+    words = ["farthest", str(plates), *CHEAP, "--output", str(tmp_path / "results"), "--device", "cpu"]
+    assert main(["evaluate", *words, *sets("body.wall=0 geometry=gaussians")]) == 130
     inputs = asked[0].inputs
     assert (inputs.body.wall, inputs.geometry, inputs.device) == (0.0, "gaussians", "cpu")
     # Figures of another wall are not these.

@@ -29,9 +29,8 @@ from factories.clouds import random_cloud
 from factories.made_fields import BANK, SIDES, directional, elastic, positional, saved, sounding
 from factories.made_tables import read_arrays
 from factories.raising import raises
-from factories.verbs import run_verb
+from factories.verbs import Streams, run_verb
 
-Streams = pytest.CaptureFixture[str]
 SAMPLES = 1200
 # Meshes here have no colors.
 pytestmark = pytest.mark.filterwarnings("ignore::avmsf.errors.CaptureWarning")
@@ -88,10 +87,8 @@ def test_contacts_of_faust_and_of_wavs_have_the_same_numbers(field_file: Path, t
     export(field_file, "faust", tmp_path / "a.dsp", "--contacts", 7, "--json")
     contacts = Path(json.loads(capsys.readouterr().out)["contacts"])
     folder = export(field_file, "wavs", tmp_path / "w", "--contacts", 7, "--seconds", 0.01)
-    one, other = (
-        {row["contact"]: [row[axis] for axis in "xyz"] for row in table_of(path)}
-        for path in (contacts, folder / "samples.csv")
-    )
+    tables = (table_of(path) for path in (contacts, folder / "samples.csv"))
+    one, other = ({row["contact"]: [row[axis] for axis in "xyz"] for row in table} for table in tables)
     assert len(one) == 7
     assert one == other
 
@@ -236,10 +233,8 @@ def test_an_edited_field_is_not_paired_with_recordings(field_file: Path, tmp_pat
 
 @pytest.mark.parametrize("size", [1.0, 3.0])
 def test_a_captures_mesh_is_as_large_as_the_field(size, field_file, tmp_path, capsys):
-    field, capture = (
-        load(field_file),
-        fill(tmp_path / "capture", rows=["a.wav,0,0,0"], settings='surface_unit = "cm"\n'),
-    )
+    field = load(field_file)
+    capture = fill(tmp_path / "capture", rows=["a.wav,0,0,0"], settings='surface_unit = "cm"\n')
     for part in (2.0, 1.5) if size == 3.0 else ():
         field = change_material(field, "glass", "glass", size=part)
     save(field, tmp_path / "large.safetensors")

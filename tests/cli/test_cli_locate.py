@@ -22,9 +22,8 @@ from avmsf.localization.locator import Locator
 from avmsf.modal.modes import ModalBank, synthesize
 from factories.made_fields import BANK, positional, sounding
 from factories.raising import raises
-from factories.verbs import results_of, run_verb
+from factories.verbs import Streams, results_of, run_verb
 
-Streams = pytest.CaptureFixture[str]
 RATE, SAMPLES = 8000, 4000
 STRUCK, SECOND_PLACE = 68, 102
 
@@ -83,14 +82,10 @@ def test_an_impact_is_found_drawn_and_told(place: Place, hit: str, tmp_path: Pat
     # The field's own contacts, left out, are badly predicted by the others: the region is as wide as that makes it.
     assert 0.0 < impact["credible_region"]["surface_fraction"] < 0.7
     assert (tmp_path / "maps" / "hit.png").read_bytes().startswith(b"\x89PNG")
-    regions = [
-        located(place, capsys, hit, "--probability", level)[0]["impacts"][0]["credible_region"]
-        for level in ("0.5", "0.999")
-    ]
-    assert (
-        regions[0]["surface_fraction"] < impact["credible_region"]["surface_fraction"] < regions[1]["surface_fraction"]
-    )
-    assert regions[0]["radius"] < regions[1]["radius"]
+    others = (located(place, capsys, hit, "--probability", level)[0]["impacts"][0] for level in ("0.5", "0.999"))
+    low, middle, high = (each["credible_region"] for each in (next(others), impact, next(others)))
+    assert low["surface_fraction"] < middle["surface_fraction"] < high["surface_fraction"]
+    assert low["radius"] < high["radius"]
 
 
 @pytest.mark.slow
@@ -108,12 +103,8 @@ def test_recordings_without_an_impact_on_the_object_have_no_place(place, tmp_pat
     silent = str(place.folder / "silent.wav")
     soundfile.write(silent, np.zeros(SAMPLES), RATE)
     noise = torch.randn(SAMPLES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    other = ModalBank(BANK.frequency * 1.27 + 40.0, BANK.damping)
-    cases = {
-        silent: "silence",
-        place.wav("noise.wav", noise): " dB",
-        place.wav("other.wav", place.impact(STRUCK, bank=other)): "a mismatch ratio of",
-    }
+    other = place.wav("other.wav", place.impact(STRUCK, bank=ModalBank(BANK.frequency * 1.27 + 40.0, BANK.damping)))
+    cases = {silent: "silence", place.wav("noise.wav", noise): " dB", other: "a mismatch ratio of"}
     printed, _ = located(place, capsys, *cases, "--output", str(tmp_path), code=2)
     for values, reason in zip(printed["impacts"], cases.values(), strict=True):
         assert (values["status"], values["position"]) == ("not located", None)

@@ -31,9 +31,8 @@ from avmsf.field.store import save
 from factories.made_fields import positional, sounding
 from factories.plate_capture import TINY, fill_plate
 from factories.raising import raises
-from factories.verbs import results_of, run_verb
+from factories.verbs import Streams, results_of, run_verb
 
-Streams = pytest.CaptureFixture[str]
 EVIL = "\x1b]0;title\x07\x9b31m\u202e"
 
 

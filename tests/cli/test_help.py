@@ -22,9 +22,8 @@ from avmsf.simulate.recipe import named_recipe
 from factories.made_fields import positional, sounding
 from factories.plate_capture import fill_plate
 from factories.raising import raises
-from factories.verbs import run_verb
+from factories.verbs import Streams, run_verb
 
-Streams = pytest.CaptureFixture[str]
 MOST_LINES = 50
 """Of a help at 80 columns."""
 
@@ -102,9 +101,6 @@ def test_values_are_numbers_words_truth_values_and_lists_of_these() -> None:
     assert (made.scene.lift.symmetry, made.body.wall, made.scene.views.source) == (False, 0.0, "mesh")
 
 
-STORED = Path(__file__).parents[1] / "field" / "data" / "format-8" / "mixture.safetensors"
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with captures, a field, and tables of contacts that cannot be used."""
@@ -115,8 +111,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "empty").mkdir()
     (folder / "cells").mkdir()
     (folder / "cells" / "impacts.csv").write_text("file,x,y,z\n001.wav,0,0,0\n002.wav,left,0,0\n")
-    newer = STORED.read_bytes().replace(b'\\"format\\": 8', b'\\"format\\": 9', 1)
-    (folder / "newer.safetensors").write_bytes(newer)
     (folder / "not-ours.safetensors").write_bytes(b"RIFF and so on")
     (folder / "no-z.csv").write_text("file,x,y\na.wav,0,0\n")
     (folder / "far.csv").write_text("file,x,y,z\na.wav,0.1,0.05,0\n\nb.wav,50,60,0\n")
@@ -163,7 +157,6 @@ EARLY: dict[str, dict[str, Any]] = {
     "fit empty --material glass": {"file": "empty"},
     "fit plate -o f.safetensors --set modes=0": {"name": "modes", "value": 0},
     f"{TABLE} no-z.csv": {"file": "no-z.csv", "row": 1, "name": "z"},
-    "info newer.safetensors": {"file": "newer.safetensors"},
     "locate field.safetensors": {"name": "recordings", "value": 0},
     "suggest field.safetensors --unseen --candidates plate": {"name": "--unseen"},
     "export field.safetensors --to wavs -o plate --overwrite": {"file": "plate", "name": "--overwrite"},

@@ -105,10 +105,8 @@ def test_modes_beyond_the_count_follow_the_common_factors_alone():
 
 def test_the_published_form_has_one_factor_on_frequencies_and_gains_that_follow_them():
     field = ringing_field()
-    follow, stay = (
-        trace(field, towards(pitch=0.9), config=QUICK, parameters=replace(PUBLISHED, gains_follow=each))[0]
-        for each in (True, False)
-    )
+    both = (replace(PUBLISHED, gains_follow=each) for each in (True, False))
+    follow, stay = (trace(field, towards(pitch=0.9), config=QUICK, parameters=each)[0] for each in both)
     entry = follow.origin.report["edits"][-1]
     assert entry["pitch"] == pytest.approx(0.9, rel=0.03)
     assert entry["decay"] == 1.0

@@ -138,13 +138,9 @@ def test_adjusted_modes_keep_the_material():
 
 
 def made_edit(*, pitch: float = math.log(0.7)) -> ModalEdit:
-    return ModalEdit(
-        torch.tensor(pitch, dtype=torch.float64),
-        torch.tensor([0.02, -0.01, 0.0, 0.03, 0.0], dtype=torch.float64),
-        torch.tensor(math.log(3.0), dtype=torch.float64),
-        torch.tensor([0.0, 0.1, -0.1, 0.0, 0.2], dtype=torch.float64),
-        torch.tensor([0.0, 0.5, -0.5, 0.1, 1.0], dtype=torch.float64),
-    )
+    first, second, third = [0.02, -0.01, 0.0, 0.03, 0.0], [0.0, 0.1, -0.1, 0.0, 0.2], [0.0, 0.5, -0.5, 0.1, 1.0]
+    values = (pitch, first, math.log(3.0), second, third)
+    return ModalEdit(*(torch.tensor(each, dtype=torch.float64) for each in values))
 
 
 def test_the_formula_of_the_paper():

@@ -77,15 +77,10 @@ def test_the_estimate_is_the_v_prediction_of_the_paper(model):
     rotary = diffusers.models.embeddings.get_1d_rotary_pos_embed(
         4, FRAMES + 1, use_real=True, repeat_interleave_real=False
     )
+    text, times = (each[1:].expand(2, -1, -1) for each in (conditioning.text, conditioning.times))
+    given = {"encoder_hidden_states": text, "global_hidden_states": times, "rotary_embedding": rotary}
     with torch.no_grad():
-        v = model.pipeline.transformer(
-            latents,
-            level,
-            encoder_hidden_states=conditioning.text[1:].expand(2, -1, -1),
-            global_hidden_states=conditioning.times[1:].expand(2, -1, -1),
-            rotary_embedding=rotary,
-            return_dict=False,
-        )[0]
+        v = model.pipeline.transformer(latents, level, return_dict=False, **given)[0]
     found = model.denoised(latents, level, conditioning, guidance=1.0)
     torch.testing.assert_close(found, torch.cos(angle) * latents - torch.sin(angle) * v, rtol=1e-4, atol=1e-5)
     # Guidance is linear in the text.
@@ -129,9 +124,8 @@ def test_models_that_cannot_be_used_are_refused(model, folder, monkeypatch):
     with raises(EditError, name="device", value="cpu"):
         StableAudio.load(folder, device="cpu")
     monkeypatch.setattr("avmsf.editing.stable_audio.find_spec", lambda name: None)
-    with raises(EditError, name="diffusers") as caught:
+    with raises(EditError, name="diffusers"):
         StableAudio.load(folder)
-    assert "pip install 'avmsf[text]'" in str(caught.value)
 
 
 def test_seconds_bound_the_window(folder):
@@ -146,10 +140,8 @@ def test_seconds_bound_the_window(folder):
 
 def test_weights_that_are_not_here(monkeypatch, tmp_path):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with raises(EditError, name="source", value=STABLE_AUDIO) as caught:
+    with raises(EditError, name="source", value=STABLE_AUDIO):
         StableAudio.load()
-    assert f"https://huggingface.co/{STABLE_AUDIO}" in str(caught.value)
-    assert "hf auth login" in str(caught.value)
     with raises(EditError, file=tmp_path / "nowhere", name="source"):
         StableAudio.load(tmp_path / "nowhere")
 
@@ -171,6 +163,5 @@ def test_a_folder_that_is_not_complete(folder, tmp_path):
     )
     for spoil in spoilers:
         spoil()
-        with raises(EditError, file=place, name="source") as caught:
+        with raises(EditError, file=place, name="source"):
             StableAudio.load(place)
-        assert f"hf download {STABLE_AUDIO}" in str(caught.value)

@@ -100,11 +100,10 @@ def test_sounds_that_cannot_be_compared_are_refused(cdpam):
     assert 1e307 < caught.value.value <= 1e308
 
 
-def test_a_missing_package_is_named_with_its_remedy(monkeypatch):
+def test_a_missing_package_is_named(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with raises(EvaluationError, name="cdpam") as caught:
+    with raises(EvaluationError, name="cdpam"):
         Cdpam.load()
-    assert "pip install 'avmsf[eval]'" in str(caught.value)
 
 
 def test_other_weights_are_refused_unread(tmp_path):

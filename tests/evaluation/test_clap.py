@@ -36,11 +36,8 @@ def clap(saved) -> Clap:
 def strikes(count: int = 3, *, samples: int = 24000, rate: float = RATE) -> torch.Tensor:
     times = torch.arange(samples, dtype=torch.float64) / rate
     pitches = 400.0 * torch.arange(1, count + 1, dtype=torch.float64) ** 2
-    return (
-        0.5
-        * torch.exp(-torch.outer(5 * torch.arange(1, count + 1), times))
-        * torch.sin(2 * math.pi * torch.outer(pitches, times))
-    )
+    sines = torch.sin(2 * math.pi * torch.outer(pitches, times))
+    return 0.5 * torch.exp(-torch.outer(5 * torch.arange(1, count + 1), times)) * sines
 
 
 def directly(clap: Clap, sounds: torch.Tensor, prompts: tuple[str, ...]) -> torch.Tensor:
@@ -101,9 +98,8 @@ def test_sounds_and_prompts_that_cannot_be_scored_are_refused(clap):
 
 
 def test_folders_that_hold_something_else_are_named(saved, tmp_path):
-    with raises(EvaluationError, file=tmp_path, name="source") as caught:
+    with raises(EvaluationError, file=tmp_path, name="source"):
         Clap.load(tmp_path)
-    assert "hf download laion" in str(caught.value)
     other = tmp_path / "other"
     shutil.copytree(saved, other)
     whole = (other / "model.safetensors").read_bytes()

@@ -33,15 +33,9 @@ from avmsf.evaluation.runner import run_objects
 from avmsf.evaluation.tables import CHOSEN_ON_TEST, Section, missing_of, sections, summarize, times_of, values_of
 from factories.plate_set import fill_plates
 
-IDENTITY = {
-    "protocol": "farthest",
-    "dataset": "ObjectFolder Real",
-    "version": "0",
-    "seed": 0,
-    "metrics": {"kind": "m"},
-    "modes": {"kind": "n"},
-    "methods": {"knn3": "", "paper": "", "paper-per-contact": "", "nearest": ""},
-}
+IDENTITY = {"protocol": "farthest", "dataset": "ObjectFolder Real", "version": "0", "seed": 0}
+IDENTITY |= {"methods": {"knn3": "", "paper": "", "paper-per-contact": "", "nearest": ""}}
+IDENTITY |= {"metrics": {"kind": "m"}, "modes": {"kind": "n"}}
 
 
 def record(name: str, figures: dict[str, tuple[float | None, ...] | str], *, label: str = "farthest") -> ObjectRecord:
@@ -95,10 +89,8 @@ def test_the_best_is_marked_among_methods_that_have_all_objects() -> None:
 def test_the_damping_of_lower_env_on_test_contacts_has_a_row_that_says_so_and_is_never_best() -> None:
     def tested(name: str, *both: tuple[float, float]) -> ObjectRecord:
         """Return an object with L1 and ENV of both forms of the paper's dampings."""
-        outcomes = [
-            Outcome("farthest", method, {"l1": (l1, l1), "envelope": (env, env)})
-            for method, (l1, env) in zip(("paper", "paper-per-contact"), both, strict=False)
-        ]
+        forms = zip(("paper", "paper-per-contact"), both, strict=False)
+        outcomes = [Outcome("farthest", form, {"l1": (l1, l1), "envelope": (env, env)}) for form, (l1, env) in forms]
         return replace(record(name, {}), outcomes=tuple(outcomes))
 
     # By ENV, object by object: where the loser has the lower L1, too.

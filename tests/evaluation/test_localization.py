@@ -137,14 +137,8 @@ def test_heat_maps_have_the_true_contacts_and_the_papers_methods_their_own_dista
     drawn: dict[str, tuple[ContactPosterior, torch.Tensor]] = {}
 
     def quick(method: FieldMethod, task: Task) -> SoundField:
-        config = replace(QUICK, warmup_steps=0, steps=1)
-        return fit(
-            task.train,
-            task.features(VisualInput("visual", bare=True)),
-            task.modes(),
-            config,
-            gains=MixtureEstimator(("smooth",)),
-        )
+        points, config = task.features(VisualInput("visual", bare=True)), replace(QUICK, warmup_steps=0, steps=1)
+        return fit(task.train, points, task.modes(), config, gains=MixtureEstimator(("smooth",)))
 
     def watched(*given: Any, **named: Any) -> Any:
         asked[named["published"]] = named["vertices"]

@@ -196,11 +196,8 @@ def test_every_metric_of_the_corpus_says_what_it_said():
     """Made sounds of three struck objects and such as differ from them in one thing each, and what metrics said."""
     cdpam = None if importlib.util.find_spec("cdpam") is None else Cdpam.load()
     expected = json.loads((CORPUS / "expected.json").read_text(encoding="utf-8"))
-    functions = {
-        name if name == "relative_stft" else f"paper.{name}": resolve(entry.function)
-        for name, entry in REGISTERED.items()
-        if entry.function is not None
-    }
+    given = {name: resolve(entry.function) for name, entry in REGISTERED.items() if entry.function is not None}
+    functions = {name if name == "relative_stft" else f"paper.{name}": each for name, each in given.items()}
     # Six figures are kept; CDPAM is computed in float32, whose rounding goes with the processor.
     tolerances = {"cdpam.cdpam": 1e-3}
     assert len(expected) == 21
@@ -296,16 +293,11 @@ def test_a_value_that_is_no_number_does_not_better_the_mean(monkeypatch: pytest.
 
 def test_recordings_that_do_not_fit_the_renderer_are_refused():
     train, test = split(plate_impacts(), 0.5)
-    nearest, broken = NearestRecording(train), test.sounds.clone()
-    samples = broken.shape[1]
+    nearest, samples = NearestRecording(train), test.sounds.shape[1]
     with raises(EvaluationError, name="sample_rate", value=48000.0):
         evaluate(nearest, replace(test, sample_rate=48000.0))
     with raises(EvaluationError, name="predicted", value=[len(test), samples]):
         evaluate(nearest, replace(test, sounds=test.sounds[:, : samples // 2]))
-    broken[0, 3] = math.nan
-    with raises(EvaluationError, name="truth", row=0) as caught:
-        evaluate(nearest, replace(test, sounds=broken))
-    assert test.names[0] in str(caught.value)
     with raises(EvaluationError, name="sample_rate", value=test.sample_rate):
         other = replace(test, sample_rate=2 * test.sample_rate)
         metric_values(MetricSettings(cdpam=False), nearest, test.sounds, other, None, loudest=1.0)

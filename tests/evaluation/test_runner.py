@@ -209,9 +209,8 @@ def test_results_of_different_evaluations_are_not_mixed(plates, tmp_path, monkey
             run_objects(evaluation, ("a",), results)
     monkeypatch.setitem(METRICS, "peak", METRICS["l1"])
     monkeypatch.delitem(METRICS, "umap")
-    with raises(EvaluationError, file=results.path, name="columns", value=held["columns"]) as caught:
+    with raises(EvaluationError, file=results.path, name="columns", value=held["columns"]):
         run_objects(plan, ("a",), results)
-    assert "metrics, got those without peak and with umap" in str(caught.value)
     monkeypatch.undo()
     monkeypatch.setattr("avmsf.evaluation.plan.source_digest", lambda module: "of other code")
     with raises(EvaluationError, file=results.path, name="source", value=held["source"]):

@@ -183,16 +183,6 @@ def test_a_texture_becomes_the_corners_colors(tmp_path):
     assert colors.sum() == 1.0
 
 
-def test_other_endings_are_refused(tmp_path):
-    field = table()
-    with raises(ExportError, file="thing.obj", name="suffix", value=".obj"):
-        write_gltf(field, tmp_path / "thing.obj")
-    with raises(ExportError, file="thing.cpp", name="suffix", value=".cpp"):
-        write_faust(field, tmp_path / "thing.cpp")
-    write_faust(field, tmp_path / "THING.DSP")
-    assert "process" in (tmp_path / "THING.DSP").read_text()
-
-
 DRIVER = Path(__file__).with_name("faust_driver.c")
 BLOCK = 64
 compiled = pytest.mark.skipif(
@@ -301,7 +291,8 @@ def test_as_many_points_are_written_as_faust_compiles_unless_more_are_asked_for(
 
 def test_the_table_has_each_contacts_place(tmp_path):
     field = table()
-    path = tmp_path / "thing.dsp"
+    # Endings may be in capitals.
+    path = tmp_path / "THING.DSP"
     written = write_faust(field, path)
     place = contacts_path(path)
     assert set(written.sizes) == {path, place}

@@ -73,7 +73,7 @@ def test_files_and_folders_are_told_apart(tmp_path):
         write_files({tmp_path: b"avmsf"}, overwrite=True)
 
 
-def test_both_forms_are_written_whole_and_kept_from_others(tmp_path: Path) -> None:
+def test_both_forms_are_written_whole(tmp_path: Path) -> None:
     table = replace(struck_table(shared=True), name="Tom & <Ann>")
     written = write_webpage(table, tmp_path / "site")
     found = {str(path.relative_to(tmp_path / "site")) for path in (tmp_path / "site").rglob("*") if path.is_file()}
@@ -86,8 +86,3 @@ def test_both_forms_are_written_whole_and_kept_from_others(tmp_path: Path) -> No
     torn = {"index.html": b"<title></title><p>"}
     with raises(ExportError, file="index.html", name="import map", value=0):
         single_file(make_bundle(table), torn)
-    other = tmp_path / "mine.html"
-    other.write_text("mine")
-    with raises(ExportError, file=other, name="--overwrite"):
-        write_webpage(table, other)
-    assert other.read_text() == "mine"

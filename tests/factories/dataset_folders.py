@@ -51,13 +51,8 @@ def write_raw(folder: Path, objects: Mapping[str, Sequence[str]], *, contacts: b
     """Write objects of the raw layout, each impact of another force and gain, and perhaps a list of the contacts."""
     for identifier, names in objects.items():
         for order, contact in enumerate(names):
-            write_strike(
-                folder / identifier / "audio" / contact,
-                newtons=2.0 + order,
-                gain=6.0 if order == 2 else 18.0 - 6 * (order % 2),
-                pad=int(order != 2),
-                seed=int(contact),
-            )
+            path, gain = folder / identifier / "audio" / contact, 6.0 if order == 2 else 18.0 - 6 * (order % 2)
+            write_strike(path, newtons=2.0 + order, gain=gain, pad=int(order != 2), seed=int(contact))
     if contacts:
         write_contacts(folder, objects)
     return folder
@@ -74,15 +69,10 @@ def write_contacts(folder: Path, objects: Mapping[str, Sequence[str]], *, lines:
 def records(identifier: str, names: Sequence[str]) -> list[dict[str, object]]:
     """Return contacts as SonicGauss's lists have them."""
     base = f"datas/OF_Real/ObjectFolderResults/{identifier}"
-    return [
-        {
-            "location": f"{base}/audio/{identifier}_{contact}_3sec_48000hz.wav",
-            "ply_file": f"{base}/model.ply",
-            "contact": place(identifier, contact).tolist(),
-            "duration": 3.0,
-        }
-        for contact in names
-    ]
+    sounds = [f"{base}/audio/{identifier}_{contact}_3sec_48000hz.wav" for contact in names]
+    places = [place(identifier, contact).tolist() for contact in names]
+    shared = {"ply_file": f"{base}/model.ply", "duration": 3.0}
+    return [{"location": sound, "contact": at, **shared} for sound, at in zip(sounds, places, strict=True)]
 
 
 def write_mesh(path: Path, *, radius: float = 0.1, middle: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:

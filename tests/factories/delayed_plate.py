@@ -41,15 +41,10 @@ def strikes(count: int, *, starts: Tensor | None = None) -> Impacts:
 
 def cut(files: Tensor, *, rate: float, lead: int, samples: int, contacts: Tensor | None = None) -> Impacts:
     """Return recordings whose sounds start after `lead` samples of their files."""
-    files = files.float()
-    return Impacts(
-        contacts=torch.zeros(len(files), 3) if contacts is None else contacts,
-        sounds=files[:, lead : lead + samples].contiguous(),
-        sample_rate=rate,
-        names=tuple(f"{row:02d}.wav" for row in range(len(files))),
-        before=files[:, :lead].contiguous(),
-        after=files[:, lead + samples :].contiguous(),
-    )
+    contacts = torch.zeros(len(files), 3) if contacts is None else contacts
+    before, sounds, after = (part.contiguous() for part in files.float().tensor_split((lead, lead + samples), dim=1))
+    names = tuple(f"{row:02d}.wav" for row in range(len(files)))
+    return Impacts(contacts, sounds, rate, names, before=before, after=after)
 
 
 def without_delays(impacts: Impacts, modes: Extraction, starts: Tensor) -> Impacts:

@@ -112,11 +112,8 @@ class Fuzzer:
             channels = np.repeat(sound[:, None], self._choose((1, 1, 1, 2, 8)), axis=1)
             soundfile.write(memory, channels, RATE, subtype=subtype, format=kind)
         content = memory.getvalue()
-        return (
-            damage_bytes(content, random.Random(int(self.random.integers(1 << 30))))
-            if self._choose((True, False))
-            else content
-        )
+        damaged = self._choose((True, False))
+        return damage_bytes(content, random.Random(int(self.random.integers(1 << 30)))) if damaged else content
 
 
 def fuzz(ask: Callable[[Request], tuple[int, bytes]], *, count: int, seed: int = 0) -> dict[str, float]:

@@ -28,34 +28,19 @@ def tiny_pipeline() -> Any:
     text_encoder = transformers.T5EncoderModel(
         transformers.T5Config(vocab_size=40, d_model=16, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
     )
+    vae = {"encoder_hidden_size": DIM, "downsampling_ratios": STRIDES, "audio_channels": 2, "sampling_rate": int(RATE)}
+    vae |= {"decoder_channels": DIM, "decoder_input_channels": DIM // 2, "channel_multiples": [1, 2]}
+    dit = {"sample_size": FRAMES, "in_channels": DIM // 2, "out_channels": DIM // 2, "num_layers": 1}
+    dit |= {"attention_head_dim": 8, "num_attention_heads": 2, "num_key_value_attention_heads": 1, "time_proj_dim": 8}
+    dit |= {"cross_attention_dim": 16, "global_states_input_dim": 32, "cross_attention_input_dim": 16}
     return StableAudioPipeline(
-        vae=diffusers.AutoencoderOobleck(
-            encoder_hidden_size=DIM,
-            downsampling_ratios=STRIDES,
-            channel_multiples=[1, 2],
-            decoder_channels=DIM,
-            decoder_input_channels=DIM // 2,
-            audio_channels=2,
-            sampling_rate=int(RATE),
-        ),
+        vae=diffusers.AutoencoderOobleck(**vae),
         text_encoder=text_encoder,
         projection_model=diffusers.StableAudioProjectionModel(
             text_encoder_dim=16, conditioning_dim=16, min_value=0, max_value=32
         ),
         tokenizer=tokenizer,
-        transformer=diffusers.StableAudioDiTModel(
-            sample_size=FRAMES,
-            in_channels=DIM // 2,
-            num_layers=1,
-            attention_head_dim=8,
-            num_attention_heads=2,
-            num_key_value_attention_heads=1,
-            out_channels=DIM // 2,
-            cross_attention_dim=16,
-            time_proj_dim=8,
-            global_states_input_dim=32,
-            cross_attention_input_dim=16,
-        ),
+        transformer=diffusers.StableAudioDiTModel(**dit),
         scheduler=diffusers.CosineDPMSolverMultistepScheduler(),
     )
 

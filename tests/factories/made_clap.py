@@ -23,28 +23,12 @@ def save_clap(folder: Path, *, seed: int = 0, fused: bool = False) -> None:
         (folder / "merges.txt").write_text("#version: 0.2\n", encoding="utf-8")
         tokenizer = RobertaTokenizer(str(folder / "vocab.json"), str(folder / "merges.txt"), model_max_length=40)
     extractor = ClapFeatureExtractor(max_length_s=SECONDS, truncation="fusion" if fused else "rand_trunc")
-    config = ClapConfig(
-        text_config={
-            "vocab_size": len(tokens),
-            "hidden_size": 16,
-            "num_hidden_layers": 1,
-            "num_attention_heads": 2,
-            "intermediate_size": 16,
-            "max_position_embeddings": 64,
-        },
-        audio_config={
-            "window_size": 4,
-            "spec_size": 128,
-            "patch_embeds_hidden_size": 8,
-            "depths": [1, 1],
-            "num_attention_heads": [1, 2],
-            "hidden_size": 16,
-            "num_hidden_layers": 2,
-            "enable_fusion": fused,
-            "fusion_num_hidden_layers": 2,
-        },
-        projection_dim=12,
-    )
+    text = {"vocab_size": len(tokens), "hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
+    text |= {"intermediate_size": 16, "max_position_embeddings": 64}
+    audio = {"window_size": 4, "spec_size": 128, "patch_embeds_hidden_size": 8, "depths": [1, 1], "hidden_size": 16}
+    audio |= {"num_attention_heads": [1, 2], "num_hidden_layers": 2}
+    audio |= {"enable_fusion": fused, "fusion_num_hidden_layers": 2}
+    config = ClapConfig(text_config=text, audio_config=audio, projection_dim=12)
     torch.manual_seed(seed)
     model = ClapModel(config)
     with torch.no_grad():

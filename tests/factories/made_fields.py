@@ -120,12 +120,9 @@ def struck(count: int, *, noise: float = 0.05) -> tuple[Sites, torch.Tensor]:
 
 def attention(*, spatial_damping: bool = False) -> AttentionGains:
     shape = AttentionShape(6, 2, 8, 12, 2, feature_scale=4.0, spatial_damping=spatial_damping)
-    network = AttentionGains(
-        FeatureField.from_points(places(150, seed=0)),
-        gain_scale=torch.tensor([2.0, 1.0, 0.5, 1.5, 0.1]),
-        shape=shape,
-        generator=torch.Generator().manual_seed(0),
-    )
+    points, generator = FeatureField.from_points(places(150, seed=0)), torch.Generator().manual_seed(0)
+    scale = torch.tensor([2.0, 1.0, 0.5, 1.5, 0.1])
+    network = AttentionGains(points, gain_scale=scale, shape=shape, generator=generator)
     return with_biases(network).eval().requires_grad_(False)
 
 

@@ -30,20 +30,13 @@ def table(
     draw = torch.Generator().manual_seed(seed)
     damping = 8.0 + 30.0 * torch.rand(points, MODES, generator=draw, dtype=torch.float64)
     places = torch.rand(points, 3, generator=draw) - 0.5
-    return SampledField(
-        places,
-        torch.nn.functional.normalize(torch.randn(points, 3, generator=draw), dim=1),
-        torch.tensor([412.3, 1077.7, 1081.25, 3300.1], dtype=torch.float64),
-        damping if spatial else damping[0],
-        torch.complex(
-            torch.randn(points, MODES, generator=draw),
-            torch.randn(points, MODES, generator=draw) * 0.5 if phased else torch.zeros(points, MODES),
-        ),
-        torch.randn(SAMPLES, generator=draw) * (0.02 if noisy else 0.0),
-        RATE,
-        background_force=background_force,
-        name="thing",
-    )
+    normals = torch.nn.functional.normalize(torch.randn(points, 3, generator=draw), dim=1)
+    frequency = torch.tensor([412.3, 1077.7, 1081.25, 3300.1], dtype=torch.float64)
+    real = torch.randn(points, MODES, generator=draw)
+    gains = torch.complex(real, 0.5 * torch.randn(real.shape, generator=draw) if phased else torch.zeros_like(real))
+    noise = torch.randn(SAMPLES, generator=draw) * (0.02 if noisy else 0.0)
+    given = (places, normals, frequency, damping if spatial else damping[0], gains, noise, RATE)
+    return SampledField(*given, background_force=background_force, name="thing")
 
 
 def struck_table(*, shared: bool, modes: int = 40, points: int = 6, seconds: float = 3.0) -> SampledField:

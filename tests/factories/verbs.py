@@ -9,6 +9,8 @@ import pytest
 from avmsf.cli import main, options_of
 from avmsf.cli.output import display
 
+Streams = pytest.CaptureFixture[str]
+
 
 def run_verb(*words: str) -> int:
     """Run a verb as the command does, and raise its errors and interruptions."""
@@ -22,7 +24,7 @@ def run_verb(*words: str) -> int:
     return code
 
 
-def results_of(streams: pytest.CaptureFixture[str], *words: object, code: int | None = 0) -> tuple[Any, str]:
+def results_of(streams: Streams, *words: object, code: int | None = 0) -> tuple[Any, str]:
     """Run a command with --json that ends with a code, or any; return its results and what is on the standard error."""
     streams.readouterr()
     ended = main([*map(str, words), "--json"])

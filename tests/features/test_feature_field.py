@@ -150,8 +150,6 @@ def test_a_failed_save_leaves_the_old_file(tmp_path):
         with raises(SceneError, file=path, name="report"):
             save_features(field(box(20)), path, report=report)
     assert path.read_bytes() == before
-    with raises(SceneError, file=path / "below"):
-        save_features(field(box(20)), path / "below")
 
 
 TENSORS = {"points": torch.zeros(20, 3), "features": torch.zeros(20, 5)}
@@ -160,7 +158,6 @@ TENSORS = {"points": torch.zeros(20, 3), "features": torch.zeros(20, 5)}
 @pytest.mark.parametrize(
     ("changes", "name", "value"),
     [
-        ({"format": 2, "version": "9.9"}, "format", 2),
         ({"sizes": {"points": 20}}, "dim", None),
         ({"sizes": {"points": 20, "dim": 0}}, "header", None),
         ({"sizes": {"points": 20, "dim": True}}, "header", None),

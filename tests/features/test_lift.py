@@ -136,12 +136,8 @@ def test_gaussians_get_their_own_positions():
 def test_rendered_gaussians_hide_what_lies_behind_them():
     points = sphere_points(2500)
     cloud, camera = sphere_cloud(points), AROUND[0]
-    visibility = depth_test(
-        cloud.centers,
-        view_of(camera),
-        depth_of_cloud(cloud, NumbaRasterizer())(camera),
-        reach=depth_reach(cloud, camera),
-    )
+    depth = depth_of_cloud(cloud, NumbaRasterizer())(camera)
+    visibility = depth_test(cloud.centers, view_of(camera), depth, reach=depth_reach(cloud, camera))
     towards = camera.position - points
     cosine = (points / RADIUS * towards / towards.norm(dim=1, keepdim=True)).sum(1)
     # Gaussians of 4 mm: the shell is some millimeters thick and its rim uncertain by as much.

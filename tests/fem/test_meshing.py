@@ -202,10 +202,8 @@ def test_a_knotted_skin_shares_a_few_edges_rather_than_keep_its_triangles_and_is
 
 
 def test_a_sheet_is_thinned_alike_wherever_it_lies():
-    x, y = np.meshgrid(*2 * [np.linspace(0, 0.1, 200)], indexing="ij")
-    points = np.stack([x, y, 8e-4 * np.sin(1047 * x) * np.sin(1047 * y)], -1).reshape(-1, 3)
-    row = np.arange(40_000).reshape(200, 200)
-    a, b, c, d = (each.ravel() for each in (row[:-1, :-1], row[1:, :-1], row[1:, 1:], row[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    side = np.linspace(0, 0.1, 200)
+    sheet = sheet_over(side, side, lambda x, y: 8e-4 * np.sin(1047 * x) * np.sin(1047 * y))
+    points, faces = sheet.vertices.double().numpy(), sheet.faces.numpy()
     moved = (trimesh.Trimesh(points + np.array([0.0, 0.0, z]), faces, process=False) for z in (0.0, 0.5))
     assert len({len(thinned(each, log=lambda _: None).faces) for each in moved}) == 1

@@ -293,10 +293,8 @@ def test_equal_weights_make_equation_13_of_the_warm_up() -> None:
     assert float(run.advance(targets)) == pytest.approx(expected, rel=1e-4)
     offsets = 1e-3 * torch.eye(modes)
     # One squared error, whichever mode makes it, and otherwise the energies of modes of unequal damping.
-    plain, weighed = (
-        [warmup_loss(replace(SHORT, warmup_weights=weights), offset) for offset in offsets]
-        for weights in ("equal", "energy")
-    )
+    configs = (replace(SHORT, warmup_weights=weights) for weights in ("equal", "energy"))
+    plain, weighed = ([warmup_loss(config, offset) for offset in offsets] for config in configs)
     assert plain == pytest.approx([plain[0]] * modes, rel=1e-3)
     assert max(weighed) > 1.2 * min(weighed)
 

@@ -49,13 +49,8 @@ def image_of(cloud: GaussianCloud, camera: Camera) -> Rendering:
 
 
 def single(place: tuple[float, float, float], *, scale: float = 0.01, logit: float = 1.0) -> GaussianCloud:
-    return GaussianCloud(
-        torch.tensor([place]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        torch.full((1, 3), math.log(scale)),
-        torch.tensor([logit]),
-        torch.tensor([[[1.0, 0.0, -1.0]]]),
-    )
+    size, color = torch.full((1, 3), math.log(scale)), torch.tensor([[[1.0, 0.0, -1.0]]])
+    return GaussianCloud(torch.tensor([place]), torch.tensor([[1.0, 0, 0, 0]]), size, torch.tensor([logit]), color)
 
 
 AHEAD = Camera(torch.eye(4, dtype=torch.float64), (100.0, 100.0), (20.0, 13.0), 40, 27)

@@ -262,11 +262,8 @@ def test_similarity_is_wangs_formula_window_by_window() -> None:
             # Variances about the mean, not as differences of moments.
             var_x, var_y = (weights * (x - mean_x) ** 2).sum(), (weights * (y - mean_y) ** 2).sum()
             covariance = (weights * (x - mean_x) * (y - mean_y)).sum()
-            values.append(
-                (2 * mean_x * mean_y + 0.01**2)
-                * (2 * covariance + 0.03**2)
-                / ((mean_x**2 + mean_y**2 + 0.01**2) * (var_x + var_y + 0.03**2))
-            )
+            shared = (2 * mean_x * mean_y + 0.01**2) * (2 * covariance + 0.03**2)
+            values.append(shared / ((mean_x**2 + mean_y**2 + 0.01**2) * (var_x + var_y + 0.03**2)))
     # Both in float64: what is left is rounding.
     assert float(ssim(*map(torch.from_numpy, (first, second)))) == pytest.approx(np.mean(values), abs=1e-12)
 

@@ -124,10 +124,8 @@ def test_a_force_that_the_level_contradicts_is_noted():
 
 def test_the_region_grows_with_the_noise():
     locator = locator_of()
-    sizes = [
-        sum(int(locator.locate(sound).region().sum()) for sound in struck(20, seed=4, noise_db=level).sounds)
-        for level in (-40.0, 15.0)
-    ]
+    both = (struck(20, seed=4, noise_db=level).sounds for level in (-40.0, 15.0))
+    sizes = [sum(int(locator.locate(sound).region().sum()) for sound in sounds) for sounds in both]
     assert sizes[1] > 1.5 * sizes[0]
 
 

@@ -236,29 +236,23 @@ def test_own_sounds_of_damped_plates_fit(material, noise_db):
 
 @pytest.mark.parametrize(("material", "other", "length"), FOREIGN)
 def test_a_stream_refuses_strangers_or_doubts_them(material, other, length):
-    listener, foreign = (
-        StreamingLocalizer(damped_locator(material)),
-        damped_blows(other, length=length, heard_by=material)[:4],
-    )
+    listener = StreamingLocalizer(damped_locator(material))
+    foreign = damped_blows(other, length=length, heard_by=material)[:4]
     blows = [blow for sound in foreign for blow in listener.process(recorded(sound))]
     assert listener.rejected + len(blows) == len(foreign)
     # In 40 ms broad modes are told apart less than in all of a sound.
     assert len(blows) <= 1
     assert all("mismatch ratio" in note for blow in blows for note in blow.map.notes)
     assert "mismatch ratio" in listener.refusal
-    own = [
-        each for sound in damped_blows(material, heard_by=material)[:4] for each in listener.process(recorded(sound))
-    ]
-    assert [each.map.notes for each in own] == [()] * 4
+    sounds = damped_blows(material, heard_by=material)[:4]
+    assert [each.map.notes for sound in sounds for each in listener.process(recorded(sound))] == [()] * 4
 
 
 @pytest.mark.parametrize("seconds", [0.04, 0.4])
 def test_noise_is_no_part_of_a_sounds_energy(seconds):
     field = damped_field("wood")
-    quiet, loud = (
-        damped_blows("wood", heard_by="wood", noise_db=level)[:, : round(seconds * PLATE_RATE)]
-        for level in (-60.0, 0.0)
-    )
+    both = (damped_blows("wood", heard_by="wood", noise_db=level) for level in (-60.0, 0.0))
+    quiet, loud = (sounds[:, : round(seconds * PLATE_RATE)] for sounds in both)
     modes = Extractor(field.bank, sample_rate=PLATE_RATE, samples=quiet.shape[1])
     for clear, noisy in zip(quiet, loud, strict=True):
         energy = float(clear.double().square().sum())

@@ -28,17 +28,11 @@ def triangle(*, nodes: int = 1, count: int = 3, matrix: list[float] | None = Non
     corners = np.eye(3, dtype="<f4").tobytes()
     node = {"mesh": 0} if matrix is None else {"mesh": 0, "matrix": matrix}
     accessor = {"componentType": 5126, "count": count, "type": "VEC3"}
-    return glb(
-        {
-            "scenes": [{"nodes": list(range(nodes))}],
-            "nodes": [node] * nodes,
-            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}],
-            "accessors": [accessor if count > 3 else accessor | {"bufferView": 0}],
-            "bufferViews": [{"buffer": 0, "byteLength": 36}],
-            "buffers": [{"byteLength": 36}],
-        },
-        corners,
-    )
+    record = {"scenes": [{"nodes": list(range(nodes))}], "nodes": [node] * nodes}
+    record |= {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}]}
+    record |= {"accessors": [accessor if count > 3 else accessor | {"bufferView": 0}]}
+    record |= {"bufferViews": [{"buffer": 0, "byteLength": 36}], "buffers": [{"byteLength": 36}]}
+    return glb(record, corners)
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "stl", "off"])

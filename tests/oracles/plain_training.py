@@ -43,16 +43,10 @@ class PlainRun(TrainingRun):
 
 
 def _distance(sounds: Float[Tensor, "contacts samples"], target: SpectralTarget) -> Float[Tensor, ""]:
-    loss = sounds.new_zeros(())
+    loss, sounds = sounds.new_zeros(()), sounds[:, : target.samples]
     for each in target.resolutions:
         spectra = torch.stft(
-            sounds[:, : target.samples],
-            len(each.window),
-            each.hop,
-            window=each.window,
-            center=True,
-            pad_mode="constant",
-            return_complex=True,
+            sounds, len(each.window), each.hop, window=each.window, pad_mode="constant", return_complex=True
         )
         loss = loss + (spectra.abs().mT - each.magnitudes).abs().sum() / each.magnitudes.sum()
     return loss

@@ -116,13 +116,9 @@ def strike(
     if noise_db is not None:
         level = sounds.square().mean().sqrt() * 10.0 ** (noise_db / 20.0)
         sounds = sounds + level * torch.randn(sounds.shape, dtype=torch.float64, generator=generator)
-    return Impacts(
-        contacts=contacts,
-        sounds=sounds.float(),
-        sample_rate=float(sample_rate),
-        names=tuple(f"plate/{row + 1:03d}" for row in range(len(contacts))),
-        directions=torch.tensor([[0.0, 0.0, -1.0]]).expand(len(contacts), 3).to(contacts.dtype),
-    )
+    names = tuple(f"plate/{row + 1:03d}" for row in range(len(contacts)))
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(contacts), 3).to(contacts.dtype)
+    return Impacts(contacts, sounds.float(), float(sample_rate), names, directions=directions)
 
 
 def sample_contacts(plate: Plate, count: int, *, generator: torch.Generator) -> Float64[Tensor, "contacts 3"]:

@@ -40,12 +40,9 @@ def scene() -> TexturedMesh:
     corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
     squares = np.stack([corner, corner + 1, corner + side + 1, corner, corner + side + 1, corner + side], axis=1)
     faces = squares.reshape(-1, 3)
-    return TexturedMesh.build(
-        torch.from_numpy(vertices),
-        torch.from_numpy(faces),
-        coordinates=torch.from_numpy(grid.reshape(-1, 2)[faces]),
-        textures=[torch.from_numpy(np.clip(128 + 40 * texture, 0, 255).astype(np.uint8))],
-    )
+    image = torch.from_numpy(np.clip(128 + 40 * texture, 0, 255).astype(np.uint8))
+    points, corners, places = map(torch.from_numpy, (vertices, faces, grid.reshape(-1, 2)[faces]))
+    return TexturedMesh.build(points, corners, coordinates=places, textures=[image])
 
 
 @pytest.fixture(scope="module")

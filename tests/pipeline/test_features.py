@@ -27,7 +27,7 @@ from avmsf.pipeline.scene import SceneStages, shape_of_cloud, without_far
 from avmsf.pipeline.shape import OFF_MESH, moved_onto
 from avmsf.pipeline.stages import Kept, StageFolder
 from avmsf.pipeline.visual_checks import expect_contacts_in_views, expect_mesh_in_views
-from factories.ball_views import MIDDLE, RADIUS
+from factories.ball_views import MIDDLE, RADIUS, ball_normals
 from factories.clouds import cloud, random_cloud
 from factories.plate_capture import fill_plate
 from factories.raising import raises
@@ -127,8 +127,7 @@ CELLS = 48
 
 
 def _ball(count: int = 3000, *, opacity: float = 0.95) -> GaussianCloud:
-    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(1))
-    normals = torch.nn.functional.normalize(normals, dim=1)
+    normals = ball_normals(count)
     return _discs(torch.tensor(MIDDLE) + RADIUS * normals, normals, opacity=opacity)
 
 

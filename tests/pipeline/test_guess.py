@@ -133,10 +133,8 @@ def test_recordings_are_not_passed_over(tmp_path: Path):
 def test_a_mesh_or_its_file_and_a_material_give_a_field(tmp_path: Path):
     box(LENGTH, WIDTH, HEIGHT).write(tmp_path / "bar.ply")
     config = PipelineConfig(modes=12, body=QUICK)
-    made = [
-        avmsf.fit(each, material="steel", config=config, progress=False)
-        for each in (str(tmp_path / "bar.ply"), box(LENGTH, WIDTH, HEIGHT))
-    ]
+    given = (str(tmp_path / "bar.ply"), box(LENGTH, WIDTH, HEIGHT))
+    made = [avmsf.fit(each, material="steel", config=config, progress=False) for each in given]
     assert made[0].origin.capture == "bar"
     for each in made:
         torch.testing.assert_close(each.bank.frequency, bar().bank.frequency, rtol=1e-4, atol=0)

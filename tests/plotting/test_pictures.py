@@ -98,13 +98,9 @@ def test_a_picture_has_the_format_that_its_name_says(tmp_path: Path) -> None:
 
 GENERATOR = torch.Generator().manual_seed(0)
 POINTS = torch.rand(300, 3, generator=GENERATOR) * torch.tensor([0.2, 0.1, 0.3])
-FOUND = Symmetries(
-    (RotationalSymmetry(torch.tensor([0.0, 0.0, 1.0]).double(), torch.tensor([0.1, 0.05, 0.0]).double(), 4, 0.1),),
-    (MirrorSymmetry(torch.tensor([1.0, 0.0, 0.0]).double(), torch.tensor([0.1, 0.0, 0.0]).double(), 0.1),),
-    0.01,
-    0.35,
-    1.0,
-)
+TURN = RotationalSymmetry(torch.tensor([0, 0, 1.0]).double(), torch.tensor([0.1, 0.05, 0.0]).double(), 4, 0.1)
+MIRROR = MirrorSymmetry(torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.1, 0.0, 0.0]).double(), 0.1)
+FOUND = Symmetries((TURN,), (MIRROR,), 0.01, 0.35, 1.0)
 
 
 def test_an_axis_and_a_plane_are_drawn_where_they_are():

@@ -18,14 +18,8 @@ from factories.raising import raises
 
 HANDLES = {"mug": 1, "jug": 1, "bracket": 2, "tube": 1}
 """Holes through a shape, as through a ring."""
-TURNS = {
-    **dict.fromkeys(("bell", "bottle", "bowl", "goblet", "lid", "plate", "tube"), math.inf),
-    "channel": 2,
-    "fluted": 7,
-    "platter": 2,
-    "pot": 6,
-    "tray": 2,
-}
+TURNS = dict.fromkeys(("bell", "bottle", "bowl", "goblet", "lid", "plate", "tube"), math.inf)
+TURNS |= {"channel": 2, "fluted": 7, "platter": 2, "pot": 6, "tray": 2}
 """Turns about z that carry a kind's first individual onto itself: of the round ones all."""
 MIRRORS = {"channel": "xy", "platter": "xyz", "tray": "xy", "boomerang": "yz", "tube": "z"}
 MIRRORS |= dict.fromkeys(("mug", "scallop", "skillet", "spoon"), "y")

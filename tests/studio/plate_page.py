@@ -46,16 +46,8 @@ def plate_table() -> SampledField:
     normals = torch.zeros_like(points)
     normals[:, 2] = points[:, 2].sign()
     order = torch.arange(1, len(WAVES) + 1, dtype=torch.float64)
-    return SampledField(
-        points,
-        normals,
-        400.0 * order,
-        4.0 * order,
-        plate_shapes(points) / order.float() + 0j,
-        torch.zeros(8000),
-        RATE,
-        name="Plate",
-    )
+    shapes = plate_shapes(points) / order.float() + 0j
+    return SampledField(points, normals, 400.0 * order, 4.0 * order, shapes, torch.zeros(8000), RATE, name="Plate")
 
 
 def plate_shapes(points: torch.Tensor) -> torch.Tensor:

@@ -25,10 +25,8 @@ from factories.running import gone
 from served import blow, plate_field, run_async
 
 # A loop that a test closes right after a process was killed leaves pipes for the collector, which warns of them.
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+IGNORED = ("ResourceWarning", "pytest.PytestUnraisableExceptionWarning")
+pytestmark = [pytest.mark.filterwarnings(f"ignore::{each}") for each in IGNORED]
 TEST = {"task": "test"}
 in_proc = pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are looked up in /proc")
 

@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from avmsf.errors import AvmsfError, StudioError
 from avmsf.field.store import save
 from avmsf.gaussians.ply import write_splats
-from avmsf.gaussians.start_points import StartPoints, starting_cloud
 from avmsf.pipeline.config import CACHE, CACHED_FIELD, SURFACE
 from avmsf.pipeline.scene import CLOUD
 from avmsf.studio.files import Showcase
@@ -20,6 +18,7 @@ from avmsf.studio.opening import MAX_MESH_BYTES, Opened, find_object, find_recon
 from avmsf.studio.session import Revision
 from avmsf.studio.studio import Studio
 from factories.capture_folder import fill
+from factories.clouds import random_cloud
 from factories.raising import raises
 from served import plate_field, served
 
@@ -87,8 +86,7 @@ def test_a_mesh_brings_its_pictures_and_overwrites_none(tmp_path: Path) -> None:
 
 def test_gaussians_are_opened_as_gaussians(tmp_path: Path) -> None:
     points = plate_field().gain_field.points.float()
-    start = StartPoints(points, torch.full_like(points, 0.5), torch.tensor([[0.0, 0.0, 1.0]]).expand_as(points))
-    write_splats(starting_cloud(start, degree=0, scale=1.0, opacity=0.9, flatness=0.2), tmp_path / "cloud.ply")
+    write_splats(random_cloud(points), tmp_path / "cloud.ply")
     opened = open_target(tmp_path / "cloud.ply")
     assert opened.capture is not None
     assert find_object(opened) == opened.capture / "splats.ply"
@@ -136,12 +134,7 @@ def capture(tmp_path: Path) -> Path:
     kept = folder / CACHE
     kept.mkdir(parents=True)
     points = plate_field().gain_field.points.float()
-    write_splats(
-        starting_cloud(
-            StartPoints(points, torch.full_like(points, 0.5)), degree=0, scale=1.0, opacity=0.9, flatness=0.5
-        ),
-        kept / CLOUD,
-    )
+    write_splats(random_cloud(points), kept / CLOUD)
     box = trimesh.creation.box(np.ptp(points.numpy(), axis=0) + 0.01)
     box.apply_translation((points.amax(0) + points.amin(0)).numpy() / 2)
     box.export(kept / SURFACE)

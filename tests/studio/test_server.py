@@ -190,13 +190,8 @@ def test_the_command_serves_until_it_is_told_to_end_and_tells_no_browsers_comman
     environment = {**os.environ, "TMPDIR": str(tmp_path / "temporary")}
     environment["BROWSER"] = f"{sys.executable} {script} {seen} %s"
     (tmp_path / "temporary").mkdir()
-    process = subprocess.Popen(
-        [*command, str(opened.field), "--port", "0", "--json"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    )
+    command += [str(opened.field), "--port", "0", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stderr is not None
     try:
         line = next(line for line in process.stderr if "http://" in line)

@@ -167,13 +167,8 @@ def test_modes_are_the_same_at_any_sample_rate(page: "Page", table: SampledField
         rate,
     )
     kept = table.frequency < rate / 2
-    expected = synthesize(
-        table.gains[4:5, kept],
-        table.frequency[kept],
-        table.take(torch.tensor([4])).damping[..., kept],
-        samples=samples,
-        sample_rate=rate,
-    )[0]
+    damping = table.take(torch.tensor([4])).damping[..., kept]
+    expected = synthesize(table.gains[4:5, kept], table.frequency[kept], damping, samples=samples, sample_rate=rate)[0]
     assert error(numbers(found), expected) < 1e-6
 
 

@@ -286,10 +286,8 @@ def test_the_level_of_a_part_is_that_of_the_modes_near_in_frequency():
     doubled = replace(given, frequency=given.frequency.index_fill(0, torch.tensor([1]), float(given.frequency[0]) + 1))
     counted = doubled.informative.reshape(2, -1).double().numpy()
     assert counted.sum() == 2 * 4
-    expected = [
-        oracle.expected_level(part.numpy(), doubled.frequency.numpy(), known, width=0.3)
-        for part, known in zip((doubled.values.real, doubled.values.imag), counted, strict=True)
-    ]
+    frequency, pairs = doubled.frequency.numpy(), zip((doubled.values.real, doubled.values.imag), counted, strict=True)
+    expected = [oracle.expected_level(part.numpy(), frequency, known, width=0.3) for part, known in pairs]
     assert doubled.level.reshape(2, -1).numpy() == pytest.approx(np.stack(expected), rel=5e-3)
 
 

@@ -178,10 +178,8 @@ def test_mode_shapes_predict_what_positions_cannot_and_know_how_well():
     """Of shapes that are known at few places."""
     sites, asked = impacts(8, seed=1), impacts(60, seed=5)
     gains, true = measured(sites, noise=0.01), measured(asked, noise=0.0).values
-    fits = [
-        fit_mixture(families(sites, elastic=each), gains, sites.points.float(), directional=True)
-        for each in (True, False)
-    ]
+    recipes = (families(sites, elastic=each) for each in (True, False))
+    fits = [fit_mixture(each, gains, sites.points.float(), directional=True) for each in recipes]
     own, other = (gains_at(each, asked) - true for each in fits)
     shaped, smooth = ((each.abs().square().mean(0) / true.abs().square().mean(0)).sqrt() for each in (own, other))
     assert float(smooth.min()) > 0.3

@@ -54,13 +54,9 @@ def _gains(sites: Sites, *, noise: float = 0.02) -> MeasuredGains:
     phase = 2.0 * math.pi * torch.rand(MODES, generator=generator, dtype=torch.float64)
     values = torch.cos(sites.points @ wave.T + phase) * sites.directions[:, 2:]
     error = torch.randn(*values.shape, 2, generator=generator, dtype=torch.float64) * noise
-    frequency = torch.linspace(100.0, 2000.0, MODES, dtype=torch.float64)
-    return MeasuredGains(
-        torch.complex(values + error[..., 0], 0.3 * values + error[..., 1]),
-        torch.full((MODES,), noise**2, dtype=torch.float64),
-        frequency,
-        torch.linspace(2.0, 20.0, MODES, dtype=torch.float64),
-    )
+    gains = torch.complex(values + error[..., 0], 0.3 * values + error[..., 1])
+    frequency, damping = (torch.linspace(*ends, MODES, dtype=torch.float64) for ends in ((100.0, 2000.0), (2.0, 20.0)))
+    return MeasuredGains(gains, torch.full((MODES,), noise**2, dtype=torch.float64), frequency, damping)
 
 
 def _fit(sites: Sites, measured: MeasuredGains) -> Fit:
@@ -105,10 +101,8 @@ def _ratios() -> PredictiveRatios:
 def test_ratio_is_that_of_student_densities_given_the_other_contacts() -> None:
     ratios = _ratios()
     for aside in (frozenset[int](), frozenset({2, 7})):
-        expected = [
-            _dense_ratio(ratios, row, [each for each in range(9) if each != row and each not in aside])
-            for row in range(9)
-        ]
+        others = ([each for each in range(9) if each != row and each not in aside] for row in range(9))
+        expected = [_dense_ratio(ratios, row, given) for row, given in enumerate(others)]
         assert ratios_of_all(ratios, aside).tolist() == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 

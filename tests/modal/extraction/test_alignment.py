@@ -149,10 +149,8 @@ def test_measured_impulse_responses_cut_by_a_threshold_get_their_starts_back(sha
     rate, sounds = recordings[0].sample_rate, [each.response() for each in recordings]
     onsets = [find_onset(each, sample_rate=rate) for each in sounds]
     lead, length = max(onsets), min(len(each) - onset for each, onset in zip(sounds, onsets, strict=True))
-    padded = [
-        np.concatenate([np.full(lead - onset, np.nan), each[: onset + length]])
-        for each, onset in zip(sounds, onsets, strict=True)
-    ]
+    pairs = zip(sounds, onsets, strict=True)
+    padded = [np.concatenate([np.full(lead - onset, np.nan), each[: onset + length]]) for each, onset in pairs]
     impacts = cut(torch.from_numpy(np.stack(padded)), rate=rate, lead=lead, samples=length)
     found = align(impacts)
     assert len(set(onsets)) > 1

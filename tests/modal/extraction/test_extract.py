@@ -45,11 +45,8 @@ def matched(bank: ModalBank, truth: PlateModes) -> tuple[Tensor, Tensor, Tensor]
     """Return for each true mode the nearest found one's relative errors of frequency and damping, and its energy."""
     nearest = (bank.frequency[:, None] - truth.frequency).abs().argmin(0)
     energy = (truth.gains.square() / (4 * truth.damping)).sum(0)
-    return (
-        (bank.frequency[nearest] / truth.frequency - 1).abs(),
-        (bank.damping[nearest] / truth.damping - 1).abs(),
-        energy,
-    )
+    frequency, damping = bank.frequency[nearest] / truth.frequency, bank.damping[nearest] / truth.damping
+    return (frequency - 1).abs(), (damping - 1).abs(), energy
 
 
 def impacts_of(sounds: Tensor, rate: float = RATE) -> Impacts:

@@ -93,10 +93,8 @@ def test_two_modes_of_one_frequency_share_the_gain():
 def test_refinement_finds_the_modes_from_nearby():
     truth = bank_of([440.0, 443.0, 1000.0, 2500.0], [3.0, 4.0, 60.0, 20.0])
     _, sounds = draw(truth)
-    start = ModalBank(
-        truth.frequency + torch.tensor([0.3, -0.3, 4.0, 1.0], dtype=torch.float64),
-        truth.damping * torch.tensor([1.5, 0.7, 1.4, 0.6], dtype=torch.float64),
-    )
+    offsets, factors = torch.tensor([[0.3, -0.3, 4.0, 1.0], [1.5, 0.7, 1.4, 0.6]], dtype=torch.float64)
+    start = ModalBank(truth.frequency + offsets, truth.damping * factors)
     found = refine(sounds, start, sample_rate=RATE, iterations=60)
     # The search ends when a step gains less than 1e-7 of the energy: the error is the root of that, shrunk once more.
     torch.testing.assert_close(found.frequency, truth.frequency, rtol=0, atol=1e-3)
@@ -107,10 +105,8 @@ def test_refinement_finds_the_modes_from_nearby():
 def test_refinement_never_explains_less(seed: int):
     generator = torch.Generator().manual_seed(seed)
     sounds = torch.randn(2, 1500, generator=generator) * torch.exp(-torch.arange(1500) / 400.0)
-    bank = ModalBank(
-        torch.sort(4000 * torch.rand(8, generator=generator, dtype=torch.float64)).values,
-        torch.exp(8 * torch.rand(8, generator=generator, dtype=torch.float64) - 2),
-    )
+    frequency = torch.sort(4000 * torch.rand(8, generator=generator, dtype=torch.float64)).values
+    bank = ModalBank(frequency, torch.exp(8 * torch.rand(8, generator=generator, dtype=torch.float64) - 2))
     banks = [bank] + [refine(sounds, bank, sample_rate=RATE, iterations=count) for count in range(1, 15)]
     explained = [NormalEquations.of(sounds, poles_of(modes, RATE)).explained() for modes in banks]
     assert explained == sorted(explained)
