@@ -124,8 +124,7 @@ def fit(
                 raise FitError.expected(wanted, got="a file without", file=source, name="material")
             source = read_capture(source, settings_of(source).starting(config.time_zero))
         if not isinstance(source, Capture):
-            wanted = "a folder or a Capture, as avmsf.Capture(name, impacts, surface)"
-            raise FitError.expected(wanted, type(source).__name__, name="capture")
+            raise FitError.expected("a folder or an avmsf.Capture", type(source).__name__, name="capture")
         if features is None and source.folder is not None:
             expect_shape(source)
         views = isinstance(pipeline_of(source, config, features, StageFolder(Path()), listener=listener), SceneStages)
