@@ -60,7 +60,7 @@ def conditional(
     own = [values[[row]] for row in range(count)] if places is None else [values[places == each] for each in {*places}]
     within = sum(((each - each.mean()) ** 2).sum() for each in own)
     quadratic = values @ inverse @ values - (within / variance if within else 0.0)
-    across, scale = kernel[count:, :count], quadratic / len(own)
+    across, scale = kernel[count:, :count], max(quadratic / len(own), values @ inverse @ values / count)
     return across @ inverse @ values, scale * (kernel[count:, count:] - across @ inverse @ across.T), float(scale)
 
 

@@ -11,7 +11,7 @@ from avmsf.field.gains.kernels import Sites
 from avmsf.field.gains.mixture import NOISE_SHARES
 from avmsf.field.gains.mixture_gains import MixtureGains
 from avmsf.field.gains.model import series_of
-from factories.made_fields import families, impacts, measured, model
+from factories.made_fields import draw, families, impacts, measured, model
 from oracles import gain_model as oracle
 
 ASKED = impacts(9, seed=5)
@@ -216,12 +216,15 @@ def test_impacts_in_one_place_have_their_mean_there():
     assert bool(deviation_at(given).isfinite().all())
 
 
-def test_repeated_recordings_leave_the_deviation_as_it_is():
+@pytest.mark.parametrize("moved", [0.0, 1e-6, 1e-3])
+def test_repeated_recordings_leave_the_deviation_as_it_is(moved):
     sites = impacts(10, seed=1)
     once, rows = measured(sites), torch.arange(10).repeat(4)
+    again = sites.take(rows)
+    again = replace(again, points=again.points + moved * draw(40, 3, seed=5))
 
     def deviation(sites: Sites, gains: MeasuredGains) -> float:
         given = fit_mixture(families(sites, elastic=False), gains, sites.points.float(), directional=True)
         return float(deviation_at(given).median())
 
-    assert deviation(sites.take(rows), once.take(rows)) == pytest.approx(deviation(sites, once), rel=0.25)
+    assert deviation(again, once.take(rows)) == pytest.approx(deviation(sites, once), rel=0.25)

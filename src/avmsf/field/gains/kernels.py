@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
+from avmsf.capture.impacts import places_of
 from avmsf.mesh.points import nearest_points
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -34,6 +35,8 @@ _ROUNDING = 1e-6
 _FLAT = 1e-3
 """Extent over the longest below which contacts do not differ along an axis."""
 
+_SAME_DIRECTION = 0.9
+"""Least cosine of directions, 26 degrees apart, whose impacts at one place are repetitions: hands do not aim better."""
 _PERPENDICULAR = 1e-6
 """Largest cosine that the rounding of float32 (6e-8 a component) can leave between perpendicular directions. It has no
 sign."""
@@ -54,6 +57,12 @@ class Sites:
     def take(self, rows: Int[Tensor, " rows"]) -> "Sites":
         """Return some of the impacts."""
         return Sites(self.points[rows], self.directions[rows])
+
+    def places(self) -> Int[Tensor, " sites"]:
+        """Return a number for each impact, the same for those at one place (`places_of`) along one direction."""
+        owner = places_of(self.points)
+        same = (owner[:, None] == owner) & (self.directions @ self.directions.T > _SAME_DIRECTION)
+        return same.int().argmax(1)
 
     @classmethod
     def along(

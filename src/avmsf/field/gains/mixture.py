@@ -121,6 +121,8 @@ class KernelMixture:
     weights: Float64[Tensor, "kernels noises series"]
     """Posterior probability of each kernel with each noise share; they sum to one for each series."""
     noise_shares: tuple[float, ...] = NOISE_SHARES
+    places: Int[Tensor, " contacts"] | None = None
+    """A number for each contact, the same for repeated recordings (`Sites.places`); None where there are none."""
 
     def take(self, series: Int[Tensor, " series"]) -> "KernelMixture":
         """Return the posterior of some series, in the given order."""
@@ -136,11 +138,6 @@ class KernelMixture:
         """Eigenvalues and eigenvectors of the kernels."""
         return _eigen(self.kernels)
 
-    @cached_property
-    def places(self) -> Int[Tensor, " contacts"]:
-        """Number of each contact's place: repeated recordings have the same covariances in all kernels."""
-        return torch.unique(self.kernels.mean(0).round(decimals=9), dim=0, return_inverse=True)[1]
-
     def scale(
         self,
         quadratic: Float64[Tensor, " pairs"],
@@ -151,12 +148,14 @@ class KernelMixture:
         """Return s^2 by the values of some contacts, of which Q and v are given: Q over the number of places.
 
         What repeated recordings add to Q, their squares about the mean of their place over v, tells the noise alone.
-        It is mostly less than v, and would make s^2 smaller with every repetition.
+        It is mostly less than v, and would make s^2 smaller with every repetition. Where places are not met to the
+        point, the squares may be of the gains' own changes: s^2 is never less than Q over the number of contacts.
         """
-        values, places = self.values[rows], self.places[rows]
+        values, places = self.values[rows], rows if self.places is None else self.places[rows]
         member = (places[:, None] == torch.unique(places)).double()
         within = (values - member @ (member.T @ values / member.sum(0)[:, None])).square().sum(0)
-        return (quadratic - within[series] / variance).clamp_min(0.0) / max(member.shape[1], 1)
+        by_place = (quadratic - within[series] / variance) / max(member.shape[1], 1)
+        return torch.maximum(by_place, quadratic / max(len(rows), 1))
 
     def standard_error(self) -> Float64[Tensor, " series"]:
         """Return the standard deviation of the noise in each value."""

@@ -199,8 +199,9 @@ class MixtureGains(GainModel):
         kept = torch.nonzero(~contacts).flatten()
         measured = None if self.measured is None else self.measured[kept]
         kernels, values = self.mixture.kernels[:, kept[:, None], kept], self.mixture.values[kept]
-        mixture = replace(self.mixture, kernels=kernels, values=values)
-        return replace(self, training=self.training.take(kept), mixture=mixture, measured=measured)
+        training = self.training.take(kept)
+        mixture = replace(self.mixture, kernels=kernels, values=values, places=training.places())
+        return replace(self, training=training, mixture=mixture, measured=measured)
 
     def shares(self) -> Float64[Tensor, "families modes"]:
         """Return the posterior probability of each family: mean over both parts of each mode, by their energy."""
@@ -264,7 +265,7 @@ class MixtureGains(GainModel):
         values, measured = (
             torch.view_as_complex(read(name, contacts, modes, 2).contiguous()) for name in ("values", "measured")
         )
-        mixture = KernelMixture(kernels, series_of(values), floor, weights)
+        mixture = KernelMixture(kernels, series_of(values), floor, weights, places=training.places())
         return cls(places, training, families, mixture, directional, share, measured)
 
     def _of(self, kind: type[Family]) -> list[Family]:

@@ -87,14 +87,13 @@ class PredictiveRatios:
     """Contacts that are set aside."""
 
     def mean(self) -> float:
-        """Return the mean ratio of the contacts that are not set aside, of each place the first one alone.
+        """Return the mean ratio of the contacts that are not set aside, of repeated recordings the first one alone.
 
-        A repeated recording predicts the other ones of its place, whatever a body says.
+        These predict each other, whatever a body says.
         """
-        rows = others(self.sites, self.aside).tolist()
-        places = places_of(self.sites.points[rows]).tolist()
-        first = dict(zip(reversed(places), reversed(rows), strict=True)).values()
-        return float(self.without(frozenset(range(len(self.sites))) - set(first))[0].nanmean())
+        rows = others(self.sites, self.aside)
+        first = rows[torch.unique(self.sites.take(rows).places())]
+        return float(self.without(frozenset(range(len(self.sites))) - {*first.tolist()})[0].nanmean())
 
     @cached_property
     def values(self) -> Float64[Tensor, "contacts series"]:
