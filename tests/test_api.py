@@ -258,6 +258,9 @@ CORNERS, AWAY = torch.eye(3), [CONTACT, [50.0, 60.0, 0.0]]
         ),
         (lambda: impacts_of(contacts=CONTACT), ArrayError, {"name": "contacts"}),
         (lambda: impacts_of(names=["a"]), ArrayError, {"name": "names"}),
+        (lambda: capture().impacts.take([True, False]), ArrayError, {"name": "rows", "value": 2}),
+        (lambda: capture().impacts.take([1.7]), ArrayError, {"name": "rows", "value": [1.7]}),
+        (lambda: avmsf.split(capture(), seed=1.7), EvaluationError, {"name": "seed", "value": 1.7}),
         (lambda: impacts_of(forces=0), ArrayError, {"name": "forces", "row": 0, "value": 0.0}),
         *(
             (lambda rate=rate: impacts_of(sample_rate=rate), ArrayError, {"name": "sample_rate"})

@@ -101,6 +101,14 @@ def test_names_that_cannot_be_files_become_numbers(tmp_path: Path, names: tuple[
     assert sorted(os.listdir(tmp_path)) == ["cup"]
 
 
+def test_writing_never_overwrites(tmp_path: Path) -> None:
+    write_capture(invented(), tmp_path / "cup")
+    before = sorted(os.listdir(tmp_path / "cup"))
+    with raises(CaptureError, file="cup"):
+        write_capture(invented(), tmp_path / "cup")
+    assert sorted(os.listdir(tmp_path / "cup")) == before
+
+
 CONTACTS = torch.tensor([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]], dtype=torch.float64)
 
 

@@ -183,7 +183,7 @@ LATE: dict[str, dict[str, Any]] = {
     f"render field.safetensors {AT} --output plate": {"file": "plate/001.wav", "name": "--overwrite"},
     f"render field.safetensors {AT} --output s --seconds nan": {"name": "--seconds"},
     f"render field.safetensors {AT} --output s --seconds 1e9": {"name": "--seconds", "value": 1e9},
-    f"render field.safetensors {AT} --output s --force 1e300": {"name": "finite"},
+    f"render field.safetensors {AT} --output s --force 1e300": {"name": "samples"},
     f"{TABLE} twice.csv": {"file": "twice.csv", "row": 3, "name": "file", "value": "a.wav"},
     f"{TABLE} outside.csv": {"file": "outside.csv", "row": 2, "name": "file", "value": "../a.wav"},
     "info field.safetensors --capture fast": {"name": "sample_rate"},

@@ -293,11 +293,15 @@ def test_a_value_that_is_no_number_does_not_better_the_mean(monkeypatch: pytest.
 
 def test_recordings_that_do_not_fit_the_renderer_are_refused():
     train, test = split(plate_impacts(), 0.5)
-    nearest, samples = NearestRecording(train), test.sounds.shape[1]
+    nearest, broken = NearestRecording(train), test.sounds.clone()
+    samples = broken.shape[1]
     with raises(EvaluationError, name="sample_rate", value=48000.0):
         evaluate(nearest, replace(test, sample_rate=48000.0))
     with raises(EvaluationError, name="predicted", value=[len(test), samples]):
         evaluate(nearest, replace(test, sounds=test.sounds[:, : samples // 2]))
+    broken[0, 3] = math.nan
+    with raises(EvaluationError, name="truth", row=0):
+        evaluate(nearest, replace(test, sounds=broken))
     with raises(EvaluationError, name="sample_rate", value=test.sample_rate):
         other = replace(test, sample_rate=2 * test.sample_rate)
         metric_values(MetricSettings(cdpam=False), nearest, test.sounds, other, None, loudest=1.0)

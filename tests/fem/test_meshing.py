@@ -1,6 +1,7 @@
 """Surfaces made fit: what faces inwards is turned, noise goes, holes are measured, dense meshes are thinned."""
 
 import math
+from dataclasses import replace
 
 import fast_simplification
 import numpy as np
@@ -13,7 +14,7 @@ from trimesh import Trimesh
 from avmsf.errors import SimulationError
 from avmsf.fem import meshing
 from avmsf.fem.candidate_bodies import CandidateBodies
-from avmsf.fem.meshing import MIN_ROUGHNESS_DEG, CheckedSurface, checked, denoised, roughness, simplified, thinned, weld
+from avmsf.fem.meshing import TOLERANCES, CheckedSurface, checked, denoised, roughness, simplified, thinned, weld
 from avmsf.fem.remeshing import boundary_edges, mesh_of, remeshed
 from avmsf.fem.tetrahedra import fill
 from avmsf.mesh.level_set import Grid, enclose
@@ -105,7 +106,7 @@ def test_noise_is_taken_out_of_a_mesh_by_as_much_as_it_has():
 def test_what_is_not_noisy_stays_as_it_is():
     box = welded(trimesh.creation.box((1.0, 0.2, 0.01)))
     for mesh in (box, remeshed(box, 0.03), welded(trimesh.creation.icosphere(4)), cup(0.3)):
-        assert roughness(mesh) < MIN_ROUGHNESS_DEG
+        assert roughness(mesh) < TOLERANCES.min_roughness_deg
         found, moved = denoised(mesh)
         assert found is mesh
         assert moved == 0.0
@@ -115,7 +116,7 @@ def test_a_rough_form_that_is_no_noise_stays():
     # Each vertex lies on a wave that its neighbors predict, though triangles turn by more than noise would make them.
     side = np.linspace(0, 1, 49)
     waves = weld(sheet_over(side, side, lambda x, y: 0.12 * np.sin(12 * math.pi * x) * np.sin(12 * math.pi * y)))
-    assert roughness(waves) > MIN_ROUGHNESS_DEG
+    assert roughness(waves) > TOLERANCES.min_roughness_deg
     assert denoised(waves)[0] is waves
 
 
@@ -129,8 +130,7 @@ def test_corners_a_millionth_of_the_size_apart_are_one() -> None:
 
 
 def limit(monkeypatch: pytest.MonkeyPatch, triangles: int) -> None:
-    for name in ("_MAX_FACES", "_ENOUGH_FACES"):
-        monkeypatch.setattr(meshing, name, triangles)
+    monkeypatch.setattr(meshing, "TOLERANCES", replace(TOLERANCES, max_faces=triangles, enough_faces=triangles))
 
 
 def ellipsoid(subdivisions: int) -> Trimesh:

@@ -12,7 +12,7 @@ from avmsf.fem.elements import SecondOrder
 from avmsf.fem.material import NOMINAL, STEEL
 from avmsf.fem.perturbation import smooth_fields
 from avmsf.fem.solid import Solid
-from avmsf.fem.updating import DENSITY_STD, STIFFNESS_STD, Matched, update
+from avmsf.fem.updating import TOLERANCES, Matched, update
 from avmsf.field.gains.elastic import Elastic
 from avmsf.field.gains.fitting import MeasuredGains, WeighedFamily, matched
 from avmsf.field.gains.kernels import Sites, Smooth, Unstructured
@@ -93,7 +93,9 @@ def nominal() -> ElasticModes:
 def uneven(kind: str) -> ElasticModes:
     """Return the body as it is: stiffness or density departs by 1.5 or 2 prior deviations."""
     fields = smooth_fields(SecondOrder.of(body()))
-    deviation = {"stiffness_factor": 1.5 * STIFFNESS_STD, "density_factor": 2.0 * DENSITY_STD}[kind]
+    deviation = {"stiffness_factor": 1.5 * TOLERANCES.stiffness_std, "density_factor": 2.0 * TOLERANCES.density_std}[
+        kind
+    ]
     drawn = np.random.default_rng(3).normal(0.0, deviation, len(fields))
     return elastic_modes(body(), NOMINAL, count=MODES, **{kind: torch.from_numpy(np.exp(drawn @ fields))})
 

@@ -197,7 +197,7 @@ def words_of(hint: Any) -> str:
     if kind is tuple:
         return f"[{', '.join('...' if each is Ellipsis else words_of(each) for each in parts)}]"
     if kind in (Union, UnionType):
-        return " or ".join(words_of(each) for each in parts if each is not type(None))
+        return " or ".join("none" if each is type(None) else words_of(each) for each in parts)
     words = {str: "text", int: "a whole number", float: "a number", bool: "true or false", dict: "an object"}
     return words[hint] if hint in words else getattr(hint, "__name__", str(hint))
 

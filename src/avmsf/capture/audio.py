@@ -35,6 +35,8 @@ MIN_CHANNEL_LEVEL = 0.1
 """Level of a channel over the loudest one's below which it is not used: a muted or far microphone's, 20 dB down."""
 OFFSET_SIGNIFICANCE = 1e-6
 """Probability by which noise without an offset would look as if it had one."""
+_FEW_BLOCKS, _CLEAR_OFFSET = 80, 40.0
+"""Blocks below which an offset has to be this many standard deviations of the quietest ones' means."""
 EIGHT_BIT = frozenset({"PCM_U8", "PCM_S8", "ULAW", "ALAW", "DPCM_8"})
 LOSSLESS = ("PCM_", "FLOAT", "DOUBLE", "ALAC_", "DWVW_", "DPCM_")
 """What libsndfile's names of formats without loss begin with; FLAC's is that of its samples, PCM_16 or PCM_24."""
@@ -135,6 +137,9 @@ def constant_offset(sound: Float64[np.ndarray, " frames"], *, sample_rate: float
     means = means[np.argsort(variance, kind="stable")[: max(8, count // 10)]] + middle
     offset, error = float(means.mean()), float(means.std(ddof=1)) / math.sqrt(len(means))
     limit = error * float(stdtrit(len(means) - 1, 1.0 - OFFSET_SIGNIFICANCE))
+    if count < _FEW_BLOCKS:
+        # Their few quietest blocks may lie within one cycle of a vibration, and are then not independent.
+        limit = max(limit, _CLEAR_OFFSET * float(means.std(ddof=1)))
     return offset if abs(offset) > limit else 0.0
 
 
@@ -205,11 +210,12 @@ def wav_bytes(
 
     Raises ArrayError, about `file`, for samples that are not finite, and for what 16 bits would clip.
     """
-    coded, memory = samples.astype(np.float32), io.BytesIO()
+    with np.errstate(over="ignore"):
+        coded, memory = samples.astype(np.float32), io.BytesIO()
     wrong, peak = int((~np.isfinite(coded)).sum()), float(np.abs(coded).max(initial=0.0))
     if wrong:
-        got, advice = f"{wrong} of {coded.size} that are not", "fit the field again, or choose a smaller force or level"
-        raise ArrayError.expected("finite samples", wrong, got=got, file=file, name="finite", advice=advice)
+        got = f"{wrong} of {coded.size} that are not"
+        raise ArrayError.expected("finite samples in float32", wrong, got=got, file=file, name="samples")
     if coding == "int16":
         if round(peak * 2**15) >= 2**15:
             got, wanted = f"{peak:.3g} ({20 * math.log10(peak):+.1f} dB)", "amplitudes below 1 for 16 bits"

@@ -217,7 +217,7 @@ def write_capture(capture: Capture, folder: str | Path, *, onsets_within: float 
         for name, sound in zip(names, sounds, strict=True):
             (begun / name).parent.mkdir(parents=True, exist_ok=True)
             # Soundfile's own error of a full disk does not say that it is full.
-            (begun / name).write_bytes(wav_bytes(sound.numpy(), rate))
+            (begun / name).write_bytes(wav_bytes(sound.numpy(), rate, file=Path(name)))
         (begun / TABLE).write_text(csv_text(rows), encoding="utf-8", newline="")
         (begun / SETTINGS).write_text(settings, encoding="utf-8")
         if capture.surface is not None:

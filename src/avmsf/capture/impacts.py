@@ -102,9 +102,18 @@ class Impacts:
         return content_digest(self.names, self.sample_rate, *known)
 
     def take(self, rows: ArrayLike) -> "Impacts":
-        """Return the given rows alone, in the given order; of a mask, one truth value each, those that are true."""
+        """Return the given rows alone, in the given order; of a mask, one truth value each, those that are true.
+
+        Raises ArrayError for a mask of another length, and for fractions.
+        """
         index = torch.from_numpy(np.array(list(rows)))
-        index = index.nonzero().flatten() if index.dtype == torch.bool else index.long()
+        if index.dtype == torch.bool:
+            if len(index) != len(self):
+                raise ArrayError.expected(f"{len(self)} truth values", len(index), name="rows")
+            index = index.nonzero().flatten()
+        elif not bool((index == index.long()).all()):
+            raise ArrayError.expected("whole numbers", index.tolist(), name="rows")
+        index = index.long()
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         taken: dict[str, Any] = {name: value[index] for name, value in values.items() if isinstance(value, Tensor)}
         return replace(self, names=tuple(self.names[row] for row in index.tolist()), **taken)

@@ -150,6 +150,11 @@ class Placement:
             return "frame"
         return "rows" if self.off or self.shrunken or mismatch is not None else "none"
 
+    @property
+    def apart(self) -> bool:
+        """Whether contacts and points are in different frames or units."""
+        return self.fault in ("frame", "unit")
+
     def describe(self, names: Sequence[str] = (), *, what: str = "surface") -> str:
         """Return a message on the contacts off `what` there is, by these names or else by indices; "" for none."""
         if self.fault == "none":
@@ -209,27 +214,36 @@ def expect_placed(
     names: Sequence[str] = (),
     what: str = "surface",
     strict: bool = False,
-    elastic: bool = False,
     advice: str = "",
 ) -> None:
     """Raise CaptureError for contacts in another frame or unit than an object's points, and warn of others off these.
 
     `points` are all over `what` there is; both in meters. CaptureError too for a contact farther off than the object is
-    large, and if `strict` for any off it. For `elastic` mode shapes it is a FitError, and rough surfaces, glue, single
-    wrong rows and small shifts pass (`Placement.fault`). The `value` is the largest distance, meters.
+    large, and if `strict` for any off it. The `value` is the largest distance, meters.
     """
     placement = check_placement(contacts, points)
     words, distance = placement.describe(names, what=what), float(placement.distances.max())
-    apart = placement.fault in ("frame", "unit")
-    if elastic and apart:
-        wanted = "contacts on the surface for elastic mode shapes"
-        advice = "bring both into one frame and unit (unit, surface_unit in capture.toml), or use another gain model"
-        raise FitError.expected(wanted, distance, got=words, name="contacts", advice=advice)
-    if elastic or not words:
+    if not words:
         return
-    if apart or distance > placement.diagonal or (strict and placement.off):
+    if placement.apart or distance > placement.diagonal or (strict and placement.off):
         raise CaptureError(f"{words}{advice}", name="contacts", value=distance)
     warnings.warn(CaptureWarning(words, name="contacts", value=distance), stacklevel=2)
+
+
+def expect_on_body(
+    contacts: Float[Tensor, "contacts 3"], points: Float[Tensor, "points 3"], *, names: Sequence[str]
+) -> None:
+    """Raise FitError where contacts are in another frame or unit than points all over a body; both in meters.
+
+    Rough surfaces, glue, single wrong rows and small shifts pass (`Placement.fault`). The `value` is the largest
+    distance, meters.
+    """
+    placement = check_placement(contacts, points)
+    if placement.apart:
+        wanted = "contacts on the surface for elastic mode shapes"
+        advice = "bring both into one frame and unit (unit, surface_unit in capture.toml), or use another gain model"
+        distance = float(placement.distances.max())
+        raise FitError.expected(wanted, distance, got=placement.describe(names), name="contacts", advice=advice)
 
 
 def _find_mismatch(

@@ -91,7 +91,7 @@ def propose_settings(folder: str | Path, wrong: Sequence[AvmsfError | AvmsfWarni
     for each in wrong:
         mends = each.name in ("unit", "surface_unit") and each.value and not each.value.keys() & chosen
         if mends and not any(proposal.key.endswith("unit") for proposal in found):
-            reason = str(each).rpartition("; ")[0]
+            reason = "The contacts, the object and the photographs' cameras then count one unit."
             found += [Proposal(key, unit, reason) for key, unit in each.value.items()]
     return tuple(found)
 

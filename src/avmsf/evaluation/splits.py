@@ -196,6 +196,8 @@ def split(
         wanted = "a fraction of the contacts between 0 and 1, or their whole number"
         raise EvaluationError.expected(wanted, train_size, name="train_size")
     if seed is not None:
+        if not hasattr(seed, "__index__"):
+            raise EvaluationError.expected("a whole number", seed, name="seed")
         start = random.Random(int(seed)).randrange(len(impacts))
     distinct = DistinctContacts.of(impacts)
     if isinstance(train_size, float):

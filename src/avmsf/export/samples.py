@@ -102,7 +102,7 @@ def write_grid(
             sound = scale * sounds[place]
             loudest = float(sound.abs().max())
             name = f"{SOUNDS}/{place + 1:03d}-{number}.wav"
-            files[name] = wav_bytes(sound.numpy(), rate)
+            files[name] = wav_bytes(sound.numpy(), rate, file=Path(name))
             level = f"{20 * math.log10(loudest):.2f}" if loudest > 0 else "-inf"
             how = (f"{layer.force:g}", f"{layer.contact_time:g}", note, *velocities)
             records.append((name, *where, *how, f"{samples / rate:.6g}", level, row))

@@ -7,6 +7,7 @@ fTetWild's number of tetrahedra is erratic.
 import contextlib
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -18,7 +19,8 @@ from avmsf.fem.elements import SecondOrder
 from avmsf.fem.meshing import CheckedSurface, checked, simplified
 from avmsf.fem.remeshing import remeshed, surface_of
 from avmsf.fem.solid import Solid
-from avmsf.fem.tetrahedra import ENVELOPE, fill
+from avmsf.fem.tetrahedra import TOLERANCES as FILLING
+from avmsf.fem.tetrahedra import fill
 from avmsf.fem.walls import shell, wall_of
 from avmsf.mesh.surface import Surface
 
@@ -27,23 +29,30 @@ MIN_DOFS = 1000
 _TRIANGLES_PER_DOF = 0.1
 """Triangles that `fill` gets, over the degrees of freedom: its time and number of tetrahedra go with them."""
 
-# How the detail is searched, and what modes take of the memory.
-_MIN_DOFS_RATIO = 0.65  # degrees of freedom over those wanted, from which on the search ends
-_MAX_DOFS_RATIO = 1.2  # and up to which
-_MAX_PRISM_DOFS_RATIO = 1.5  # likewise of prisms: a few more cost less than tetrahedra
-_MAX_FILLING_SECONDS = 60.0  # of one filling with tetrahedra; then a coarser one is tried once
-_MAX_TRIES = 4  # solids that are made
-_DOFS_POWER = 1.5  # by which degrees of freedom go with the inverse of the detail
-_MAX_STEP = 2.0  # factor on the detail from one try to the next
-_REFINEMENT = 0.6  # factor on a detail that is too coarse for a body
-_MIN_DETAIL = 0.002  # length of a tetrahedron's edges over the body's size
-_MAX_DETAIL = 0.4
-_MAX_KNOTTED_RATIO = 4.0  # triangles over those that `fill` should get, for no edge to be shared among three
-_WALL_DOFS_PER_VERTEX = 36.0  # degrees of freedom of a wall over the vertices of the mesh that it follows
-_PEAK_BYTES = 377e6  # that the modes of `_PEAK_DOFS` take (benchmarks/proof.py)
-_PEAK_DOFS = 40_000
-_PEAK_POWER = 1.1  # by which it grows with the degrees of freedom
-_MEMORY_SAFETY = 2.0  # factor on that, for lumps take more than the walls it was measured on
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How the detail is searched, and what modes take of the memory."""
+
+    min_dofs_ratio: float = 0.65  # degrees of freedom over those wanted, from which on the search ends
+    max_dofs_ratio: float = 1.2  # and up to which
+    max_prism_dofs_ratio: float = 1.5  # likewise of prisms: a few more cost less than tetrahedra
+    max_filling_seconds: float = 60.0  # of one filling with tetrahedra; then a coarser one is tried once
+    max_tries: int = 4  # solids that are made
+    dofs_power: float = 1.5  # by which degrees of freedom go with the inverse of the detail
+    max_step: float = 2.0  # factor on the detail from one try to the next
+    refinement: float = 0.6  # factor on a detail that is too coarse for a body
+    min_detail: float = 0.002  # length of a tetrahedron's edges over the body's size
+    max_detail: float = 0.4
+    max_knotted_ratio: float = 4.0  # triangles over those that `fill` should get, for no edge to be shared among three
+    wall_dofs_per_vertex: float = 36.0  # degrees of freedom of a wall over the vertices of the mesh that it follows
+    peak_bytes: float = 377e6  # that the modes of `peak_dofs` take (benchmarks/proof.py)
+    peak_dofs: int = 40_000
+    peak_power: float = 1.1  # by which it grows with the degrees of freedom
+    memory_safety: float = 2.0  # factor on that, for lumps take more than the walls it was measured on
+
+
+TOLERANCES = Tolerances()
 
 
 @runtime_checkable
@@ -92,21 +101,21 @@ def filled_solid(surface: CheckedSurface, dofs: int, *, wall: float | None = Non
     if sides is not None:
         with contextlib.suppress(SimulationError):
             # Degrees of freedom may be few for prisms along a wall that bends tightly; tetrahedra need not follow it.
-            size, most = sides.mesh.scale, _MAX_PRISM_DOFS_RATIO
+            size, most = sides.mesh.scale, TOLERANCES.max_prism_dofs_ratio
             first = sides.length(dofs) / size
             return _near(lambda detail: sides.solids(detail * size)(sides.thickness), dofs, first=first, most=most)
     first = _filling_detail(surface, dofs)
 
     def filled(detail: float) -> Solid:
-        least = ENVELOPE * detail * surface.mesh.scale
+        least = FILLING.envelope * detail * surface.mesh.scale
         if wall is not None and wall < least:
             # Nothing but crumbs would be left, after some seconds, of sides within reach of each other.
             advice = "allow more degrees of freedom (--set body.dofs=N)"
             raise SimulationError.expected(f"a wall of at least {least:.2g} m", wall, name="detail", advice=advice)
         # Quadrics keep the volume. Edges taken out one by one made the wall of a mug 5 % thinner.
         count = round(_TRIANGLES_PER_DOF * dofs * (first / detail) ** 2)
-        mesh = simplified(surface.mesh, count, most=_MAX_KNOTTED_RATIO * count)
-        return fill(surface_of(mesh), detail=detail, timeout=_MAX_FILLING_SECONDS)
+        mesh = simplified(surface.mesh, count, most=TOLERANCES.max_knotted_ratio * count)
+        return fill(surface_of(mesh), detail=detail, timeout=TOLERANCES.max_filling_seconds)
 
     return _near(filled, dofs, first=first)
 
@@ -127,18 +136,18 @@ def wall_solids(surface: CheckedSurface, dofs: int) -> Callable[[float], Solid]:
     `shell` does.
     """
     sheet = surface.sheet()
-    length = 1.2 * math.sqrt(_WALL_DOFS_PER_VERTEX * sheet.area / dofs)
-    for _ in range(_MAX_TRIES):
+    length = 1.2 * math.sqrt(TOLERANCES.wall_dofs_per_vertex * sheet.area / dofs)
+    for _ in range(TOLERANCES.max_tries):
         mesh = remeshed(sheet, length)
-        part = _WALL_DOFS_PER_VERTEX * len(mesh.vertices) / dofs
-        if _MIN_DOFS_RATIO <= part <= 1.0:
+        part = TOLERANCES.wall_dofs_per_vertex * len(mesh.vertices) / dofs
+        if TOLERANCES.min_dofs_ratio <= part <= 1.0:
             break
         length *= math.sqrt(part / 0.85)
     wall, first = surface_of(mesh), length / mesh.scale
     return lambda thickness: _near(lambda detail: shell(wall, thickness=thickness, detail=detail), dofs, first=first)
 
 
-def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: float = _MAX_DOFS_RATIO) -> Solid:
+def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: float = TOLERANCES.max_dofs_ratio) -> Solid:
     """Return the solid of the detail, `first` at first, whose degrees of freedom come nearest to those wanted.
 
     Raises SimulationError where all of them are over by more than the factor `most`, and what `make` raises of the
@@ -146,14 +155,14 @@ def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: floa
     """
     made: dict[float, tuple[int, Solid]] = {}
     detail: float | None = _bounded(first)
-    while detail is not None and detail not in made and len(made) < _MAX_TRIES:
+    while detail is not None and detail not in made and len(made) < TOLERANCES.max_tries:
         try:
             solid = make(detail)
         except SimulationError as error:
             # Walls too thin for one detail may be thick enough for a finer one, and what takes too long may be coarser.
             if made:
                 break
-            detail *= 1.0 / _REFINEMENT if error.name == "timeout" else _REFINEMENT
+            detail *= 1.0 / TOLERANCES.refinement if error.name == "timeout" else TOLERANCES.refinement
             solid = make(detail)
         made[detail] = count_dofs(solid), solid
         detail = _next_detail({each: count for each, (count, _) in made.items()}, dofs)
@@ -169,18 +178,18 @@ def _near(make: Callable[[float], Solid], dofs: int, *, first: float, most: floa
 def _next_detail(counts: dict[float, int], dofs: int) -> float | None:
     """Return the detail to try next, between two that enclose the wanted number once there are; None if it is near."""
     last, found = list(counts.items())[-1]
-    if _MIN_DOFS_RATIO * dofs <= found <= _MAX_DOFS_RATIO * dofs:
+    if TOLERANCES.min_dofs_ratio * dofs <= found <= TOLERANCES.max_dofs_ratio * dofs:
         return None
     finer = max((each for each, count in counts.items() if count > dofs), default=None)
     coarser = min((each for each, count in counts.items() if count <= dofs), default=None)
     if finer is not None and coarser is not None:
         return math.sqrt(finer * coarser)
-    change = (found / (0.95 * dofs)) ** (1.0 / _DOFS_POWER)
-    return _bounded(last * min(max(change, 1.0 / _MAX_STEP), _MAX_STEP))
+    change = (found / (0.95 * dofs)) ** (1.0 / TOLERANCES.dofs_power)
+    return _bounded(last * min(max(change, 1.0 / TOLERANCES.max_step), TOLERANCES.max_step))
 
 
 def _bounded(detail: float) -> float:
-    return min(max(detail, _MIN_DETAIL), _MAX_DETAIL)
+    return min(max(detail, TOLERANCES.min_detail), TOLERANCES.max_detail)
 
 
 def _filling_detail(surface: CheckedSurface, dofs: int) -> float:
@@ -188,18 +197,18 @@ def _filling_detail(surface: CheckedSurface, dofs: int) -> float:
     size, held, area = surface.mesh.scale, surface.mean_thickness or 0.0, surface.mesh.area
     volume = 0.5 * held * area
     # Found by filling mugs, bowls, spoons and lumps: thin walls make tetrahedra smaller than asked for.
-    lengths = np.geomspace(_MIN_DETAIL, _MAX_DETAIL, 200) * size
+    lengths = np.geomspace(TOLERANCES.min_detail, TOLERANCES.max_detail, 200) * size
     relative = np.maximum(held / lengths, 1e-3)
     needed = area / lengths**2 * 16.4 * relative**-0.68 + volume / lengths**3 * 38.0 * np.minimum(1.0, relative / 3.0)
-    return float(lengths[np.argmax(needed <= dofs)] / size) if (needed <= dofs).any() else _MAX_DETAIL
+    return float(lengths[np.argmax(needed <= dofs)] / size) if (needed <= dofs).any() else TOLERANCES.max_detail
 
 
 def expect_memory(dofs: int) -> None:
     """Raise SimulationError where the modes of a mesh with so many degrees of freedom do not fit into memory."""
-    free, peak = free_memory(), _MEMORY_SAFETY * _PEAK_BYTES
-    needed = peak * (dofs / _PEAK_DOFS) ** _PEAK_POWER
+    free, peak = free_memory(), TOLERANCES.memory_safety * TOLERANCES.peak_bytes
+    needed = peak * (dofs / TOLERANCES.peak_dofs) ** TOLERANCES.peak_power
     if free is not None and needed > free:
-        fitting = int(_PEAK_DOFS * (free / peak) ** (1.0 / _PEAK_POWER)) // 1000 * 1000
+        fitting = int(TOLERANCES.peak_dofs * (free / peak) ** (1.0 / TOLERANCES.peak_power)) // 1000 * 1000
         wanted = f"about {needed / 1e9:.2g} GB of it free for {dofs} degrees of freedom"
         advice = f"use {max(fitting, MIN_DOFS)} (--set body.dofs=N), or close other programs"
         raise SimulationError.expected(wanted, free, got=f"{free / 1e9:.2g} GB", name="memory", advice=advice)

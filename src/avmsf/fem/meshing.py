@@ -28,22 +28,29 @@ from avmsf.mesh.points import connected_parts
 from avmsf.mesh.queries import ClosestPoints
 from avmsf.mesh.surface import Surface
 
-# What a mesh may have, and what it is taken for.
-_WELD_RATIO = 2e-6  # distance of vertices that are one, over the size: text files round, STL repeats corners
-_MAX_LOST_AREA = 0.05  # part of the area that may face against its neighbors
-MIN_ROUGHNESS_DEG = 20.0  # mean angle between neighboring triangles, from which on noise is likelier
-_MAX_EDGE = 0.06  # mean edge over the size, beyond which noise and form are one: a box turns by 60 degrees
-_MIN_LOG_STRENGTH = -3.0  # decimal logarithm of the weakest smoothing
-_MAX_LOG_STRENGTH = 5.0  # of the strongest
-_MAX_FREEDOM = 0.8  # part of the vertices' degrees of freedom that a mesh without noise would keep
-_MAX_FACES = 60_000  # beyond which a mesh is simplified even where that changes its form
-_ENOUGH_FACES = 16_000  # beyond which it is simplified as far as its form stays; models have some thousand
-_MAX_DISTANCE = 0.01  # root mean square, of a simplified mesh over its mean thickness; by a twisted blade
-_MAX_LIDS = 0.25  # part of the closed surface that lids over holes may make up, as `fill` has it
-_MAX_SMALL_LIDS = 0.02  # likewise of defects of a scan: openings of vessels are larger
-_MAX_LOOSE_AREA = 0.1  # part of the area in loose bits, which a wall leaves out
-_MIN_VESSEL = 0.03  # volume behind lids over area^1.5 of a surface with an inside; .13 of a hemisphere
-_MAX_WALL = 1.0 / 6.0  # thickness of a guessed wall over the mean thickness of what a closed surface holds
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What a mesh may have, and what it is taken for."""
+
+    weld_ratio: float = 2e-6  # distance of vertices that are one, over the size: text files round, STL repeats corners
+    max_lost_area: float = 0.05  # part of the area that may face against its neighbors
+    min_roughness_deg: float = 20.0  # mean angle between neighboring triangles, from which on noise is likelier
+    max_edge: float = 0.06  # mean edge over the size, beyond which noise and form are one: a box turns by 60 degrees
+    min_log_strength: float = -3.0  # decimal logarithm of the weakest smoothing
+    max_log_strength: float = 5.0  # of the strongest
+    max_freedom: float = 0.8  # part of the vertices' degrees of freedom that a mesh without noise would keep
+    max_faces: int = 60_000  # beyond which a mesh is simplified even where that changes its form
+    enough_faces: int = 16_000  # beyond which it is simplified as far as its form stays; models have some thousand
+    max_distance: float = 0.01  # root mean square, of a simplified mesh over its mean thickness; by a twisted blade
+    max_lids: float = 0.25  # part of the closed surface that lids over holes may make up, as `fill` has it
+    max_small_lids: float = 0.02  # likewise of defects of a scan: openings of vessels are larger
+    max_loose_area: float = 0.1  # part of the area in loose bits, which a wall leaves out
+    min_vessel: float = 0.03  # volume behind lids over area^1.5 of a surface with an inside; .13 of a hemisphere
+    max_wall: float = 1.0 / 6.0  # thickness of a guessed wall over the mean thickness of what a closed surface holds
+
+
+TOLERANCES = Tolerances()
 _PROBES = 8
 """Random vectors that estimate the number of degrees of freedom left, within a per cent for thousands of vertices."""
 _ROUNDS = 4
@@ -66,7 +73,7 @@ def weld(surface: Surface) -> Trimesh:
         raise SimulationError.expected("a mesh", 0, got=got, name="faces", advice="make a mesh of the points")
     places, rows = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
-    pairs = cKDTree(places).query_pairs(_WELD_RATIO * size, output_type="ndarray")
+    pairs = cKDTree(places).query_pairs(TOLERANCES.weld_ratio * size, output_type="ndarray")
     if len(pairs):
         label = connected_parts(pairs, len(places))
         places, rows = places[np.unique(label, return_index=True)[1]], label[rows]
@@ -93,7 +100,7 @@ def oriented(mesh: Trimesh) -> Trimesh:
             used.update(sides)
             kept[row] = True
     lost = float(areas[~kept].sum() / areas.sum())
-    if lost > _MAX_LOST_AREA:
+    if lost > TOLERANCES.max_lost_area:
         wanted = "triangles counter-clockwise from outside and at most two per edge"
         got, advice = f"others on {lost:.0%} of the surface", "make the normals of the mesh consistent"
         raise SimulationError.expected(wanted, lost, got=got, name="normals", advice=advice)
@@ -103,7 +110,7 @@ def oriented(mesh: Trimesh) -> Trimesh:
 def roughness(mesh: Trimesh) -> float:
     """Return the mean angle between the normals of neighboring triangles, degrees; 0 for a mesh of few long edges."""
     ends = mesh.vertices[mesh.face_adjacency_edges]
-    if not len(ends) or np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean() > _MAX_EDGE * mesh.scale:
+    if not len(ends) or np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean() > TOLERANCES.max_edge * mesh.scale:
         return 0.0
     return math.degrees(float(mesh.face_adjacency_angles.mean()))
 
@@ -114,7 +121,7 @@ def denoised(mesh: Trimesh) -> tuple[Trimesh, float]:
     A mesh that is not rough, or whose vertices predict each other no better when smoothed, comes back as it is, with
     0. The volume of a closed one stays.
     """
-    if roughness(mesh) < MIN_ROUGHNESS_DEG:
+    if roughness(mesh) < TOLERANCES.min_roughness_deg:
         return mesh, 0.0
     points = np.asarray(mesh.vertices)
     # The squared difference of each vertex from the mean of its neighbors.
@@ -132,10 +139,10 @@ def denoised(mesh: Trimesh) -> tuple[Trimesh, float]:
         smoothed, freedom = smooth(exponent)
         return math.log(float(((smoothed - points) ** 2).mean()) / (1.0 - freedom) ** 2)
 
-    bounds = _MIN_LOG_STRENGTH, _MAX_LOG_STRENGTH
+    bounds = TOLERANCES.min_log_strength, TOLERANCES.max_log_strength
     found = scipy.optimize.minimize_scalar(error, bounds=bounds, options={"xatol": 0.05})
     smoothed, freedom = smooth(float(found.x))
-    if freedom > _MAX_FREEDOM:
+    if freedom > TOLERANCES.max_freedom:
         return mesh, 0.0
     result = _as_large(smoothed, mesh)
     return result, float(np.sqrt(((result.vertices - points) ** 2).sum(axis=1).mean()))
@@ -176,19 +183,19 @@ def _as_large(points: Float64[np.ndarray, "points 3"], mesh: Trimesh) -> Trimesh
 
 
 def thinned(mesh: Trimesh, *, log: Callable[[str], None]) -> Trimesh:
-    """Return a mesh of at most `_MAX_FACES` triangles, fewer within the tolerance; log what was done to a larger one.
+    """Return a mesh of at most `max_faces` triangles, fewer within the tolerance; log what was done to a larger one.
 
     More are left where fewer would open a seam or share an edge among three.
     """
-    count, enough, most = len(mesh.faces), _ENOUGH_FACES, _MAX_FACES
+    count, enough, most = len(mesh.faces), TOLERANCES.enough_faces, TOLERANCES.max_faces
     if count <= enough:
         return mesh
     log(f"checking a mesh of {count} triangles")
     rough = roughness(mesh)
     # Quadrics follow each noisy corner, and tie the mesh into knots.
-    noisy = rough >= MIN_ROUGHNESS_DEG
+    noisy = rough >= TOLERANCES.min_roughness_deg
     even = averaged(mesh, math.ceil(_ROUNDS * count / most)) if noisy else mesh
-    tolerance, places = _MAX_DISTANCE * 2.0 * abs(_held(even)) / even.area, even_points(even)
+    tolerance, places = TOLERANCES.max_distance * 2.0 * abs(_held(even)) / even.area, even_points(even)
     for target in (enough, 2 * enough, most):
         found = simplified(even, target, like=mesh)
         distances = ClosestPoints(found.triangles)(places).distances
@@ -242,11 +249,11 @@ class CheckedSurface:
     @cached_property
     def mean_thickness(self) -> float | None:
         """Twice the volume over the area, meters: of a thin wall, its thickness; None for a sheet, which holds none."""
-        return None if self.lids > _MAX_LIDS else 2.0 * abs(_held(self.mesh)) / self.mesh.area
+        return None if self.lids > TOLERANCES.max_lids else 2.0 * abs(_held(self.mesh)) / self.mesh.area
 
     def expect_filling(self) -> None:
         """Raise SimulationError where the surface is too open to be filled."""
-        if self.lids > _MAX_LIDS:
+        if self.lids > TOLERANCES.max_lids:
             got = f"{len(boundary_edges(self.mesh))} open edges whose holes are {self.lids:.0%} of the surface"
             advice = "give a wall thickness, or close the mesh"
             raise SimulationError.expected("a closed one", self.lids, got=got, name="mesh", advice=advice)
@@ -261,8 +268,8 @@ class CheckedSurface:
             got, advice = millimeters(thickness, 3), "give a thinner wall"
             raise SimulationError.expected(wanted, thickness, got=got, name="wall", advice=advice)
         held = self.mean_thickness if guessed else None
-        if held is not None and thickness > _MAX_WALL * held:
-            most = 1000 * _MAX_WALL * held
+        if held is not None and thickness > TOLERANCES.max_wall * held:
+            most = 1000 * TOLERANCES.max_wall * held
             wanted = f"at most {most:.3g} mm in a mesh that is {1000 * held:.3g} mm thick on average"
             raise SimulationError.expected(wanted, thickness, got="more", name="wall", advice="use a solid body")
 
@@ -273,7 +280,7 @@ class CheckedSurface:
         """
         parts = _parts(self.mesh)
         areas = np.bincount(parts, weights=self.mesh.area_faces)
-        if areas[0] < (1.0 - _MAX_LOOSE_AREA) * areas.sum():
+        if areas[0] < (1.0 - TOLERANCES.max_loose_area) * areas.sum():
             raise several_parts("mesh", (10_000 * areas).tolist(), "cm2")
         return oriented(mesh_of(self.mesh.vertices, self.mesh.faces[parts == 0]))
 
@@ -296,12 +303,12 @@ def checked(surface: Surface, *, log: Callable[[str], None]) -> CheckedSurface:
     result, opened = CheckedSurface(mesh), len(boundary_edges(mesh))
     if opened:
         # No mistake that could be undone: what was seen from inside alone faces inwards, and its wall lies outside.
-        if _held(mesh) < -_MIN_VESSEL * mesh.area**1.5:
+        if _held(mesh) < -TOLERANCES.min_vessel * mesh.area**1.5:
             log(
                 "open mesh whose triangles face inwards: its wall is taken to be outside; reverse the triangles if the "
                 "wall is inside"
             )
-        helps = "trying to close the holes" if result.lids <= _MAX_LIDS else "give a wall thickness"
+        helps = "trying to close the holes" if result.lids <= TOLERANCES.max_lids else "give a wall thickness"
         log(f"the mesh has {opened} open edges: {helps}")
     return result
 
@@ -323,7 +330,7 @@ def _closed(mesh: Trimesh) -> Trimesh:
 
     Holes as large as openings that an object may have stay.
     """
-    if not 0.0 < CheckedSurface(mesh).lids <= _MAX_SMALL_LIDS:
+    if not 0.0 < CheckedSurface(mesh).lids <= TOLERANCES.max_small_lids:
         return mesh
     corners = np.concatenate([mesh.triangles, _lids(mesh)])
     points, rows = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)

@@ -27,13 +27,20 @@ STIFFNESS_RATIOS = (0.03, 0.003, 0.3, 1000.0)
 """Stiffness of a patch over `HeldModes.stiffness_scale`: about that of the clamps of a measured strip (strip30), at
 which supports are compared first, a softer one, a stiffer one, and one that is rigid."""
 
-# What a patch and its cells are; lengths are over the body's size.
-_HELD_DISTANCE = 0.01  # from the extreme plane, within which nodes belong to a patch
-_HELD_RADIUS = 0.03  # about a point at which a user says that the object was held: a finger, a foot, a clamp
-_MAX_HELD_RATIO = 0.3  # part of the surface's nodes that a patch may hold: what is left would not ring
-_CELL_EXTENT = 0.08  # of a cell: a long patch moves as several rigid ones
-_MAX_CELLS = 8  # of a patch
-_RANK = 1e-3  # singular value of a cell's motions over the largest: nodes on a line cannot tell one
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What a patch and its cells are; lengths are over the body's size."""
+
+    held_distance: float = 0.01  # from the extreme plane, within which nodes belong to a patch
+    held_radius: float = 0.03  # about a point at which a user says that the object was held: a finger, a foot, a clamp
+    max_held_ratio: float = 0.3  # part of the surface's nodes that a patch may hold: what is left would not ring
+    cell_extent: float = 0.08  # of a cell: a long patch moves as several rigid ones
+    max_cells: int = 8  # of a patch
+    rank: float = 1e-3  # singular value of a cell's motions over the largest: nodes on a line cannot tell one
+
+
+TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True)
@@ -53,10 +60,10 @@ class Patch:
     def nodes(self, mesh: SecondOrder) -> Int[np.ndarray, " nodes"]:
         """Return the rows of the surface's nodes that belong to it."""
         (outer, _), size, place = mesh.surface, mesh.solid.size, np.array(self.place)
-        away, reach = np.linalg.norm(mesh.nodes[outer] - place, axis=1), _HELD_RADIUS * size
+        away, reach = np.linalg.norm(mesh.nodes[outer] - place, axis=1), TOLERANCES.held_radius * size
         if self.is_end:
             away, reach = -(mesh.nodes[outer] @ place), -math.inf
-        return outer[away <= max(reach, away.min() + _HELD_DISTANCE * size)]
+        return outer[away <= max(reach, away.min() + TOLERANCES.held_distance * size)]
 
     def loads(self, mesh: SecondOrder) -> scipy.sparse.csc_array:
         """Return the rigid motions of its cells [3 nodes, loads], as the head of this module scales them."""
@@ -69,7 +76,7 @@ class Patch:
             extent = max(math.sqrt(np.square(arms).sum(1).mean()), np.finfo(float).tiny)
             motions = np.concatenate([shifts, turns / extent], axis=2).reshape(3 * len(cell), 6)
             left, values, _ = np.linalg.svd(motions, full_matrices=False)
-            left = left[:, values > _RANK * values[0]] / math.sqrt(len(rows))
+            left = left[:, values > TOLERANCES.rank * values[0]] / math.sqrt(len(rows))
             dofs = (3 * rows[cell][:, None] + np.arange(3)).ravel()
             place = np.repeat(dofs, left.shape[1]), np.tile(np.arange(left.shape[1]), len(dofs))
             columns.append(scipy.sparse.csc_array((left.ravel(), place), shape=(3 * len(mesh.nodes), left.shape[1])))
@@ -112,7 +119,7 @@ def patches_of(mesh: SecondOrder) -> list[Patch]:
         patch = Patch("", (float(direction[0]), float(direction[1]), float(direction[2])))
         nodes = set(patch.nodes(mesh).tolist())
         known = any(2 * len(nodes & other) > len(nodes | other) for other in seen)
-        if known or len(nodes) > _MAX_HELD_RATIO * len(outer):
+        if known or len(nodes) > TOLERANCES.max_held_ratio * len(outer):
             continue
         x, y, z = 1000.0 * mesh.nodes[sorted(nodes)].mean(axis=0) + 0.0
         name = "its lowest part" if row == 0 else f"its end at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
@@ -130,7 +137,7 @@ def patches_about(points: Sequence[Place]) -> list[Patch]:
 def _cells(places: Float64[np.ndarray, "nodes 3"], size: float) -> list[Int[np.ndarray, " some"]]:
     """Return the rows of places in each cell: those nearest to one of a few points far from each other."""
     extent = float(np.linalg.norm(np.ptp(places, axis=0)))
-    count = max(1, min(_MAX_CELLS, math.ceil(extent / (_CELL_EXTENT * size)), len(places)))
+    count = max(1, min(TOLERANCES.max_cells, math.ceil(extent / (TOLERANCES.cell_extent * size)), len(places)))
     outermost = int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())
     centers = places[farthest_points(torch.from_numpy(places), count, start=outermost).numpy()]
     label = cKDTree(centers).query(places)[1]

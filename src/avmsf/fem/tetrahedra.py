@@ -14,6 +14,7 @@ import sys
 import tempfile
 import zipfile
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -34,12 +35,19 @@ from avmsf.mesh.surface import Surface
 
 WORKER = Path(tetrahedra_worker.__file__)
 
-# How near tetrahedra are to the mesh that they fill.
-ENVELOPE = 0.04  # how far the solid's surface may lie from the mesh, over the length of tetrahedra's edges
-_MIN_EDGE = 0.1  # shorter ones are taken out of the mesh beforehand, over the length of tetrahedra's edges
-_MIN_TURN_COSINE = 0.7  # by which triangles may turn then: it makes a scan's filling ten times as quick
-_MAX_LIDS = 0.25  # part of the solid's surface that may close holes
-_MAX_LOST = 0.1  # part of the mesh, or of the volume of its parts, that may be left out
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How near tetrahedra are to the mesh that they fill."""
+
+    envelope: float = 0.04  # how far the solid's surface may lie from the mesh, over the length of tetrahedra's edges
+    min_edge: float = 0.1  # shorter ones are taken out of the mesh beforehand, over the length of tetrahedra's edges
+    min_turn_cosine: float = 0.7  # by which triangles may turn then: it makes a scan's filling ten times as quick
+    max_lids: float = 0.25  # part of the solid's surface that may close holes
+    max_lost: float = 0.1  # part of the mesh, or of the volume of its parts, that may be left out
+
+
+TOLERANCES = Tolerances()
 _MAX_STORED = 300
 """Fillings that are stored, some megabytes each; the oldest are removed."""
 
@@ -56,18 +64,18 @@ def fill(surface: Surface, *, detail: float = 0.05, timeout: float = 600.0) -> S
     size, opened = mesh.scale, len(boundary_edges(mesh))
     advice = f"give a wall thickness, such as {0.015 * size:.1g} m"
     # Of a sheet fTetWild makes a sliver as thin as its envelope, or nothing, as chance has it.
-    if opened and principal_extents(mesh.triangles.reshape(-1, 3)).min() < 2.0 * ENVELOPE * detail * size:
+    if opened and principal_extents(mesh.triangles.reshape(-1, 3)).min() < 2.0 * TOLERANCES.envelope * detail * size:
         wanted, got = "a mesh that encloses a volume", "a flat sheet"
         raise SimulationError.expected(wanted, 0, got=got, name="volume", advice=advice)
-    coarse = coarsened(mesh, _MIN_EDGE * detail * size, turn=_MIN_TURN_COSINE)
+    coarse = coarsened(mesh, TOLERANCES.min_edge * detail * size, turn=TOLERANCES.min_turn_cosine)
     points, cells = _stored(coarse, detail, timeout)
     if not len(cells):
         wanted, got = "a mesh that encloses a volume", f"{opened} open edges"
         raise SimulationError.expected(wanted, opened, got=got, name="volume", advice=advice)
     solid = Solid.build(torch.from_numpy(points), torch.from_numpy(cells))
-    solid.expect_connected(loose=_MAX_LOST)
+    solid.expect_connected(loose=TOLERANCES.max_lost)
     solid = Solid.build(solid.points, solid.cells[solid.parts == 0])
-    _expect_likeness(solid, mesh, tolerance=4.0 * ENVELOPE * detail * size, advice=advice)
+    _expect_likeness(solid, mesh, tolerance=4.0 * TOLERANCES.envelope * detail * size, advice=advice)
     return solid
 
 
@@ -76,7 +84,7 @@ def _stored(mesh: Trimesh, detail: float, timeout: float) -> tuple[np.ndarray, n
     given, faces = np.array(mesh.vertices), np.array(mesh.faces)
     folder = Path(os.environ.get("AVMSF_CACHE") or os.path.expanduser("~/.cache/avmsf")) / "tetrahedra"
     code = f"{version('pytetwild')} {source_digest(tetrahedra_worker.__name__)}"
-    values = f"{code} {detail} {ENVELOPE} {given.shape} {given.dtype} {faces.dtype}"
+    values = f"{code} {detail} {TOLERANCES.envelope} {given.shape} {given.dtype} {faces.dtype}"
     digest = hashlib.sha256(values.encode() + given.tobytes() + faces.tobytes()).hexdigest()
     path = folder / f"{digest[:24]}.npz"
     try:
@@ -103,7 +111,7 @@ def _tetrahedralize(points: np.ndarray, faces: np.ndarray, detail: float, timeou
     with tempfile.TemporaryDirectory(prefix="avmsf-fill-") as name:
         job, result, log = (Path(name) / file for file in ("job.npz", "result.npz", "log"))
         np.savez(
-            job, points=points, faces=faces.astype(np.uint32), edge=detail, envelope=ENVELOPE * detail,
+            job, points=points, faces=faces.astype(np.uint32), edge=detail, envelope=TOLERANCES.envelope * detail,
             library=found.submodule_search_locations[0], seconds=timeout,
         )  # fmt: skip
         # -P keeps this folder, whose modules have common names, from where the worker looks for libraries.
@@ -134,13 +142,13 @@ def _expect_likeness(solid: Solid, mesh: Trimesh, *, tolerance: float, advice: s
     behind = (outside.face_normals[found.rows] * (places - nearest)).sum(axis=1) < 0
     # Where bodies cross, the mesh runs inside; only what lies outside was lost.
     lost = float(((found.distances > tolerance) & ~behind).mean())
-    if lost > _MAX_LOST:
+    if lost > TOLERANCES.max_lost:
         wanted = f"tetrahedra within {tolerance:.2g} m of the mesh"
         got = f"{lost:.0%} of it without ({opened} open edges, or thin walls)"
         advice = f"use a smaller detail or more degrees of freedom, close the mesh, or {advice}"
         raise SimulationError.expected(wanted, lost, got=got, name="detail", advice=advice)
     lids = float((ClosestPoints(mesh.triangles)(even_points(outside)).distances > tolerance).mean())
-    if lids > _MAX_LIDS:
+    if lids > TOLERANCES.max_lids:
         got = f"{opened} open edges whose holes are {lids:.0%} of the surface"
         advice = f"close the mesh, or {advice}"
         raise SimulationError.expected("a nearly closed mesh", lids, got=got, name="holes", advice=advice)

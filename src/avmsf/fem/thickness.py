@@ -8,6 +8,7 @@ one. The prior is uniform in the log thickness over the range that was computed.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -15,18 +16,25 @@ from scipy.ndimage import gaussian_filter1d
 from avmsf.fem.candidate_bodies import CandidateBody
 from avmsf.fem.material import DISCREPANCY
 
-# How the thickness is searched; steps are differences of its logarithm.
-_MIN_STEP = 0.06  # below which no body is computed between two: real walls vary by 3 to 5 %
-# From which on three bodies say little of those between them: of a dish from photographs a body of twice the best
-# one's thickness was less probable by 66 nats; one half way was by 9 nats more so.
-_MAX_STEP = 0.4
-_MAX_BODIES = 8  # that are computed besides the first ones, failures included
-_MAX_EVIDENCE_GAP = math.log(100.0)  # nats below the most probable body, beyond which is no hypothesis
-# Below the first range, whose lower end is a guess; with no end, gains that no wall explains made it ever thinner
-# (from 1 to .06 mm).
-_MAX_EXTENSION = math.log(4.0)
-_AT_ONCE = 2  # bodies that are computed side by side, on however many processors: the same walls everywhere
-_STEPS = 2000  # thicknesses on which the posterior is summed up
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How the thickness is searched; steps are differences of its logarithm."""
+
+    min_step: float = 0.06  # below which no body is computed between two: real walls vary by 3 to 5 %
+    # From which on three bodies say little of those between them: of a dish from photographs a body of twice the best
+    # one's thickness was less probable by 66 nats; one half way was by 9 nats more so.
+    max_step: float = 0.4
+    max_bodies: int = 8  # that are computed besides the first ones, failures included
+    max_evidence_gap: float = math.log(100.0)  # nats below the most probable body, beyond which is no hypothesis
+    # Below the first range, whose lower end is a guess; with no end, gains that no wall explains made it ever thinner
+    # (from 1 to .06 mm).
+    max_extension: float = math.log(4.0)
+    at_once: int = 2  # bodies that are computed side by side, on however many processors: the same walls everywhere
+    steps: int = 2000  # thicknesses on which the posterior is summed up
+
+
+TOLERANCES = Tolerances()
 
 
 def search_thickness(
@@ -43,8 +51,8 @@ def search_thickness(
     is the most probable one, or where fewer than two thicknesses are known.
     """
     found, failed = dict(zip(bodies, evidence(bodies), strict=True)), list[float]()
-    thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - _MAX_EXTENSION
-    for _ in range(0, _MAX_BODIES, _AT_ONCE):
+    thinnest = min((math.log(wall) for wall, _ in _walls(found)), default=0.0) - TOLERANCES.max_extension
+    for _ in range(0, TOLERANCES.max_bodies, TOLERANCES.at_once):
         walls, best = _walls(found), max(found, key=found.__getitem__)
         if len(walls) < 2 or best.thickness is None:
             break
@@ -57,7 +65,7 @@ def search_thickness(
         new = [body for body in made if body is not None]
         found |= zip(new, evidence(new), strict=True)
     best = max(found, key=found.__getitem__)
-    likely = [body for body, each in found.items() if each > found[best] - _MAX_EVIDENCE_GAP]
+    likely = [body for body, each in found.items() if each > found[best] - TOLERANCES.max_evidence_gap]
     likely.sort(key=found.__getitem__)
     walls = _walls(found)
     return likely[::-1], None if best.thickness is None or len(walls) < 2 else _posterior(walls)
@@ -90,18 +98,18 @@ def _next(places: np.ndarray, values: np.ndarray, failed: np.ndarray, *, thinnes
         # The first range is a guess below; above, the views or the object's width bound it.
         proposals += [places[0] - part * (places[1] - places[0]) for part in (1.0, 0.5)]
     fall, apart = values[best] - values, np.abs(places - places[best])
-    near = [row for row in near if fall[row] < 4.0 * _MAX_EVIDENCE_GAP or apart[row] > _MAX_STEP]
+    near = [row for row in near if fall[row] < 4.0 * TOLERANCES.max_evidence_gap or apart[row] > TOLERANCES.max_step]
     proposals += [0.5 * (places[best] + places[row]) for row in sorted(near, key=lambda row: -values[row])]
     chosen = list[float]()
     for each in proposals:
-        if each >= thinnest and np.abs(np.concatenate([places, failed, chosen]) - each).min() >= _MIN_STEP:
+        if each >= thinnest and np.abs(np.concatenate([places, failed, chosen]) - each).min() >= TOLERANCES.min_step:
             chosen.append(each)
-    return np.exp(chosen[:_AT_ONCE]).tolist()
+    return np.exp(chosen[: TOLERANCES.at_once]).tolist()
 
 
 def _posterior(walls: Sequence[tuple[float, float]]) -> dict[str, float]:
     places, values = np.log([wall for wall, _ in walls]), np.array([each for _, each in walls])
-    grid = np.linspace(places[0] - 3 * DISCREPANCY, places[-1] + 3 * DISCREPANCY, _STEPS)
+    grid = np.linspace(places[0] - 3 * DISCREPANCY, places[-1] + 3 * DISCREPANCY, TOLERANCES.steps)
     likely = np.exp(np.interp(grid, places, values - values.max(), left=-np.inf, right=-np.inf))
     density = gaussian_filter1d(likely, DISCREPANCY / (grid[1] - grid[0]), mode="constant")
     share = np.cumsum(density) / density.sum()

@@ -28,20 +28,27 @@ from torch import Tensor
 
 from avmsf.fem.elastic_modes import ElasticModes
 
-# Prior standard deviations of the coefficients, and what counts as known and as near.
-STIFFNESS_STD = 0.10  # of Young's modulus over its nominal value
-DENSITY_STD = 0.04  # of the density over its nominal value
-_POISSON_STD = 1.0  # of Poisson's ratio over `_POISSON_STEP`
-_FACTOR_STD = 0.5  # of the log factor on all frequencies over one round
-_POISSON_STEP = 0.05  # change of Poisson's ratio that a coefficient of 1 stands for
-_MAX_ROUNDS = 6  # on simulated objects the evidence rises for 3 to 6
-_MIN_CERTAINTY = 0.7  # probability of a shape from which on a mode is taken for it
-_FREQUENCY_STD = 0.02  # of log frequency at first
-_MIN_FREQUENCY_STD = 0.002
-_MIN_GAIN_NOISE = 0.02  # variance of gains that updating cannot explain, over their mean square
-_MIXING_GAP = 0.01  # of squared frequencies, relative, below which shapes mix and first order says nothing
-_GROUP_GAP = 0.02  # of squared frequencies, relative, within which shapes count as one group
-_MAX_STEP = 2.0  # of a coefficient, in prior standard deviations
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Prior standard deviations of the coefficients, and what counts as known and as near."""
+
+    stiffness_std: float = 0.10  # of Young's modulus over its nominal value
+    density_std: float = 0.04  # of the density over its nominal value
+    poisson_std: float = 1.0  # of Poisson's ratio over `poisson_step`
+    factor_std: float = 0.5  # of the log factor on all frequencies over one round
+    poisson_step: float = 0.05  # change of Poisson's ratio that a coefficient of 1 stands for
+    max_rounds: int = 6  # on simulated objects the evidence rises for 3 to 6
+    min_certainty: float = 0.7  # probability of a shape from which on a mode is taken for it
+    frequency_std: float = 0.02  # of log frequency at first
+    min_frequency_std: float = 0.002
+    min_gain_noise: float = 0.02  # variance of gains that updating cannot explain, over their mean square
+    mixing_gap: float = 0.01  # of squared frequencies, relative, below which shapes mix and first order says nothing
+    group_gap: float = 0.02  # of squared frequencies, relative, within which shapes count as one group
+    max_step: float = 2.0  # of a coefficient, in prior standard deviations
+
+
+TOLERANCES = Tolerances()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +81,10 @@ def update(
     local = modes.near(points)
     known = local.gains(points, directions).numpy()
     problem = _Problem(modes, known, frequency[usable].numpy(), values[:, usable].numpy())
-    theta, spread, best = np.zeros(len(problem.deviation)), _FREQUENCY_STD, None
+    theta, spread, best = np.zeros(len(problem.deviation)), TOLERANCES.frequency_std, None
     found = match(local)
     nominal = highest = found.evidence
-    for step in range(_MAX_ROUNDS):
+    for step in range(TOLERANCES.max_rounds):
         theta, spread, volume = problem.solved(theta, found, found.centers[:, usable], spread, with_gains=step > 0)
         size = float(np.square(theta / problem.deviation).sum())
         if size > len(theta):
@@ -102,9 +109,9 @@ class _Problem:
         self.known, self.frequency, self.values = known, frequency, values
         self.squares, changes = np.square(2.0 * np.pi * nominal.frequency.numpy()), nominal.perturbations
         assert changes is not None
-        self.forces = np.concatenate([changes.stiffness, _POISSON_STEP * changes.poisson[None]])
+        self.forces = np.concatenate([changes.stiffness, TOLERANCES.poisson_step * changes.poisson[None]])
         self.masses = changes.mass
-        deviations = [STIFFNESS_STD, _POISSON_STD, DENSITY_STD]
+        deviations = [TOLERANCES.stiffness_std, TOLERANCES.poisson_std, TOLERANCES.density_std]
         self.deviation = np.repeat(deviations, [len(self.forces) - 1, 1, len(self.masses)])
 
     def solution(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -133,11 +140,11 @@ class _Problem:
         """
         squares, shapes = self.solution(theta)
         centers = known.numpy()
-        together = np.abs(squares[:, None] - squares) <= _GROUP_GAP * squares[:, None]
+        together = np.abs(squares[:, None] - squares) <= TOLERANCES.group_gap * squares[:, None]
         grouped = together @ centers
         shape = centers.argmax(0)
         certainty = grouped[shape, np.arange(len(shape))]
-        mode = np.flatnonzero(certainty > _MIN_CERTAINTY)
+        mode = np.flatnonzero(certainty > TOLERANCES.min_certainty)
         shape, certainty = shape[mode], certainty[mode]
         forces = np.einsum("jk,ljm,mn->lkn", shapes, self.forces, shapes, optimize=True)
         masses = np.einsum("jk,ljm,mn->lkn", shapes, self.masses, shapes, optimize=True)
@@ -153,19 +160,19 @@ class _Problem:
                 rows.append(np.concatenate([row * weight, np.zeros((len(row), 1))], axis=1))
                 rest.append((value + row @ theta) * weight)
         matrix, right = np.concatenate(rows), np.concatenate(rest)
-        precision = np.append(self.deviation, _FACTOR_STD) ** -2.0
+        precision = np.append(self.deviation, TOLERANCES.factor_std) ** -2.0
         posterior = matrix.T @ matrix + np.diag(precision)
         solution = np.linalg.solve(posterior, matrix.T @ right)
         # Of the coefficients alone: the factor is not known of the nominal body either.
         alone = posterior[:-1, :-1] - np.outer(posterior[:-1, -1], posterior[-1, :-1]) / posterior[-1, -1]
         volume = 0.5 * np.linalg.slogdet(alone * self.deviation[:, None] * self.deviation)[1]
-        longest = _MAX_STEP * self.deviation
+        longest = TOLERANCES.max_step * self.deviation
         step = np.clip(solution[:-1] - theta, -longest, longest)
         # More than the root mean square of the fitted residuals: as many coefficients as modes fit them.
         left = apart - slopes @ step - solution[-1]
         if len(mode):
             fitted = 1.5 * np.sqrt(np.average(left**2, weights=certainty))
-            spread = float(np.clip(fitted, _MIN_FREQUENCY_STD, spread))
+            spread = float(np.clip(fitted, TOLERANCES.min_frequency_std, spread))
         return theta + step, spread, float(volume)
 
     def _gain_rows(
@@ -182,11 +189,11 @@ class _Problem:
         basis, _ = np.linalg.qr(own)
         sizes = np.linalg.lstsq(own, values, rcond=1e-3)[0]
         left = values - basis @ (basis.T @ values)
-        noise = np.sqrt(max(_MIN_GAIN_NOISE, 0.5 * (left @ left) / (values @ values)) * np.mean(values**2))
+        noise = np.sqrt(max(TOLERANCES.min_gain_noise, 0.5 * (left @ left) / (values @ values)) * np.mean(values**2))
         moved = np.zeros((len(values), len(self.deviation)))
         for k, size in zip(np.flatnonzero(group), sizes, strict=True):
             apart = squares[k] - squares
-            mixing = np.where(group, 0.0, apart / (apart**2 + (_MIXING_GAP * squares[k]) ** 2))
+            mixing = np.where(group, 0.0, apart / (apart**2 + (TOLERANCES.mixing_gap * squares[k]) ** 2))
             coefficients = np.concatenate([forces[:, :, k], -squares[k] * masses[:, :, k]]) * mixing
             moved += size * along @ coefficients.T
         moved -= basis @ (basis.T @ moved)

@@ -25,27 +25,34 @@ from avmsf.mesh.points import connected_parts, unit
 from avmsf.mesh.queries import ClosestPoints, RayCaster
 from avmsf.mesh.surface import Surface
 
-# What a wall may be, and what a closed mesh is taken to be a wall by.
-_MAX_TURNS = 30  # times that the wall is turned and thinned where prisms are folded
-_TILT = 0.1  # how far a folded triangle turns the wall towards its own inside, each time
-_THINNING = 0.85  # factor on the wall's thickness at folded prisms, each time
-_MAX_SLOPE = 0.3  # that the thickness grows along an edge over the edge's length, where it was thinned
-_MAX_SPARED_AREA = 0.1  # part at which the wall may be folded, or thinner than half of what was asked for
-_MIN_PRISM_VOLUME = 0.05  # of a tetrahedron over a third of a straight prism, below which that is folded
-_MAX_OPPOSITE_COSINE = -0.8  # between the normals of the two sides
-_MIN_SMOOTH_COSINE = 0.7  # of the angle between neighboring triangles of one side
-_MAX_REACH = 2.5  # distance to the other side over twice the volume by area; beyond is a rim or a lump
-_MIN_COVERED_AREA = 0.85  # part of one side's area that faces the other side
-_MAX_HELD_ERROR = 0.25  # relative, of the volume behind one side: a handle or a foot is more
-_MAX_VOLUME_ERROR = 0.03  # relative, of the prisms' volume: frequencies go with the thickness
-# The same where the thickness is known: facets that cut across a curved wall leave out area, but no thickness. A
-# tube with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high.
-_MAX_EVEN_VOLUME_ERROR = 0.05
-_MAX_DISTANT_PART = 0.02  # of either surface, farther from the other than half an unknown thickness
-_RAY_LEAD = 1e-5  # how far behind a triangle rays start, in diagonals of the box around the mesh
-_TRIANGLE_RATIO = 1.2  # squared sides over the sheet's area for each vertex, by trial; 1.15 if regular
-_MAX_LAYERS = 50
-_MAX_ROUNDS = 100  # of averaging, which fills in the thickness where no ray finds the other side
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What a wall may be, and what a closed mesh is taken to be a wall by."""
+
+    max_turns: int = 30  # times that the wall is turned and thinned where prisms are folded
+    tilt: float = 0.1  # how far a folded triangle turns the wall towards its own inside, each time
+    thinning: float = 0.85  # factor on the wall's thickness at folded prisms, each time
+    max_slope: float = 0.3  # that the thickness grows along an edge over the edge's length, where it was thinned
+    max_spared_area: float = 0.1  # part at which the wall may be folded, or thinner than half of what was asked for
+    min_prism_volume: float = 0.05  # of a tetrahedron over a third of a straight prism, below which that is folded
+    max_opposite_cosine: float = -0.8  # between the normals of the two sides
+    min_smooth_cosine: float = 0.7  # of the angle between neighboring triangles of one side
+    max_reach: float = 2.5  # distance to the other side over twice the volume by area; beyond is a rim or a lump
+    min_covered_area: float = 0.85  # part of one side's area that faces the other side
+    max_held_error: float = 0.25  # relative, of the volume behind one side: a handle or a foot is more
+    max_volume_error: float = 0.03  # relative, of the prisms' volume: frequencies go with the thickness
+    # The same where the thickness is known: facets that cut across a curved wall leave out area, but no thickness. A
+    # tube with facets of a third of its radius has 2.4 % less, and its lowest modes are 4 to 8 % too high.
+    max_even_volume_error: float = 0.05
+    max_distant_part: float = 0.02  # of either surface, farther from the other than half an unknown thickness
+    ray_lead: float = 1e-5  # how far behind a triangle rays start, in diagonals of the box around the mesh
+    triangle_ratio: float = 1.2  # squared sides over the sheet's area for each vertex, by trial; 1.15 if regular
+    max_layers: int = 50
+    max_rounds: int = 100  # of averaging, which fills in the thickness where no ray finds the other side
+
+
+TOLERANCES = Tolerances()
 
 
 def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
@@ -67,7 +74,7 @@ def shell(surface: Surface, *, thickness: float, detail: float = 0.04) -> Solid:
         raise SimulationError.expected(wanted, thickness, got=got, name="thickness", advice=advice)
     coarse = remeshed(mesh, detail * mesh.scale)
     folded = float(_folded(coarse, -thickness * coarse.vertex_normals) @ coarse.area_faces / coarse.area)
-    if folded > _MAX_SPARED_AREA:
+    if folded > TOLERANCES.max_spared_area:
         wanted, advice = "less than the surface's radius of curvature", "try half of it, or smooth the mesh"
         raise SimulationError.expected(wanted, thickness, got=f"{thickness:g} m", name="thickness", advice=advice)
     solid = prisms(coarse, np.full(len(coarse.vertices), thickness))
@@ -90,16 +97,16 @@ def _offsets(mesh: Trimesh, thickness: Float64[np.ndarray, " points"]) -> Float6
     faces = np.asarray(mesh.faces)
     directions, lengths = -mesh.vertex_normals, thickness.copy()
     ends = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
-    tolerance = _MAX_SLOPE * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
-    for _ in range(_MAX_TURNS):
+    tolerance = TOLERANCES.max_slope * np.linalg.norm(np.diff(mesh.vertices[ends], axis=1)[:, 0], axis=1)
+    for _ in range(TOLERANCES.max_turns):
         folded = _folded(mesh, lengths[:, None] * directions)
         if not folded.any():
             thin = (lengths[faces].mean(axis=1) < 0.5 * thickness[faces].mean(axis=1)) @ mesh.area_faces
-            return lengths[:, None] * directions if thin <= _MAX_SPARED_AREA * mesh.area else None
+            return lengths[:, None] * directions if thin <= TOLERANCES.max_spared_area * mesh.area else None
         # Where there is a direction that all triangles around a vertex see from outside, this finds one in the end.
-        np.add.at(directions, faces[folded], -_TILT * mesh.face_normals[folded][:, None])
+        np.add.at(directions, faces[folded], -TOLERANCES.tilt * mesh.face_normals[folded][:, None])
         directions = unit(directions)
-        lengths[np.unique(faces[folded])] *= _THINNING
+        lengths[np.unique(faces[folded])] *= TOLERANCES.thinning
         # A wall that thins within one triangle would fold the next.
         np.minimum.at(lengths, ends[:, 0], lengths[ends[:, 1]] + tolerance)
     return None
@@ -121,7 +128,7 @@ def _folded(mesh: Trimesh, offsets: np.ndarray) -> np.ndarray:
     corners = points[_prisms(mesh)]
     volumes = np.linalg.det(corners[:, :, 1:] - corners[:, :, :1]) / 6.0
     straight = mesh.area_faces * np.linalg.norm(offsets, axis=1)[mesh.faces].mean(axis=1) / 3.0
-    return (volumes <= _MIN_PRISM_VOLUME * straight[:, None]).any(axis=1)
+    return (volumes <= TOLERANCES.min_prism_volume * straight[:, None]).any(axis=1)
 
 
 def _prisms(mesh: Trimesh) -> Int[np.ndarray, "triangles 3 4"]:
@@ -149,10 +156,10 @@ class Wall:
 
         # Each vertex of the sheet has 4 nodes on each of 2 layers + 1 levels, and two triangles.
         def needed(layers: int) -> float:
-            return math.sqrt(_TRIANGLE_RATIO * 12.0 * (2 * layers + 1) * self.sheet.area / dofs)
+            return math.sqrt(TOLERANCES.triangle_ratio * 12.0 * (2 * layers + 1) * self.sheet.area / dofs)
 
         layers = 1
-        while layers < _MAX_LAYERS - 1 and self._layers(needed(layers)) > layers:
+        while layers < TOLERANCES.max_layers - 1 and self._layers(needed(layers)) > layers:
             layers += 1
         return needed(layers)
 
@@ -185,10 +192,10 @@ class Wall:
     def _thickness_at(self, sheet: Trimesh) -> Float64[np.ndarray, " points"] | None:
         """Return the distance to the other side behind each vertex of a sheet, filled in from neighbors at rims."""
         reach, cosine, _ = _behind(self.mesh, sheet.vertices, sheet.vertex_normals)
-        known = (cosine < _MAX_OPPOSITE_COSINE) & (reach < _MAX_REACH * self.thickness)
+        known = (cosine < TOLERANCES.max_opposite_cosine) & (reach < TOLERANCES.max_reach * self.thickness)
         joined = adjacency(sheet)
         values = np.where(known, reach, 0.0)
-        for _ in range(_MAX_ROUNDS):
+        for _ in range(TOLERANCES.max_rounds):
             if known.all():
                 return values
             near = joined @ known.astype(float)
@@ -199,7 +206,7 @@ class Wall:
 
     def _fills(self, solid: Solid) -> bool:
         """Return whether prisms have the mesh's volume, and their surface is the mesh."""
-        volume, away = (_MAX_EVEN_VOLUME_ERROR, 1.0) if self.even else (_MAX_VOLUME_ERROR, 0.5)
+        volume, away = (TOLERANCES.max_even_volume_error, 1.0) if self.even else (TOLERANCES.max_volume_error, 0.5)
         if abs(solid.volume / self.mesh.volume - 1.0) > volume:
             return False
         outside = Trimesh(solid.points.numpy(), solid.boundary.numpy(), process=False)
@@ -207,7 +214,7 @@ class Wall:
             ClosestPoints(one.triangles)(even_points(other)).distances
             for one, other in ((outside, self.mesh), (self.mesh, outside))
         )
-        return all(float((each > away * self.thickness).mean()) <= _MAX_DISTANT_PART for each in distances)
+        return all(float((each > away * self.thickness).mean()) <= TOLERANCES.max_distant_part for each in distances)
 
 
 def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
@@ -220,15 +227,15 @@ def wall_of(mesh: Trimesh, thickness: float | None = None) -> Wall | None:
         return None
     areas = mesh.area_faces
     reach, cosine, behind = _behind(mesh, mesh.triangles_center, mesh.face_normals)
-    facing = (cosine < _MAX_OPPOSITE_COSINE) & (reach < _MAX_REACH * 2.0 * mesh.volume / mesh.area)
+    facing = (cosine < TOLERANCES.max_opposite_cosine) & (reach < TOLERANCES.max_reach * 2.0 * mesh.volume / mesh.area)
     if not facing.any():
         return None
     label = _sides(mesh, facing)
     side = label == np.bincount(label[facing], weights=areas[facing]).argmax()
     covered = side & ~side[behind]
     held_error = abs(float(areas[covered] @ reach[covered]) / mesh.volume - 1.0)
-    least = _MIN_COVERED_AREA * areas[side].sum()
-    if areas[covered].sum() < least or held_error > _MAX_HELD_ERROR:
+    least = TOLERANCES.min_covered_area * areas[side].sum()
+    if areas[covered].sum() < least or held_error > TOLERANCES.max_held_error:
         return None
     sheet = mesh_of(mesh.vertices, mesh.faces[side])
     if thickness is not None:
@@ -240,7 +247,7 @@ def _sides(mesh: Trimesh, facing: Bool[np.ndarray, " faces"]) -> Int[np.ndarray,
     """Return the number of the smooth connected part of the triangles `facing` that each is in; -1 for the others."""
     pairs = mesh.face_adjacency
     cosine = (mesh.face_normals[pairs[:, 0]] * mesh.face_normals[pairs[:, 1]]).sum(axis=1)
-    joined = pairs[(cosine > _MIN_SMOOTH_COSINE) & facing[pairs].all(axis=1)]
+    joined = pairs[(cosine > TOLERANCES.min_smooth_cosine) & facing[pairs].all(axis=1)]
     return np.where(facing, connected_parts(joined, len(mesh.faces)), -1)
 
 
@@ -251,5 +258,5 @@ def _behind(
 
     The distance is infinite where there is none, and the cosine 1.
     """
-    rows, reach, _ = RayCaster(mesh.triangles)(places, -normals, lead=_RAY_LEAD)
+    rows, reach, _ = RayCaster(mesh.triangles)(places, -normals, lead=TOLERANCES.ray_lead)
     return reach, np.where(rows >= 0, (normals * mesh.face_normals[rows]).sum(axis=1), 1.0), rows

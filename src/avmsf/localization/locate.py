@@ -157,13 +157,10 @@ def locate_impacts(
     resampled, highest, remark = at_field_rate(sound, whole, field, speed=chosen.playback_speed)
     finder = _locator_for(field, locator)
     ratio = len(resampled) / len(sound)
-    if ratio < 1.0:
-        # Sampled finer than it has frequencies, a sound is predicted so well that an onset seems to be before it.
-        starts = detect_onsets(resampled.double().numpy(), sample_rate=ratio * whole.sample_rate)
-        onsets = [round(start / ratio) for start in starts]
-    else:
-        onsets = detect_onsets(sound, sample_rate=whole.sample_rate)
-        starts = [round(onset * ratio) for onset in onsets]
+    # Sampled finer than it has frequencies, a sound is predicted so well that an onset seems to be before it.
+    given, rate = (resampled.double().numpy(), ratio) if ratio < 1.0 else (sound, 1.0)
+    onsets = [onset / rate for onset in detect_onsets(given, sample_rate=rate * whole.sample_rate)]
+    starts = [round(onset * ratio) for onset in onsets]
     found = []
     rejected: list[tuple[float, LocationError]] = []
     for number, (onset, start) in enumerate(zip(onsets, starts, strict=True)):
@@ -173,7 +170,7 @@ def locate_impacts(
             own = own - predict_ringing(field, resampled, starts[number - 1], start, len(own), highest=highest)
         if chosen.from_peaks:
             own = own[int(own.abs().argmax()) :]
-        seconds = onset / whole.sample_rate
+        seconds = round(onset) / whole.sample_rate
         try:
             located = assess_match(finder.locate(own.float(), highest=highest, force=force))
             if located.refusal is not None:

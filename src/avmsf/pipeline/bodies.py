@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avmsf.capture.checks import NARROWEST, WIDEST, expect_held
 from avmsf.capture.impacts import Impacts
-from avmsf.capture.placement import expect_placed
+from avmsf.capture.placement import expect_on_body
 from avmsf.capture.settings import TABLE, CaptureSettings
 from avmsf.capture.table import read_cells
 from avmsf.errors import FitError, SimulationError
@@ -59,7 +59,7 @@ def candidate_bodies(
     held_at, seen = settings.held_at, surface if isinstance(surface, Surface) else surface.as_seen()
     extent = seen.vertices.amax(0) - seen.vertices.amin(0)
     if impacts is not None:
-        expect_placed(impacts.contacts, surface_points(seen), names=impacts.names, elastic=True)
+        expect_on_body(impacts.contacts, surface_points(seen), names=impacts.names)
     expect_held(held_at, seen)
     wall = config.wall
     try:

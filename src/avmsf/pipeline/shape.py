@@ -101,7 +101,8 @@ def shape_of(
     """
     log, found, impacts, seed = pipeline.listener.note, capture.surface, capture.impacts, config.fit.seed
     if features is None and found is not None:
-        expect_placed(impacts.contacts, surface_points(found), names=impacts.names, advice=WITHOUT_SHAPE)
+        advice = "" if capture.folder is None else WITHOUT_SHAPE
+        expect_placed(impacts.contacts, surface_points(found), names=impacts.names, advice=advice)
     if isinstance(pipeline, SceneStages):
         return _shape_of_views(capture, config, pipeline, features, report)
     if config.scene != PRESETS["default"].scene and is_mesh(found):
@@ -183,7 +184,7 @@ def _shape_of_views(
         features = moved_onto(features, seen)
     # Structure from motion knows nothing of the frame that the contacts are in.
     found_frame = scene.source is not None and scene.source.kind in ("photographs", "video")
-    if scene.splats is None or given is not None:
+    if given is not None or (scene.splats is None and capture.surface is None):
         expect_placed(impacts.contacts, features.points, names=impacts.names, strict=found_frame)
 
     bare, symmetries = FeatureField.from_points(features.points), partial(reported_symmetries, report)

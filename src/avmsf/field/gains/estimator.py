@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Complex128, Float, Int
 from torch import Tensor, nn
 
-from avmsf.capture.placement import expect_placed
+from avmsf.capture.placement import expect_on_body
 from avmsf.errors import AvmsfError, FitError
 from avmsf.features.feature_field import GEOMETRY
 from avmsf.fem.candidate_bodies import PRESENT_UNIT, CandidateBodies, CandidateBody
@@ -227,7 +227,7 @@ class MixtureEstimator(GainEstimator):
                 advice = self.missing or "give its mesh"
                 raise FitError.expected("the object's shape", name=Elastic.kind, advice=advice)
             points = self.bodies.bodies[0].elastic.points
-            expect_placed(data.train.contacts, points, names=data.train.names, elastic=True)
+            expect_on_body(data.train.contacts, points, names=data.train.names)
         except FitError as error:
             if self.name == Elastic.kind:
                 raise

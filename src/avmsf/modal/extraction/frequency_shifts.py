@@ -39,28 +39,35 @@ PerPole = Complex128[Tensor, "contacts modes"]
 Poles = Complex128[Tensor, "*contacts modes"]
 """Common poles, or each recording's own."""
 
-# Numbers of the search, chosen on two simulated objects with sensors of up to .2 % of their mass, and two real.
-_SHIFT = 0.002
-"""Relative frequency shift between recordings, standard deviation, before any is known; and distance within which
-poles may be one mode."""
-_NEAR_WIDTHS = 3.0
-"""Half-power widths within which they may be one as well."""
-_BAND_WIDTHS = 6.0
-"""Half-power widths that a band reaches beyond its poles."""
-_BAND_BINS = 8
-"""Bins that it reaches at least, of the whole sound's transform."""
-_NEPERS = 7.0
-"""Decay of a band's slowest mode within the part of the sound that is transformed."""
-_MODES = 8
-"""Most poles in a band: all of their subsets are tried."""
-_PITCHED = 0.1
-"""Largest half-power width of a pole that may shift, over its frequency."""
-_LEVEL = 0.01
-"""Of the F test that a pole moves along frequency more than along damping. A pole that stands for several
-unresolved modes moves along both."""
-_LEAST = 0.05
-"""Radians that a mode turns by its shift while it falls to 1/e, standard deviation: with fewer, gains at common
-poles are as good."""
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Numbers of the search, chosen on two simulated objects with sensors of up to .2 % of their mass, and two real."""
+
+    shift: float = 0.002
+    """Relative frequency shift between recordings, standard deviation, before any is known; and distance within which
+    poles may be one mode."""
+    near_widths: float = 3.0
+    """Half-power widths within which they may be one as well."""
+    band_widths: float = 6.0
+    """Half-power widths that a band reaches beyond its poles."""
+    band_bins: int = 8
+    """Bins that it reaches at least, of the whole sound's transform."""
+    nepers: float = 7.0
+    """Decay of a band's slowest mode within the part of the sound that is transformed."""
+    modes: int = 8
+    """Most poles in a band: all of their subsets are tried."""
+    pitched: float = 0.1
+    """Largest half-power width of a pole that may shift, over its frequency."""
+    level: float = 0.01
+    """Of the F test that a pole moves along frequency more than along damping. A pole that stands for several
+    unresolved modes moves along both."""
+    least: float = 0.05
+    """Radians that a mode turns by its shift while it falls to 1/e, standard deviation: with fewer, gains at common
+    poles are as good."""
+
+
+_TOLERANCES = Tolerances()
 _ITERATIONS = 12
 """Steps of a band's fit."""
 _FREE_ITERATIONS = 2
@@ -108,7 +115,7 @@ def find_shifts(sounds: Sounds, bank: ModalBank, *, sample_rate: float, signific
     if len(sounds) < 2:
         return None
     level = sounds.double().square().mean(1, keepdim=True).sqrt().clamp_min(torch.finfo(torch.float64).tiny)
-    search, shift = _Search(sounds.double() / level, bank, sample_rate), _SHIFT
+    search, shift = _Search(sounds.double() / level, bank, sample_rate), _TOLERANCES.shift
     drift = torch.zeros(len(sounds), dtype=torch.float64)
     for _ in range(_PASSES):
         bands = search.bands(shift, drift)
@@ -150,8 +157,8 @@ class _Found:
         moved = (self.poles - self.mean).expand_as(self.gains)
         frequency, damping = moved.imag.square().mean(0), moved.real.square().mean(0)
         freedom = len(moved) - 1
-        above = frequency > damping * float(f_distribution.isf(_LEVEL, freedom, freedom))
-        return above & (frequency > (_LEAST * self.mean.real).square())
+        above = frequency > damping * float(f_distribution.isf(_TOLERANCES.level, freedom, freedom))
+        return above & (frequency > (_TOLERANCES.least * self.mean.real).square())
 
 
 class _Search:
@@ -179,7 +186,7 @@ class _Search:
         half, settled = 0.5 * sum(float(each.energy) for each in self.known), 0.0
         for row, common in enumerate(self.common):
             before = self.known[row]
-            if float((-common.real / common.imag).max()) > _PITCHED / 2:
+            if float((-common.real / common.imag).max()) > _TOLERANCES.pitched / 2:
                 settled += float(before.energy)
                 continue
             sounds = self.left + modal_sounds(before.poles, before.gains, self.samples, self.rate)
@@ -206,9 +213,13 @@ class _Band:
     def of(cls, sounds: Float64[Tensor, "contacts samples"], poles: CommonPoles, rate: float) -> "_Band":
         """Return the band around some poles."""
         slowest, widest = float(-poles.real.max()), float(-poles.real.min()) / math.pi
-        samples = min(sounds.shape[1], math.ceil(_NEPERS * rate / slowest))
+        samples = min(sounds.shape[1], math.ceil(_TOLERANCES.nepers * rate / slowest))
         lowest, highest = float(poles.imag.min()) / (2 * math.pi), float(poles.imag.max()) / (2 * math.pi)
-        reach = max(_BAND_WIDTHS * widest, 2 * _SHIFT * highest, _BAND_BINS * rate / sounds.shape[1])
+        reach = max(
+            _TOLERANCES.band_widths * widest,
+            2 * _TOLERANCES.shift * highest,
+            _TOLERANCES.band_bins * rate / sounds.shape[1],
+        )
         first = max(1, math.floor((lowest - reach) * samples / rate))
         last = min(samples // 2 - 1, math.ceil((highest + reach) * samples / rate))
         spectra = torch.fft.rfft(sounds[:, :samples])[:, first : last + 1]
@@ -357,9 +368,9 @@ def _groups(bank: ModalBank) -> list[list[int]]:
     groups: list[list[int]] = []
     for row in range(len(bank)):
         near = row > 0 and frequency[row] - frequency[row - 1] <= max(
-            _NEAR_WIDTHS * min(width[row], width[row - 1]), _SHIFT * frequency[row]
+            _TOLERANCES.near_widths * min(width[row], width[row - 1]), _TOLERANCES.shift * frequency[row]
         )
-        if near and len(groups[-1]) < _MODES:
+        if near and len(groups[-1]) < _TOLERANCES.modes:
             groups[-1].append(row)
         else:
             groups.append([row])
