@@ -10,7 +10,9 @@ import pkgutil
 import re
 import shlex
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterator
+from itertools import permutations
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -142,6 +144,25 @@ def pages() -> Iterator[ModuleType]:
 def test_every_table_of_a_page_is_what_the_records_say(pages: ModuleType, name: str) -> None:
     text = (REPOSITORY / name).read_text(encoding="utf-8")
     assert text == pages.written(text), "python -m benchmarks tables"
+
+
+@pytest.mark.parametrize("name", ["docs/baselines.md", "docs/benchmarks.md", "docs/scale.md"])
+def test_figures_after_a_mark_are_in_the_records(pages: ModuleType, name: str) -> None:
+    """In a paragraph after `<!-- from: PART ... -->` those of two decimals are values, or quotients of a kind."""
+    text = (REPOSITORY / name).read_text(encoding="utf-8")
+    marked = re.findall(r"<!-- from: (.+) -->\n((?:.+\n)+)", text)
+    assert marked
+    for parts, paragraph in marked:
+        records = [each for part in parts.split() for each in pages.stored(pages.STORED / f"{part}.jsonl")]
+        kinds = defaultdict(list)
+        for each in records:
+            if each.object in ("", "all") or parts.startswith("speed"):
+                kinds[each.name.split(".")[1], each.name.split(".")[-1].split()[0]].append(each.value)
+        known = [each.value for each in records]
+        known += [one / other for same in kinds.values() for one, other in permutations(same, 2) if other]
+        for figure in re.findall(r"(?<![\w.])\d*\.\d{2,}\b", paragraph):
+            rounding = 0.501 * 10 ** -len(figure.partition(".")[2])
+            assert any(abs(each - float(figure)) <= rounding for each in known), f"{figure} of {parts}"
 
 
 def test_the_page_has_every_part_and_no_records_are_of_none(pages: ModuleType) -> None:
