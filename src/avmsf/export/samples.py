@@ -80,7 +80,7 @@ def write_grid(
     _check(field, layers, seconds, range_db)
     rate = round(field.sample_rate)
     rows, remarks = _chosen(field, range_db)
-    samples = samples_in(seconds, rate) or field.samples
+    samples = samples_in(seconds, field.sample_rate) or field.samples
     rendered = []
     for layer in layers:
         pulse = ForcePulse(layer.contact_time, layer.shape)
