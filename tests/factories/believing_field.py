@@ -102,5 +102,7 @@ def one_hypothesis(contacts: Tensor, values: Tensor) -> MixtureGains:
     for row in range(len(rows)):
         weights[row, NOISE_SHARES.index(NOISE), [row, row + len(rows)]] = 1.0
     series = values.transpose(1, 2).flatten(1)
-    mixture = KernelMixture(family.kernels(), series, torch.zeros(series.shape[1]).double(), weights)
+    mixture = KernelMixture(
+        family.kernels(), series, torch.zeros(series.shape[1]).double(), weights, places=sites.places()
+    )
     return MixtureGains(bar_points(), sites, (family,), mixture, True)
