@@ -22,8 +22,10 @@ from avmsf.cli import VERBS, main
 from avmsf.cli.fit import Options as FitOptions
 from avmsf.cli.info import _not_trained_on
 from avmsf.cli.paths import OutputError
+from avmsf.cli.report import field_lines
 from avmsf.errors import FitError
 from avmsf.features.feature_field import FeatureField, save_features
+from avmsf.field.sound_field import Origin
 from avmsf.field.store import load, save
 from avmsf.modal.extraction.alignment import recording_keys
 from avmsf.modal.modes import ForcePulse
@@ -324,3 +326,12 @@ def test_training_recordings_are_told_by_what_they_hold_where_the_field_knows() 
     # A later session may number its recordings as the first did.
     later = replace(impacts, sounds=0.5 * impacts.sounds)
     assert _not_trained_on(field, SimpleNamespace(impacts=later)) == [0, 1, 2, 3]
+
+
+def test_outliers_are_no_recordings_that_a_field_was_fitted_to() -> None:
+    report = {"excluded": ["b.wav"], "outliers": {"b.wav": "b.wav contradicts the other recordings"}}
+    field = sounding(directional(), origin=Origin("plate", ("a.wav", "b.wav", "c.wav"), report=report))
+    (line,) = (line for line in field_lines(field, Path("f.safetensors")) if "fitted to" in line)
+    assert line.endswith(" 2 recordings")
+    values = {"report": report, "modes": 3}
+    assert FitOptions(()).cells(values)["outliers left out"] == "b.wav"

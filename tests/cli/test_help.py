@@ -131,6 +131,7 @@ EARLY: dict[str, dict[str, Any]] = {
     "fit plate --output plate": {"file": "plate", "value": "folder"},
     "fit plate --output words.csv/f.safetensors": {"file": "words.csv", "value": "file"},
     "fit plate --output f.safetensors --train-count 4 --train-fraction 0.5": {"name": "--train-count"},
+    "fit plate --output f.safetensors --train-fraction 75": {"name": "--train-fraction", "value": 75.0},
     "fit plate --output f.safetensors --set validation=2": {"name": "validation", "value": 2.0},
     "fit plate --output f.safetensors --material glass --train-count 4": {"name": "--train-count", "value": "glass"},
     "fit plate --until gaussians --without-shape": {"name": "--without-shape", "value": "gaussians"},

@@ -26,6 +26,7 @@ MIN_FORCE_NEWTONS, MAX_FORCE_NEWTONS = 1e-6, 1e6
 """Peak forces that a row may give: from a grain of dust to the largest impact hammers (2e4 N) and beyond."""
 FARTHEST = 100.0
 """Meters from the origin beyond which a contact must be in another unit."""
+_DECIMAL_COMMAS = "separate the columns by semicolons where numbers have decimal commas"
 _NO_ROW = re.compile(r"\A(\s*sep=.(\n|\Z))?(#.*(\n|\Z))*")
 """What Excel is told the separator by, and comments above the header."""
 HOW_TO_WRITE = (
@@ -66,7 +67,7 @@ class Row:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            advice = "separate the columns by semicolons where numbers have decimal commas" if "," in text else ""
+            advice = _DECIMAL_COMMAS if "," in text else ""
             raise self.error(f"a number as {name}", text, name=name, advice=advice)
         return value
 
@@ -139,7 +140,8 @@ def read_table(
         if len(cells) != len(header):
             wanted, got = f"{len(header)} cells as in the header", f"{len(cells)}: {separator.join(cells)}"
             name = header[len(cells)] if len(cells) < len(header) else None
-            raise CaptureError.expected(wanted, len(cells), got=got, file=path, row=line, name=name)
+            hint = _DECIMAL_COMMAS if name is None and separator == "," else ""
+            raise CaptureError.expected(wanted, len(cells), got=got, file=path, row=line, name=name, advice=hint)
         rows.append(Row(line, dict(zip(header, cells, strict=True)), separator != ",", shown or path))
     if not rows:
         raise CaptureError.expected("rows below the header", 0, got="none", file=path, advice=advice)

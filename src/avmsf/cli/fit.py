@@ -116,7 +116,8 @@ class Options(Configured, Many):
             "relative STFT error": values.get("scores", {}).get("field", {}).get("relative_stft"),
         }
         shown = {head: "" if error is None else format_number(error) for head, error in errors.items()}
-        return {"modes": str(values.get("modes", "")), **shown}
+        left_out = ", ".join(values.get("report", {}).get("excluded", ()))
+        return {"modes": str(values.get("modes", "")), **shown, "outliers left out": left_out}
 
     @cached_property
     def all_settings(self) -> PipelineConfig:
@@ -174,6 +175,9 @@ class Options(Configured, Many):
                 raise FitError.expected(wanted, chosen, name=option_of(name), advice=advice)
         if self.train_count is not None and self.train_fraction is not None:
             raise FitError.expected("it or --train-fraction", got="both", name="--train-count", advice="leave one out")
+        if self.train_fraction is not None and not 0 < self.train_fraction < 1:
+            wanted, advice = "a fraction of the contacts between 0 and 1", "give their number by --train-count"
+            raise FitError.expected(wanted, self.train_fraction, name="--train-fraction", advice=advice)
 
 
 def run(options: Options) -> int:

@@ -63,7 +63,8 @@ def field_lines(field: SoundField, path: Path, *, settings: bool = True) -> list
     report = values["report"]
     reason = f" ({report['damping_reason']})" if "damping_reason" in report else ""
     modes = modes_words(len(field.bank), values["supporting_pole_count"])
-    recordings, changes = counted(len(values["trained_on"]), "recording"), report.get("levels")
+    used = len(values["trained_on"]) - len(report.get("excluded", ()))
+    recordings, changes = counted(used, "recording"), report.get("levels")
     if changes:
         low, high = (20.0 * math.log10(each) for each in (min(changes), max(changes)))
         recordings += f", over levels found from their gains, {low:+.1f} to {high:+.1f} dB; quality is at these"
