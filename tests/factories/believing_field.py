@@ -103,6 +103,6 @@ def one_hypothesis(contacts: Tensor, values: Tensor) -> MixtureGains:
         weights[row, NOISE_SHARES.index(NOISE), [row, row + len(rows)]] = 1.0
     series = values.transpose(1, 2).flatten(1)
     mixture = KernelMixture(
-        family.kernels(), series, torch.zeros(series.shape[1]).double(), weights, places=sites.places()
+        family.kernels(), series, torch.zeros(series.shape[1]).double(), weights, repetitions=sites.repetitions()
     )
     return MixtureGains(bar_points(), sites, (family,), mixture, True)

@@ -219,7 +219,7 @@ def wav_bytes(
     if coding == "int16":
         if round(peak * 2**15) >= 2**15:
             got, wanted = f"{peak:.3g} ({20 * math.log10(peak):+.1f} dB)", "amplitudes below 1 for 16 bits"
-            advice = "add --normalize peak, lower --level-db, or write float32"
+            advice = "normalize the peak, lower the level, or write float32"
             raise ArrayError.expected(wanted, peak, got=got, file=file, name="peak", advice=advice)
         coded = np.rint(coded * 2**15).astype(np.int16)
     scipy.io.wavfile.write(memory, rate, coded)

@@ -38,7 +38,7 @@ def dense(
 ) -> tuple[torch.Tensor, torch.Tensor, float]:
     """Return one hypothesis's mean and covariance of a series at the asked places, and its noise's variance."""
     noise = float(NOISE_SHARES[share] + given.mixture.floor[series])
-    values, places = given.mixture.values[:, series].numpy(), given.mixture.places.numpy()
+    values, places = given.mixture.values[:, series].numpy(), given.mixture.repetitions.numpy()
     mean, covariance, scale = oracle.conditional(kernel.numpy(), noise, values, places)
     return torch.from_numpy(mean), torch.from_numpy(covariance), scale * noise
 

@@ -137,8 +137,8 @@ def fit_mixture(
     weights = posterior_weights(evidence, hypotheses_of(weighed, measured), measured.informative)
     used = weights.sum((1, 2)) > 0
     kernels = torch.cat([each.kernels for each in weighed])[used]
-    places = families[0].reference.places()
-    mixture = KernelMixture(kernels, values, floor, weights[used], noise_shares, places)
+    repetitions = families[0].reference.repetitions()
+    mixture = KernelMixture(kernels, values, floor, weights[used], noise_shares, repetitions)
     rows = torch.split(used, [len(family) for family in families])
     kept = tuple(family.take(torch.nonzero(each).flatten()) for family, each in zip(families, rows, strict=True))
     return MixtureGains(points, families[0].reference, tuple(filter(len, kept)), mixture, directional)

@@ -58,7 +58,7 @@ class Sites:
         """Return some of the impacts."""
         return Sites(self.points[rows], self.directions[rows])
 
-    def places(self) -> Int[Tensor, " sites"]:
+    def repetitions(self) -> Int[Tensor, " sites"]:
         """Return a number for each impact, the same for those at one place (`places_of`) along one direction."""
         owner = places_of(self.points)
         same = (owner[:, None] == owner) & (self.directions @ self.directions.T > _SAME_DIRECTION)

@@ -13,7 +13,8 @@ has the prior 1/s and is integrated out. With K = U diag(lambda) U', z = U' y an
 (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 5), so that one eigendecomposition of a
 kernel serves all noise shares and series. A value at a new place, with k its covariances with the contacts and k0 its
 own variance, is Student t with n degrees of freedom, location k' C^-1 y and squared scale Q/n (k0 - k' C^-1 k). Where
-places have repeated recordings, Q and n in this scale are those of the places' means (`KernelMixture.scale`).
+places have repeated recordings, Q and n in this scale are those of the places' means if these make it larger
+(`KernelMixture.scale`).
 
 Where the mean square E of the values is expected beforehand, up to a factor, s^2 has an inverse-gamma prior of shape a
 and scale a E in place of 1/s: with few contacts it decides. It adds to the log evidence, and to the weights of kernels
@@ -121,8 +122,8 @@ class KernelMixture:
     weights: Float64[Tensor, "kernels noises series"]
     """Posterior probability of each kernel with each noise share; they sum to one for each series."""
     noise_shares: tuple[float, ...] = NOISE_SHARES
-    places: Int[Tensor, " contacts"] | None = None
-    """A number for each contact, the same for repeated recordings (`Sites.places`); None where there are none."""
+    repetitions: Int[Tensor, " contacts"] | None = None
+    """A number for each contact, the same for repeated recordings (`Sites.repetitions`); None where there are none."""
 
     def take(self, series: Int[Tensor, " series"]) -> "KernelMixture":
         """Return the posterior of some series, in the given order."""
@@ -151,7 +152,7 @@ class KernelMixture:
         It is mostly less than v, and would make s^2 smaller with every repetition. Where places are not met to the
         point, the squares may be of the gains' own changes: s^2 is never less than Q over the number of contacts.
         """
-        values, places = self.values[rows], rows if self.places is None else self.places[rows]
+        values, places = self.values[rows], rows if self.repetitions is None else self.repetitions[rows]
         member = (places[:, None] == torch.unique(places)).double()
         within = (values - member @ (member.T @ values / member.sum(0)[:, None])).square().sum(0)
         by_place = (quadratic - within[series] / variance) / max(member.shape[1], 1)

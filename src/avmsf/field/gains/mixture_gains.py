@@ -200,7 +200,7 @@ class MixtureGains(GainModel):
         measured = None if self.measured is None else self.measured[kept]
         kernels, values = self.mixture.kernels[:, kept[:, None], kept], self.mixture.values[kept]
         training = self.training.take(kept)
-        mixture = replace(self.mixture, kernels=kernels, values=values, places=training.places())
+        mixture = replace(self.mixture, kernels=kernels, values=values, repetitions=training.repetitions())
         return replace(self, training=training, mixture=mixture, measured=measured)
 
     def shares(self) -> Float64[Tensor, "families modes"]:
@@ -265,7 +265,7 @@ class MixtureGains(GainModel):
         values, measured = (
             torch.view_as_complex(read(name, contacts, modes, 2).contiguous()) for name in ("values", "measured")
         )
-        mixture = KernelMixture(kernels, series_of(values), floor, weights, places=training.places())
+        mixture = KernelMixture(kernels, series_of(values), floor, weights, repetitions=training.repetitions())
         return cls(places, training, families, mixture, directional, share, measured)
 
     def _of(self, kind: type[Family]) -> list[Family]:

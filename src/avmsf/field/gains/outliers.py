@@ -92,7 +92,7 @@ class PredictiveRatios:
         These predict each other, whatever a body says.
         """
         rows = others(self.sites, self.aside)
-        first = rows[torch.unique(self.sites.take(rows).places())]
+        first = rows[torch.unique(self.sites.take(rows).repetitions())]
         return float(self.without(frozenset(range(len(self.sites))) - {*first.tolist()})[0].nanmean())
 
     @cached_property
