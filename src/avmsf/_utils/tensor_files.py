@@ -52,7 +52,7 @@ class TensorReader:
         """Return a tensor, which must be there, of this type and size and of finite numbers."""
         name = self._prefix + name
         if name not in self._left:
-            raise self._error(f"the tensor {name}", "none", name, [[name], []])
+            raise self._error(f"the tensor {name}", "none", name, None)
         tensor = self._left.pop(name)
         wanted, found = (
             f"{str(kind).removeprefix('torch.')}{list(shape)}"
@@ -68,7 +68,7 @@ class TensorReader:
     def expect_end(self) -> None:
         """Raise the kind's error where there are tensors that nothing asked for."""
         if names := sorted(self._left):
-            raise self._error("no other tensors", ", ".join(names), names[0], [[], names])
+            raise self._error("no other tensors", ", ".join(names), names[0], names)
 
     def _error(self, wanted: str, got: str, name: str, value: Any) -> AvmsfError:
         kind = self._kind
